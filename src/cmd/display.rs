@@ -1,0 +1,68 @@
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+
+use clap::Args;
+
+use crate::display::live::Live;
+use crate::display::server::{Server, Source};
+use crate::node::Watch;
+use crate::rig::Rig;
+
+/// Where the page is served unless said otherwise, or on one of the next ports.
+const DEFAULT_PORT: u16 = 8765;
+/// Ports tried from there on.
+const PORTS: u16 = 10;
+
+/// Where to show what is going on.
+#[derive(Clone, Debug, Args)]
+pub struct DisplayOptions {
+    /// Serve the page on this address [default: 127.0.0.1:8765, or the next free port]
+    #[arg(long, value_name = "ADDRESS")]
+    display: Option<SocketAddr>,
+    /// Serve no page
+    #[arg(long, conflicts_with = "display")]
+    no_display: bool,
+    /// Let --display name an address that other machines can reach; anybody there can look
+    #[arg(long, requires = "display")]
+    display_anywhere: bool,
+}
+
+impl DisplayOptions {
+    /// The addresses to try in turn; none where no page is wanted.
+    ///
+    /// # Errors
+    /// An address others can reach without the option that allows it.
+    pub fn addresses(&self) -> anyhow::Result<Vec<SocketAddr>> {
+        match self.display {
+            _ if self.no_display => Ok(vec![]),
+            Some(address) if !address.ip().is_loopback() && !self.display_anywhere => {
+                anyhow::bail!("--display is {address}, expected a loopback address; --display-anywhere allows any")
+            }
+            Some(address) => Ok(vec![address]),
+            None => Ok((0..PORTS).map(|k| (Ipv4Addr::LOCALHOST, DEFAULT_PORT + k).into()).collect()),
+        }
+    }
+}
+
+/// Serves `source` and says where. A node does without where there is no free address: that is said too.
+pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> Option<Server> {
+    let first = addresses.first()?;
+    match Server::start(addresses, source) {
+        Ok(server) => {
+            eprintln!("display: http://{}/", server.address());
+            Some(server)
+        }
+        Err(error) => {
+            eprintln!("warning: no display on {first}: {error}; another one with --display 127.0.0.1:PORT");
+            None
+        }
+    }
+}
+
+/// The page of a node.
+pub fn of_node(addresses: &[SocketAddr], rig: &Arc<Rig>, watch: &Watch) -> Option<Server> {
+    if addresses.is_empty() {
+        return None;
+    }
+    serve(addresses, Arc::new(Live::new(rig.clone(), watch.clone())))
+}

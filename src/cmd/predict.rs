@@ -1,0 +1,89 @@
+use clap::Args;
+use serde::Serialize;
+
+use super::{Conditions, Outcome, format, print};
+use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors};
+use crate::rig::Rig;
+use crate::session::map_options;
+
+/// Predict the vibration modes of a rig under one set of conditions
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    rig: String,
+    #[command(flatten)]
+    conditions: Conditions,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What `predict --json` prints; NaN is null.
+#[derive(Serialize)]
+struct Report<'a> {
+    rig: &'a str,
+    normal_load_n: f64,
+    disc_speed_rad_s: f64,
+    friction_coefficient: f64,
+    unstable_modes: u32,
+    max_growth_rate_per_s: Option<f64>,
+    nonoscillatory_growth_per_s: &'a [f64],
+    modes: Vec<ModeReport>,
+}
+
+#[derive(Serialize)]
+struct ModeReport {
+    id: u32,
+    frequency_hz: f64,
+    growth_rate_per_s: f64,
+    damping_ratio: f64,
+    pad_participation: f64,
+    residual: f64,
+}
+
+impl From<&Mode> for ModeReport {
+    fn from(mode: &Mode) -> Self {
+        Self {
+            id: mode.id,
+            frequency_hz: mode.root.frequency_hz(),
+            growth_rate_per_s: mode.root.growth_rate_per_s(),
+            damping_ratio: mode.root.damping_ratio(),
+            pad_participation: mode.root.pad_participation,
+            residual: mode.root.residual,
+        }
+    }
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let rig = Rig::load(&self.rig)?;
+        let point = self.conditions.point(&rig);
+        let summary = predict(&rig, &point)?;
+        if self.json {
+            let report = Report {
+                rig: &rig.name,
+                normal_load_n: point.normal_load_n,
+                disc_speed_rad_s: point.disc_speed_rad_s,
+                friction_coefficient: point.friction_coefficient,
+                unstable_modes: summary.unstable_modes,
+                max_growth_rate_per_s: summary.max_growth_rate_per_s,
+                nonoscillatory_growth_per_s: &summary.nonoscillatory_growth_per_s,
+                modes: summary.modes.iter().map(ModeReport::from).collect(),
+            };
+            print(&(serde_json::to_string(&report)? + "\n"))?;
+        } else {
+            print(&format::prediction(&rig, &point, &summary))?;
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+/// The modes at `point`, identified by following them there from friction coefficient 0.
+fn predict(rig: &Rig, point: &OperatingPoint) -> anyhow::Result<Summary> {
+    let mut solver = Solver::new(rig.model.dimension());
+    let spectrum = solver.solve(&rig.model, point, Vectors::Right)?;
+    let mu = point.friction_coefficient;
+    let path = MapOptions { mu_min: mu.min(0.0), mu_max: mu.max(0.0), windows: false, ..map_options(rig) };
+    let map = StabilityMap::build(&rig.model, &mut solver, point, &path)?;
+    Ok(Summary::of_spectrum(&spectrum, &map.identify(&spectrum), rig.band_max_hz, rig.instability_threshold))
+}

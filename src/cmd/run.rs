@@ -1,0 +1,167 @@
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use anyhow::Context;
+use clap::Args;
+use crossbeam_channel::{Receiver, Sender};
+
+use super::buses::BusOptions;
+use super::display::{self, DisplayOptions};
+use super::{Outcome, live, signals};
+use crate::io::heard::Heard;
+use crate::io::recorder::{Recorder, RecorderConfig};
+use crate::io::ros_args::RosArgs;
+use crate::io::ros2::{Parameters, Ros2};
+use crate::io::shm::{ShmInput, ShmOutput};
+use crate::node::{self, Incoming, Node, Outputs, Watch};
+use crate::rig::Rig;
+use crate::settings::{self, Settings};
+use crate::wire;
+
+/// Run the node on live buses
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    rig: String,
+    #[command(flatten)]
+    buses: BusOptions,
+    #[command(flatten)]
+    shown: NodeOptions,
+}
+
+/// What `run` and `demo` share.
+#[derive(Clone, Debug, Args)]
+pub struct NodeOptions {
+    /// Record the session into a new directory in this one
+    #[arg(long, value_name = "DIR")]
+    record: Option<PathBuf>,
+    /// Solve every condition anew instead of charting the rig in the background
+    #[arg(long)]
+    no_chart: bool,
+    /// Print log lines instead of a live table, on a terminal too
+    #[arg(long)]
+    plain: bool,
+    #[command(flatten)]
+    display: DisplayOptions,
+}
+
+/// The longest the recorder may take to finish its files, so that a signal ends the program within 2 s.
+const FINISH_WITHIN: Duration = Duration::from_millis(1500);
+
+impl Options {
+    pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
+        let rig = Arc::new(Rig::load(&self.rig)?);
+        let (sender, receiver) = node::channel();
+        serve(&rig, &self.buses, &self.shown, ros_args, Listening::ToTheBuses, (sender, receiver))
+    }
+}
+
+/// Where a node's inputs come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Listening {
+    ToTheBuses,
+    /// Inputs come from this process alone.
+    ToNobody,
+}
+
+/// Runs a node for `rig` until it is stopped.
+pub fn serve(
+    rig: &Arc<Rig>,
+    buses: &BusOptions,
+    options: &NodeOptions,
+    ros_args: RosArgs,
+    listening: Listening,
+    (sender, receiver): (Sender<Incoming>, Receiver<Incoming>),
+) -> anyhow::Result<Outcome> {
+    let mut initial = Settings::for_rig(rig);
+    let addresses = options.display.addresses()?;
+    let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
+    let mut outputs = Outputs { recorder: recorder.as_ref().map(Recorder::handle), ..Default::default() };
+    if let Some(shm) = buses.shm() {
+        outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
+        if listening == Listening::ToTheBuses {
+            let (sender, lost) = (sender.clone(), outputs.lost_inputs.clone());
+            outputs.shm_input = Some(ShmInput::spawn(&shm, move |heard| hear(&sender, &lost, heard))?);
+        }
+    }
+    if let Some(ros2) = buses.ros2(ros_args)? {
+        let declared: Vec<(&str, f64)> = initial.values().collect();
+        let name = ros2.args.node_name("squealcast");
+        let values = ros2.args.parameters(&declared, &ros2.args.namespace(&name, "/"), &name)?;
+        for (name, value) in &values {
+            initial.set(name, *value)?;
+        }
+        let changes = sender.clone();
+        let parameters = Parameters {
+            values,
+            validate: Box::new(|name, value| settings::validate(name, value).map(drop).map_err(|e| e.to_string())),
+            accepted: Box::new(move |name, value| {
+                // Not waited for: this is the thread that hears the bus.
+                if changes.try_send(Incoming::Parameter { name: name.to_owned(), value }).is_err() {
+                    eprintln!("parameter {name} = {value} came into a full queue and has no effect");
+                }
+            }),
+        };
+        let (sender, lost) = (sender.clone(), outputs.lost_inputs.clone());
+        let started = Ros2::start(&ros2, parameters, move |heard| {
+            if listening == Listening::ToTheBuses {
+                hear(&sender, &lost, heard);
+            }
+        });
+        outputs.ros2 = Some(started.context("ROS 2; --no-ros stays off it")?);
+    }
+
+    let stop = sender.clone();
+    signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
+    let watch = Watch::default();
+    let display = display::of_node(&addresses, rig, &watch);
+    let shown = live::show(rig, watch.clone(), options.plain, sender.clone());
+    let node = Node::new(rig.clone(), initial, outputs, sender.clone(), watch);
+    let node = if options.no_chart { node } else { node.with_chart(sender) };
+    let outputs = node.run(&receiver);
+    // The recording first: whoever shows the session may be held up by a reader that does not read.
+    let outcome = recorder.map_or(Ok(Outcome::Done), finish);
+    shown.stop();
+    drop(display);
+    drop(outputs);
+    outcome
+}
+
+/// Hands an input to the node without waiting for it; what does not fit is lost, and counted.
+fn hear(sender: &Sender<Incoming>, lost: &AtomicU64, heard: Heard<wire::OperatingPoint>) {
+    if sender.try_send(Incoming::Input(heard)).is_err() {
+        lost.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+fn start_recorder(rig: &Rig, directory: &std::path::Path) -> anyhow::Result<Recorder> {
+    let config = RecorderConfig {
+        rig_name: rig.name.clone(),
+        rig_content_hash: rig.content_hash.clone(),
+        rig_files: rig.files.clone(),
+        ..RecorderConfig::new(directory)
+    };
+    let recorder = Recorder::start(config)?;
+    eprintln!("recording into {}", recorder.status().directory.display());
+    Ok(recorder)
+}
+
+fn finish(recorder: Recorder) -> anyhow::Result<Outcome> {
+    let finished = recorder.finish(FINISH_WITHIN)?;
+    let status = &finished.status;
+    for recovered in &status.recovered {
+        eprintln!("recovered: {}", super::recover::describe(recovered));
+    }
+    for problem in &status.unrecovered {
+        eprintln!("not recovered: {problem}");
+    }
+    eprintln!("recorded {} messages into {}", status.messages_written, finished.directory.display());
+    if status.dropped() > 0 {
+        let why = status.last_error.as_deref().unwrap_or("the disk was too slow");
+        eprintln!("{} messages were not recorded: {why}", status.dropped());
+        return Ok(Outcome::Differences);
+    }
+    Ok(Outcome::Done)
+}

@@ -1,0 +1,122 @@
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::{LoadAndSpeed, Outcome, finite, print, write_file};
+use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors, Window};
+use crate::plot::{self, Point};
+use crate::rig::Rig;
+use crate::session::map_options;
+
+/// Sweep the friction coefficient, modes followed through crossings and mergings
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    rig: String,
+    /// Friction coefficients, as FROM:TO:STEP
+    #[arg(long, value_name = "FROM:TO:STEP", default_value = "0:1:0.01", allow_hyphen_values = true)]
+    mu: Range,
+    #[command(flatten)]
+    load_and_speed: LoadAndSpeed,
+    /// Write the modes as CSV to this file [default: standard output, unless --svg is given]
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Draw frequencies and growth rates to this file
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+}
+
+/// An inclusive range of friction coefficients.
+#[derive(Clone, Copy, Debug)]
+struct Range {
+    from: f64,
+    to: f64,
+    step: f64,
+}
+
+/// The most steps of a sweep.
+const MAX_STEPS: f64 = 1e6;
+
+impl std::str::FromStr for Range {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parts: Vec<f64> = text.split(':').map(finite).collect::<Result<_, _>>()?;
+        let &[from, to, step] = parts.as_slice() else {
+            return Err("expected three numbers, FROM:TO:STEP".to_owned());
+        };
+        if step <= 0.0 || to < from {
+            return Err("expected FROM up to TO and a STEP of more than 0".to_owned());
+        }
+        if (to - from) / step > MAX_STEPS {
+            return Err(format!("{:.0} steps, expected at most {MAX_STEPS:.0}", (to - from) / step));
+        }
+        Ok(Self { from, to, step })
+    }
+}
+
+impl Range {
+    /// Each value by itself, so that rounding does not add up.
+    fn values(self) -> impl Iterator<Item = f64> {
+        let count = ((self.to - self.from) / self.step + 1e-9).floor() as usize;
+        (0..=count).map(move |k| self.from + k as f64 * self.step)
+    }
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let rig = Rig::load(&self.rig)?;
+        let point = self.load_and_speed.point(&rig);
+        let (modes, windows) = sweep(&rig, &point, self.mu, self.svg.is_some())?;
+        let csv = to_csv(&modes)?;
+        match (&self.csv, &self.svg) {
+            (Some(path), _) => write_file(path, csv.as_bytes())?,
+            (None, None) => print(&csv)?,
+            (None, Some(_)) => {}
+        }
+        if let Some(path) = &self.svg {
+            let points: Vec<Point> = modes
+                .iter()
+                .map(|(mu, mode)| Point {
+                    mu: *mu,
+                    id: mode.id,
+                    frequency_hz: mode.root.frequency_hz(),
+                    growth_rate_per_s: mode.root.growth_rate_per_s(),
+                })
+                .collect();
+            let title = format!("{}, {} N, {} rad/s", rig.name, point.normal_load_n, point.disc_speed_rad_s);
+            write_file(path, plot::sweep(&title, &points, &windows)?.as_bytes())?;
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+/// A mode at a friction coefficient.
+type Swept = (f64, Mode);
+
+/// Every mode of the band at every friction coefficient of the range, and the windows of instability if asked for.
+fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<(Vec<Swept>, Vec<Window>)> {
+    let mut solver = Solver::new(rig.model.dimension());
+    let followed = MapOptions { mu_min: range.from.min(0.0), mu_max: range.to.max(0.0), windows, ..map_options(rig) };
+    let map = StabilityMap::build(&rig.model, &mut solver, point, &followed)?;
+    let mut modes = vec![];
+    for mu in range.values() {
+        let spectrum = solver.solve(&rig.model, &point.with_friction(mu), Vectors::Right)?;
+        let ids = map.identify(&spectrum);
+        let summary = Summary::of_spectrum(&spectrum, &ids, rig.band_max_hz, rig.instability_threshold);
+        modes.extend(summary.modes.into_iter().map(|mode| (mu, mode)));
+    }
+    Ok((modes, map.windows))
+}
+
+fn to_csv(modes: &[Swept]) -> anyhow::Result<String> {
+    let mut writer = csv::Writer::from_writer(vec![]);
+    writer.write_record(["friction_coefficient", "mode_id", "frequency_hz", "growth_rate_per_s", "damping_ratio"])?;
+    for (mu, mode) in modes {
+        let root = &mode.root;
+        let values = [root.frequency_hz(), root.growth_rate_per_s(), root.damping_ratio()].map(|v| v.to_string());
+        let [hz, growth, damping] = &values;
+        writer.write_record([&mu.to_string(), &mode.id.to_string(), hz, growth, damping])?;
+    }
+    Ok(String::from_utf8(writer.into_inner()?)?)
+}

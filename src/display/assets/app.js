@@ -1,0 +1,179 @@
+// Wires the page to what is served: a node's stream of states, or a recording asked moment by moment.
+
+import { Events } from "./events.js";
+import { History } from "./history.js";
+import { StabilityMap } from "./map.js";
+import { Modes } from "./modes.js";
+import { ShapeView } from "./shape.js";
+import { Status } from "./status.js";
+import { Timeline } from "./timeline.js";
+
+const at = (id) => document.getElementById(id);
+const ask = async (path) => {
+  const answer = await fetch(path);
+  if (!answer.ok) throw new Error(await answer.text());
+  return answer.json();
+};
+/** Time between two changes of the numbers, ms: faster than that nobody reads. */
+const NUMBERS_EVERY = 200;
+const HISTORY_EVERY = 500;
+
+const about = await ask("about.json");
+const recording = about.kind === "recording";
+at("rig").textContent = about.rig;
+document.title = `squealcast: ${about.rig}`;
+
+const status = new Status(about);
+const map = new StabilityMap(about);
+const history = new History(about);
+const shape = new ShapeView();
+const modes = new Modes(about, choose);
+let timeline;
+const events = new Events(about, recording ? (moment) => timeline.go(moment) : undefined);
+
+let taken = 0;
+let latest = null;
+let heardAt = 0;
+let mapShown = 0;
+let eventsShown = -1;
+let asking = { map: false, history: false, events: false };
+
+let chosenAt = 0;
+let chosenMu = NaN;
+
+async function choose(id) {
+  chosenAt = performance.now();
+  chosenMu = latest?.mu ?? NaN;
+  try {
+    const moment = recording && latest ? `&at=${latest.time_s}` : "";
+    await shape.show(await ask(`shape.json?id=${id}${moment}`));
+  } catch (error) {
+    shape.missing(error.message);
+  }
+}
+
+/** Does one thing at a time of each kind; what is asked meanwhile is asked again by the next state. */
+async function once(kind, work) {
+  if (asking[kind]) return;
+  asking[kind] = true;
+  try {
+    await work();
+  } catch {
+    // The connection is gone, or there is no such map yet: the next state asks again.
+  } finally {
+    asking[kind] = false;
+  }
+}
+
+const loadHistory = () => once("history", async () => history.load(await ask("history.json")));
+
+function take(state) {
+  latest = state;
+  heardAt = performance.now();
+  if (!recording && at("link").dataset.link !== "live") link("live", "live");
+  status.level(state.level, state.reason);
+  status.needle(state);
+  map.cursor(state);
+  if (++taken % 3 === 0) map.dots();
+  if (!history.add(state.bins)) loadHistory();
+  if (state.map && state.map !== mapShown) {
+    once("map", async () => {
+      const number = state.map;
+      map.show(await ask(`map.json?number=${number}`));
+      mapShown = number;
+    });
+  }
+  if (state.events !== eventsShown) {
+    once("events", async () => {
+      const change = state.events;
+      events.show(await ask("events.json"));
+      eventsShown = change;
+    });
+  }
+}
+
+function numbers() {
+  if (!latest) return;
+  const age = typeof latest.age_s === "number" ? latest.age_s + (recording ? 0 : (performance.now() - heardAt) / 1000) : undefined;
+  status.numbers(latest, age);
+  modes.numbers(latest);
+  if (recording) map.dots();
+  if (modes.chosen === null && latest.modes?.length) {
+    // The one to look at first: the fastest growing, or else the one that would grow first.
+    const fastest = latest.modes.reduce((best, mode) => (mode[1][1] > best[1][1] ? mode : best));
+    const first = map.curves?.windows[0]?.mode_ids[0];
+    if (latest.unstable) modes.select(fastest[0]);
+    else if (map.curves) modes.select(first ?? fastest[0]);
+  } else if (modes.chosen !== null && performance.now() - chosenAt > 1500 && Math.abs(latest.mu - chosenMu) > 0.005) {
+    // Its shape changes with the conditions.
+    choose(modes.chosen);
+  }
+}
+
+function link(kind, text) {
+  at("link").dataset.link = kind;
+  at("link-text").textContent = text;
+  status.disconnected(kind === "gone");
+}
+
+const THEMES = ["auto", "light", "dark"];
+function theme() {
+  const now = document.documentElement.dataset.theme ?? "auto";
+  at("theme").querySelector(".choice-name").textContent = now;
+}
+function repaint() {
+  map.draw();
+  map.dots();
+  history.draw();
+  shape.draw();
+}
+at("theme").addEventListener("click", () => {
+  const next = THEMES[(THEMES.indexOf(document.documentElement.dataset.theme ?? "auto") + 1) % 3];
+  if (next === "auto") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = next;
+  try {
+    localStorage.setItem("squealcast-theme", next);
+  } catch {
+    // Not kept then.
+  }
+  theme();
+  repaint();
+});
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
+theme();
+
+if (recording) {
+  link("file", "recording");
+  at("age-unit").textContent = "s before";
+  timeline = new Timeline(about, async (moment) => {
+    const state = await ask(`state.json?at=${moment}`);
+    take(state);
+    numbers();
+    history.mark(moment);
+  });
+  const whole = await ask("history.json");
+  history.load(whole);
+  timeline.paint(whole);
+  const all = await ask("events.json");
+  events.show(all);
+  timeline.events = all;
+  new ResizeObserver(() => timeline.paint(whole)).observe(at("track-levels"));
+  timeline.go(about.span_s[0]);
+} else {
+  const stream = new EventSource("stream");
+  stream.onopen = () => {
+    link("live", "live");
+    mapShown = 0;
+    loadHistory();
+  };
+  stream.onerror = () => link("gone", "no connection");
+  stream.onmessage = (event) => take(JSON.parse(event.data));
+  setInterval(() => {
+    // A node that lives sends twice a second.
+    if (latest && performance.now() - heardAt > 3000) link("gone", "no answer");
+    numbers();
+  }, NUMBERS_EVERY);
+  setInterval(() => {
+    if (!document.hidden) history.refresh();
+  }, HISTORY_EVERY);
+}

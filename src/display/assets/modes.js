@@ -1,0 +1,89 @@
+// The table of modes.
+
+import { Decimals, NONE, fixed, known, put } from "./format.js";
+
+/** A bound says its order of magnitude. */
+const bound = (error) => (error === 0 ? "0" : error.toExponential(0).replace("-", "\u2212"));
+
+export class Modes {
+  constructor(about, choose) {
+    this.threshold = about.instability_threshold;
+    this.body = document.querySelector("#modes tbody");
+    this.rows = new Map();
+    this.chosen = null;
+    this.choose = choose;
+    this.decimals = { frequency: new Decimals(6, 1), growth: new Decimals(4, 2) };
+  }
+
+  numbers(state) {
+    const modes = [...(state.modes ?? [])].sort((a, b) => a[0] - b[0]);
+    for (const id of [...this.rows.keys()]) {
+      if (!modes.some((mode) => mode[0] === id)) {
+        this.rows.get(id).row.remove();
+        this.rows.delete(id);
+      }
+    }
+    // The scales first: every row of a column has the same digits.
+    for (const [, [hz, growth]] of modes) {
+      this.decimals.frequency.of(hz);
+      this.decimals.growth.of(growth);
+    }
+    modes.forEach(([id, [hz, growth, damping, pad, error]], place) => {
+      const { row, cells } = this.rows.get(id) ?? this.#row(id);
+      if (this.body.children[place] !== row) this.body.insertBefore(row, this.body.children[place] ?? null);
+      row.classList.toggle("grows", known(damping) && damping < -this.threshold);
+      put(cells[0], this.decimals.frequency.text(hz), hz);
+      put(cells[1], this.decimals.growth.text(growth), growth);
+      put(cells[2], fixed(damping, 5), damping);
+      put(cells[3], known(error) ? bound(error) : NONE, error);
+      put(cells[4], known(pad) ? `${fixed(100 * pad, 0)} %` : NONE, pad);
+    });
+  }
+
+  #row(id) {
+    const row = document.createElement("tr");
+    const head = document.createElement("th");
+    head.scope = "row";
+    const button = document.createElement("button");
+    button.type = "button";
+    button.className = "mode-button";
+    button.dataset.mode = id;
+    button.setAttribute("aria-pressed", "false");
+    button.setAttribute("aria-label", `Show mode ${id}`);
+    const swatch = document.createElement("span");
+    swatch.className = `swatch mode-${id % 7}`;
+    button.append(swatch, String(id));
+    head.append(button);
+    row.append(head);
+    row.addEventListener("click", () => {
+      this.select(id);
+      // On a small screen the picture is elsewhere.
+      document.querySelector(".panel.shape").scrollIntoView({ block: "nearest" });
+    });
+    const cells = Array.from({ length: 5 }, () => {
+      const cell = document.createElement("td");
+      const data = document.createElement("data");
+      cell.append(data);
+      row.append(cell);
+      return data;
+    });
+    const entry = { row, cells, button };
+    this.rows.set(id, entry);
+    if (id === this.chosen) this.#mark(entry, true);
+    return entry;
+  }
+
+  #mark({ row, button }, chosen) {
+    row.classList.toggle("chosen", chosen);
+    button.setAttribute("aria-pressed", String(chosen));
+  }
+
+  select(id) {
+    const before = this.rows.get(this.chosen);
+    if (before) this.#mark(before, false);
+    this.chosen = id;
+    const entry = this.rows.get(id);
+    if (entry) this.#mark(entry, true);
+    this.choose(id);
+  }
+}

@@ -1,0 +1,331 @@
+// A mode in motion: Re(x e^{iφ}) with the phase φ running forward, so that travelling waves travel the right way.
+
+import { colour, fixed } from "./format.js";
+
+const at = (id) => document.getElementById(id);
+/** Seconds of a period on the screen. */
+const PERIOD = 2.4;
+
+/** Displacements at a phase: Re((re + i im) e^{iφ}). */
+export function displaced(re, im, phase) {
+  const [c, s] = [Math.cos(phase), Math.sin(phase)];
+  return re.map((value, k) => value * c - im[k] * s);
+}
+
+export class ShapeView {
+  constructor() {
+    this.canvas = at("shape");
+    this.stage = at("stage");
+    this.playing = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.phase = 0;
+    this.shape = null;
+    this.picture = null;
+    this.visible = true;
+    at("shape-play").addEventListener("click", () => this.#play(!this.playing));
+    at("shape-phase").addEventListener("input", (event) => {
+      this.#play(false);
+      this.#turn(Number(event.target.value) * Math.PI / 180);
+    });
+    this.#play(this.playing);
+    new ResizeObserver(() => this.#draw()).observe(this.stage);
+    new IntersectionObserver((entries) => {
+      this.visible = entries.some((entry) => entry.isIntersecting);
+      this.#run();
+    }).observe(this.stage);
+    this.frame = this.frame.bind(this);
+  }
+
+  async show(shape) {
+    const growth = shape.growth_rate_per_s;
+    const grown = growth > 0 ? "grows" : growth < 0 ? "decays" : "neither grows nor decays";
+    at("shape-note").textContent = `mode ${shape.id}, ${fixed(shape.frequency_hz, shape.frequency_hz >= 100 ? 1 : 4)} Hz, slowed down; it ${grown}`;
+    this.canvas.setAttribute("aria-label", `Mode ${shape.id} in motion`);
+    const spatial = shape.parts.some((part) => part.spatial);
+    const kind = spatial ? Space : Sticks;
+    if (!(this.picture instanceof kind)) {
+      this.picture?.dispose();
+      // A canvas keeps its first kind of context.
+      const fresh = this.canvas.cloneNode();
+      this.canvas.replaceWith(fresh);
+      this.canvas = fresh;
+      this.picture = spatial ? await Space.create(fresh) : new Sticks(fresh);
+    }
+    this.shape = shape;
+    this.picture.take(shape);
+    this.#draw();
+    this.#run();
+  }
+
+  missing(reason) {
+    at("shape-note").textContent = reason;
+  }
+
+  /** The colours changed. */
+  draw() {
+    if (this.shape) this.picture.take(this.shape);
+    this.#draw();
+  }
+
+  #play(playing) {
+    this.playing = playing;
+    const button = at("shape-play");
+    button.textContent = playing ? "Pause" : "Play";
+    button.setAttribute("aria-pressed", String(playing));
+    this.#run();
+  }
+
+  #run() {
+    if (this.running || !this.playing || !this.visible || !this.shape) return;
+    this.running = true;
+    this.before = performance.now();
+    requestAnimationFrame(this.frame);
+  }
+
+  frame(now) {
+    this.running = this.playing && this.visible;
+    if (!this.running) return;
+    // 30 pictures a second are enough.
+    if (now - this.before >= 30) {
+      this.#turn(this.phase + 2 * Math.PI * Math.min(0.2, (now - this.before) / 1000) / PERIOD);
+      this.before = now;
+    }
+    requestAnimationFrame(this.frame);
+  }
+
+  #turn(phase) {
+    this.phase = phase % (2 * Math.PI);
+    const degrees = Math.round(this.phase * 180 / Math.PI);
+    at("shape-phase").value = degrees;
+    at("shape-degrees").textContent = `${degrees}°`;
+    this.#draw();
+  }
+
+  #draw() {
+    if (!this.shape || !this.picture) return;
+    const { clientWidth: width, clientHeight: height } = this.stage;
+    this.picture.draw(this.phase, width, height);
+    this.canvas.dataset.phase = this.phase.toFixed(4);
+  }
+}
+
+/** Numbered degrees of freedom: a stalk each, its range behind it, its phase as a hand below it. */
+class Sticks {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.ctx = canvas.getContext("2d");
+  }
+
+  take(shape) {
+    this.shape = shape;
+    this.paint = { ink: colour("--ink"), muted: colour("--muted"), grid: colour("--grid"), pad: colour("--mode-0"), disc: colour("--mode-1"), other: colour("--mode-2") };
+  }
+
+  dispose() {}
+
+  draw(phase, width, height) {
+    const { ctx, canvas, paint } = this;
+    const ratio = devicePixelRatio;
+    const size = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ctx.clearRect(0, 0, width, height);
+    const text = Math.max(11, Math.min(18, width / 34));
+    ctx.font = `${text}px system-ui, sans-serif`;
+    const count = this.shape.parts.reduce((sum, part) => sum + part.re.length, 0);
+    const gap = this.shape.parts.length > 1 ? 1 : 0;
+    const step = (width - 24) / (count + gap * (this.shape.parts.length - 1));
+    const dial = Math.min(step * 0.3, height * 0.06, 14);
+    const middle = (height - 2 * dial - 2.2 * text) / 2 + text * 0.6;
+    const head = Math.max(2.5, Math.min(9, step * 0.22));
+    const reach = middle - text * 1.5 - head;
+    let x = 12 + step / 2;
+    for (const part of this.shape.parts) {
+      const u = displaced(part.re, part.im, phase);
+      const from = x - step / 2;
+      ctx.fillStyle = paint.muted;
+      ctx.textAlign = "left";
+      ctx.fillText(part.name, from + 2, text);
+      ctx.strokeStyle = paint.muted;
+      ctx.lineWidth = 1;
+      ctx.beginPath();
+      ctx.moveTo(from, middle);
+      ctx.lineTo(from + step * u.length, middle);
+      ctx.stroke();
+      const tone = paint[part.name] ?? paint.other;
+      const heights = u.map((value) => middle - value * reach);
+      // The line through the heads makes the figure.
+      ctx.strokeStyle = tone;
+      ctx.globalAlpha = 0.35;
+      ctx.beginPath();
+      heights.forEach((y, k) => ctx[k ? "lineTo" : "moveTo"](x + k * step, y));
+      ctx.stroke();
+      u.forEach((value, k) => {
+        const magnitude = Math.hypot(part.re[k], part.im[k]);
+        ctx.globalAlpha = 0.16;
+        ctx.fillStyle = tone;
+        ctx.fillRect(x - head, middle - magnitude * reach, 2 * head, 2 * magnitude * reach);
+        ctx.globalAlpha = 1;
+        ctx.strokeStyle = tone;
+        ctx.lineWidth = Math.max(1.5, head / 3);
+        ctx.beginPath();
+        ctx.moveTo(x, middle);
+        ctx.lineTo(x, heights[k]);
+        ctx.stroke();
+        ctx.beginPath();
+        ctx.arc(x, heights[k], head, 0, 2 * Math.PI);
+        ctx.fill();
+        const y = height - dial - text * 1.35;
+        ctx.strokeStyle = paint.grid;
+        ctx.lineWidth = 1.5;
+        ctx.beginPath();
+        ctx.arc(x, y, dial, 0, 2 * Math.PI);
+        ctx.stroke();
+        if (magnitude > 1e-3) {
+          const angle = Math.atan2(part.im[k], part.re[k]) + phase;
+          const length = dial * (0.35 + 0.65 * magnitude);
+          ctx.strokeStyle = tone;
+          ctx.lineWidth = 2;
+          ctx.beginPath();
+          ctx.moveTo(x, y);
+          ctx.lineTo(x + length * Math.cos(angle), y - length * Math.sin(angle));
+          ctx.stroke();
+        }
+        if (step > text * 0.9) {
+          ctx.fillStyle = paint.muted;
+          ctx.textAlign = "center";
+          ctx.fillText(String(k + 1), x, height - 3);
+        }
+        x += step;
+      });
+      x += gap * step;
+    }
+  }
+}
+
+/** Interface nodes in space. */
+class Space {
+  static async create(canvas) {
+    const three = await import("./vendor/three.module.min.js");
+    return new Space(three, canvas);
+  }
+
+  constructor(three, canvas) {
+    this.three = three;
+    this.canvas = canvas;
+    this.renderer = new three.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.scene = new three.Scene();
+    this.camera = new three.PerspectiveCamera(32, 1, 0.01, 100);
+    this.azimuth = -0.7;
+    this.elevation = 0.75;
+    canvas.tabIndex = 0;
+    const turn = (dx, dy) => {
+      this.azimuth += dx;
+      this.elevation = Math.max(-1.5, Math.min(1.5, this.elevation + dy));
+      if (this.last) this.draw(...this.last);
+    };
+    canvas.addEventListener("pointermove", (event) => {
+      if (event.buttons & 1) turn(-event.movementX * 0.01, event.movementY * 0.01);
+    });
+    canvas.addEventListener("keydown", (event) => {
+      const by = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+      if (!by) return;
+      event.preventDefault();
+      turn(...by);
+    });
+  }
+
+  dispose() {
+    this.renderer.dispose();
+  }
+
+  take(shape) {
+    const { three, scene } = this;
+    scene.clear();
+    const spatial = shape.parts.filter((part) => part.spatial && part.nodes_m.length);
+    const all = spatial.flatMap((part) => part.nodes_m);
+    const low = [0, 1, 2].map((axis) => Math.min(...all.map((node) => node[axis])));
+    const high = [0, 1, 2].map((axis) => Math.max(...all.map((node) => node[axis])));
+    const extent = Math.max(...high.map((value, axis) => value - low[axis]), 1e-9);
+    // In units of the patch, about its middle.
+    const place = (node) => node.map((value, axis) => (value - (low[axis] + high[axis]) / 2) / extent);
+    this.parts = spatial.map((part) => {
+      const rest = part.nodes_m.map(place);
+      const tone = new three.Color(colour(part.name === "disc" ? "--mode-1" : "--mode-0"));
+      const geometry = new three.BufferGeometry();
+      const positions = new three.BufferAttribute(new Float32Array(3 * rest.length), 3);
+      const colours = new three.BufferAttribute(new Float32Array(3 * rest.length), 3);
+      geometry.setAttribute("position", positions);
+      geometry.setAttribute("color", colours);
+      const points = new three.Points(geometry, new three.PointsMaterial({ size: 0.05, vertexColors: true }));
+      geometry.setIndex(null);
+      const wire = new three.BufferGeometry();
+      wire.setAttribute("position", positions);
+      wire.setAttribute("color", colours);
+      wire.setIndex(neighbours(rest));
+      const lines = new three.LineSegments(wire, new three.LineBasicMaterial({ vertexColors: true }));
+      const still = new three.BufferGeometry();
+      still.setAttribute("position", new three.BufferAttribute(new Float32Array(rest.flat()), 3));
+      still.setIndex(wire.getIndex());
+      const ghost = new three.LineSegments(still, new three.LineBasicMaterial({ color: colour("--muted"), transparent: true, opacity: 0.25 }));
+      for (const object of [ghost, lines, points]) {
+        object.frustumCulled = false;
+        scene.add(object);
+      }
+      return { part, rest, positions, colours, tone };
+    });
+  }
+
+  draw(phase, width, height) {
+    this.last = [phase, width, height];
+    const { renderer, camera } = this;
+    if (this.width !== width || this.height !== height) {
+      [this.width, this.height] = [width, height];
+      renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+      renderer.setSize(width, height, false);
+      camera.aspect = width / height;
+      camera.updateProjectionMatrix();
+    }
+    const far = 2 / Math.min(1, camera.aspect);
+    const [ca, sa, ce, se] = [Math.cos(this.azimuth), Math.sin(this.azimuth), Math.cos(this.elevation), Math.sin(this.elevation)];
+    camera.up.set(0, 0, 1);
+    camera.position.set(far * ca * ce, far * sa * ce, far * se);
+    camera.lookAt(0, 0, 0);
+    const bright = new this.three.Color(colour("--ink"));
+    for (const { part, rest, positions, colours, tone } of this.parts) {
+      const u = displaced(part.re, part.im, phase);
+      const mixed = tone.clone();
+      rest.forEach((node, k) => {
+        const d = [u[3 * k], u[3 * k + 1], u[3 * k + 2]];
+        positions.setXYZ(k, node[0] + 0.15 * d[0], node[1] + 0.15 * d[1], node[2] + 0.15 * d[2]);
+        mixed.copy(tone).lerp(bright, Math.min(0.7, 0.7 * Math.hypot(...d)));
+        colours.setXYZ(k, mixed.r, mixed.g, mixed.b);
+      });
+      positions.needsUpdate = true;
+      colours.needsUpdate = true;
+    }
+    // For tests and for whoever wants the numbers.
+    this.canvas.displacements = this.parts.map(({ part }) => displaced(part.re, part.im, phase));
+    renderer.render(this.scene, camera);
+  }
+}
+
+/** Lines from each node to its nearest ones: a net without knowing the elements. */
+function neighbours(nodes) {
+  const pairs = new Set();
+  const count = nodes.length;
+  const most = count > 1500 ? 3 : 4;
+  nodes.forEach((node, k) => {
+    const near = [];
+    for (let j = 0; j < count; j++) {
+      if (j === k) continue;
+      const distance = Math.hypot(node[0] - nodes[j][0], node[1] - nodes[j][1], node[2] - nodes[j][2]);
+      if (near.length < most || distance < near[near.length - 1][0]) {
+        near.push([distance, j]);
+        near.sort((a, b) => a[0] - b[0]);
+        near.length = Math.min(most, near.length);
+      }
+    }
+    for (const [distance, j] of near) if (distance < 2.5 * near[0][0]) pairs.add(Math.min(k, j) * count + Math.max(k, j));
+  });
+  return [...pairs].flatMap((pair) => [Math.floor(pair / count), pair % count]);
+}

@@ -1,0 +1,170 @@
+//! A node, as the page sees it: follows its watch.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use super::curves::Curves;
+use super::events::{Events, seconds};
+use super::history::History;
+use super::server::{About, Source};
+use super::shape::shape;
+use super::state::{CountersShown, Shown, State, spread, trend_per_s};
+use crate::io::clock;
+use crate::node::{Sample, Watch};
+use crate::physics::{Solver, StabilityMap};
+use crate::rig::Rig;
+
+/// Length of a bin of the history, ns.
+const BIN_NS: i64 = 200_000_000;
+/// Bins kept: 10 minutes.
+const BINS: usize = 3000;
+/// A state is sent this often although nothing happened, so that the page knows it is still there.
+const SIGN_OF_LIFE: Duration = Duration::from_millis(500);
+
+/// Follows a node.
+pub struct Live {
+    rig: Arc<Rig>,
+    watch: Watch,
+    followed: Mutex<Followed>,
+    solver: Mutex<Solver>,
+}
+
+struct Followed {
+    samples: Vec<Sample>,
+    history: History,
+    events: Events,
+    event_changes: u64,
+    /// Index of the last bin of the state sent before.
+    sent: i64,
+    sent_at: Option<Instant>,
+    /// Predictions of the ticks of the last second.
+    ticks: VecDeque<(Instant, usize)>,
+    map: Option<Arc<StabilityMap>>,
+    map_number: u64,
+    curves: Option<(u64, Arc<str>)>,
+}
+
+impl Live {
+    /// Begins to follow.
+    pub fn new(rig: Arc<Rig>, watch: Watch) -> Self {
+        let solver = Mutex::new(Solver::new(rig.model.dimension()));
+        let followed = Followed {
+            samples: vec![],
+            history: History::new(BIN_NS, BINS),
+            events: Events::default(),
+            event_changes: 0,
+            sent: i64::MIN,
+            sent_at: None,
+            ticks: VecDeque::new(),
+            map: None,
+            map_number: 0,
+            curves: None,
+        };
+        let live = Self { rig, watch, followed: Mutex::new(followed), solver };
+        live.watch.take_samples(&mut vec![]);
+        live
+    }
+
+    fn followed(&self) -> MutexGuard<'_, Followed> {
+        self.followed.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Followed {
+    /// Takes in what happened since; whether anything did.
+    fn follow(&mut self, watch: &Watch) -> bool {
+        watch.take_samples(&mut self.samples);
+        for sample in &self.samples {
+            self.history.push(sample);
+            self.event_changes += u64::from(self.events.push(sample));
+        }
+        let now = Instant::now();
+        self.ticks.push_back((now, self.samples.len()));
+        while self.ticks.front().is_some_and(|tick| now - tick.0 > Duration::from_secs(1)) {
+            self.ticks.pop_front();
+        }
+        !self.samples.is_empty()
+    }
+
+    fn state(&mut self, watch: &Watch, with_bins: bool) -> String {
+        let snapshot = watch.snapshot();
+        if let Some(map) = snapshot.map.filter(|map| self.map.as_ref().is_none_or(|known| !Arc::ptr_eq(known, map))) {
+            self.map = Some(map);
+            self.map_number += 1;
+        }
+        let time_s = seconds(clock::now_ns());
+        let bins: Vec<_> = if with_bins { self.history.since(self.sent).collect() } else { vec![] };
+        let state = State {
+            time_s,
+            age_s: snapshot.heard.map(|heard| heard.elapsed().as_secs_f64()),
+            rate_hz: Some(self.ticks.iter().map(|tick| tick.1).sum::<usize>() as f64),
+            prediction: snapshot.prediction.as_ref().map(|p| Shown::new(snapshot.input.as_ref(), p)),
+            spread: spread(&self.history, time_s),
+            trend_per_s: trend_per_s(&self.history, time_s),
+            map: self.map_number,
+            events: self.event_changes,
+            counters: Some(CountersShown::new(snapshot.counters, snapshot.passed_over)),
+            bins,
+        };
+        // Numbers and strings: nothing that JSON cannot hold.
+        let text = serde_json::to_string(&state).unwrap_or_default();
+        if with_bins {
+            self.sent = self.history.bins().back().map_or(i64::MIN, |bin| bin.index);
+            self.sent_at = Some(Instant::now());
+        }
+        text
+    }
+}
+
+impl Source for Live {
+    fn about(&self) -> About {
+        About::new(&self.rig, "live")
+    }
+
+    fn tick(&self, listened_to: bool) -> Option<String> {
+        let mut followed = self.followed();
+        let changed = followed.follow(&self.watch);
+        let due = changed || followed.sent_at.is_none_or(|sent| sent.elapsed() >= SIGN_OF_LIFE);
+        (listened_to && due).then(|| followed.state(&self.watch, true))
+    }
+
+    fn state(&self, _at_s: Option<f64>) -> String {
+        self.followed().state(&self.watch, false)
+    }
+
+    fn history(&self) -> String {
+        let history = self.followed().history.clone();
+        serde_json::to_string(&serde_json::json!({ "bin_s": seconds(BIN_NS), "bins": history.bins() }))
+            .unwrap_or_default()
+    }
+
+    fn events(&self) -> Events {
+        self.followed().events.clone()
+    }
+
+    fn map(&self, number: u64) -> Option<Arc<str>> {
+        let map = {
+            let followed = self.followed();
+            if let Some((_, text)) = followed.curves.as_ref().filter(|(of, _)| *of == followed.map_number) {
+                return Some(text.clone());
+            }
+            followed.map.clone().filter(|_| number <= followed.map_number)?
+        };
+        let curves = Curves::new(&map, self.rig.band_max_hz);
+        let text: Arc<str> = serde_json::to_string(&curves).unwrap_or_default().into();
+        let mut followed = self.followed();
+        if followed.map.as_ref().is_some_and(|latest| Arc::ptr_eq(latest, &map)) {
+            followed.curves = Some((followed.map_number, text.clone()));
+        }
+        Some(text)
+    }
+
+    fn shape(&self, id: u32, _at_s: Option<f64>) -> Result<String, String> {
+        let snapshot = self.watch.snapshot();
+        let input = snapshot.input.ok_or("no conditions were heard yet")?;
+        let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
+        let shape = shape(&self.rig, &mut solver, snapshot.map.as_deref(), &input.point(), id)?;
+        Ok(serde_json::to_string(&shape).unwrap_or_default())
+    }
+}

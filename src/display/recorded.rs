@@ -1,0 +1,236 @@
+//! A recording, as the page sees it: read once, then asked moment by moment.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::curves::Curves;
+use super::events::{Events, seconds};
+use super::history::History;
+use super::server::{About, Source};
+use super::shape::shape;
+use super::state::{Shown, State, spread, trend_per_s};
+use crate::io::message::Payload;
+use crate::io::recording::{FileDamage, Recorded as Content, Recording};
+use crate::node::{Sample, session_map};
+use crate::physics::{Solver, StabilityMap};
+use crate::rig::Rig;
+use crate::wire::{OperatingPoint, Prediction, SessionEvent, event_kind};
+
+/// Bins of the history; they get longer with the recording.
+const BINS: usize = 3000;
+/// Length of a bin to begin with, ns.
+const FIRST_BIN_NS: i64 = 50_000_000;
+/// Moments kept in full. Of a longer recording only every second, fourth ... prediction can be looked at, and those
+/// where the level changes; events and history count them all.
+const MOST_MOMENTS: usize = 40_000;
+/// Inputs remembered until their prediction comes.
+const INPUTS: usize = 1024;
+/// Maps kept computed.
+const MAPS: usize = 8;
+
+/// One prediction with its conditions.
+#[derive(Clone, Debug)]
+pub struct Moment {
+    pub time_ns: i64,
+    pub input: Option<OperatingPoint>,
+    pub prediction: Prediction,
+    /// Number of the prediction in the recording.
+    index: u64,
+    /// Its level is not that of the prediction before.
+    changed: bool,
+}
+
+/// What a recording holds, in the form of a page or a report.
+pub struct Recorded {
+    pub rig: Arc<Rig>,
+    pub history: History,
+    pub events: Events,
+    /// In order; see [`Recorded::stride`].
+    pub moments: Vec<Moment>,
+    /// Of how many predictions one is kept.
+    pub stride: u64,
+    /// Predictions by level: OK, WARN, SQUEAL, FAULT.
+    pub levels: [u64; 4],
+    /// Inputs, and those that were not predicted.
+    pub inputs: u64,
+    pub reused: u64,
+    /// Settings and maps, in order, with the time they were recorded.
+    pub session_events: Vec<(i64, SessionEvent)>,
+    pub damage: Vec<FileDamage>,
+    level_before: Option<u8>,
+    maps: Mutex<VecDeque<(u64, Arc<StabilityMap>)>>,
+    solver: Mutex<Solver>,
+}
+
+impl Recorded {
+    /// Reads `recording`, made with `rig`.
+    pub fn read(recording: &Recording, rig: Arc<Rig>) -> Self {
+        let mut recorded = Self {
+            solver: Mutex::new(Solver::new(rig.model.dimension())),
+            rig,
+            history: History::coarsening(FIRST_BIN_NS, BINS),
+            events: Events::default(),
+            moments: vec![],
+            stride: 1,
+            levels: [0; 4],
+            inputs: 0,
+            reused: 0,
+            session_events: vec![],
+            damage: vec![],
+            level_before: None,
+            maps: Mutex::default(),
+        };
+        let mut inputs: VecDeque<OperatingPoint> = VecDeque::new();
+        let mut messages = recording.messages();
+        for entry in messages.by_ref() {
+            let time_ns = i64::try_from(entry.log_time_ns).unwrap_or(i64::MAX);
+            match entry.message {
+                Content::Known(Payload::OperatingPoint(input)) => {
+                    recorded.inputs += 1;
+                    if inputs.len() == INPUTS {
+                        inputs.pop_front();
+                    }
+                    inputs.push_back(input);
+                }
+                Content::Known(Payload::Prediction(prediction)) => {
+                    let input = inputs.iter().rev().find(|input| input.seq == prediction.input_seq);
+                    recorded.take(time_ns, input, prediction);
+                }
+                Content::Known(Payload::SessionEvent(event)) => recorded.session_events.push((time_ns, event)),
+                _ => {}
+            }
+        }
+        recorded.damage = messages.damage();
+        recorded
+    }
+
+    fn take(&mut self, time_ns: i64, input: Option<&OperatingPoint>, prediction: Prediction) {
+        let sample = Sample::new(time_ns, input, &prediction);
+        self.history.push(&sample);
+        self.events.push(&sample);
+        let count: u64 = self.levels.iter().sum();
+        self.levels[usize::from(prediction.level).min(3)] += 1;
+        self.reused += u64::from(prediction.reused);
+        let changed = self.level_before != Some(prediction.level);
+        self.level_before = Some(prediction.level);
+        if !changed && !count.is_multiple_of(self.stride) {
+            return;
+        }
+        if self.moments.len() == MOST_MOMENTS {
+            self.stride *= 2;
+            let stride = self.stride;
+            let regular = |moment: &Moment| moment.index.is_multiple_of(stride);
+            self.moments.retain(|moment| moment.changed || regular(moment));
+            // A level that changes all the time is no reason to keep everything.
+            if self.moments.len() > MOST_MOMENTS / 4 * 3 {
+                self.moments.retain(regular);
+            }
+        }
+        self.moments.push(Moment { time_ns, input: input.cloned(), prediction, index: count, changed });
+    }
+
+    /// First and last moment, s since the epoch; `None` without any prediction.
+    pub fn span_s(&self) -> Option<(f64, f64)> {
+        let first = seconds(self.moments.first()?.time_ns);
+        let bin_s = seconds(self.history.bin_ns());
+        let last = self.moments.last().map_or(first, |last| seconds(last.time_ns));
+        // The very last predictions may be among those that are not kept.
+        let end = self.history.bins().back().map_or(last, |bin| bin.index as f64 * bin_s);
+        Some((first, last.max(end)))
+    }
+
+    /// The latest kept prediction up to a moment; the first before any.
+    pub fn moment(&self, at_s: f64) -> Option<&Moment> {
+        let after = self.moments.partition_point(|moment| seconds(moment.time_ns) <= at_s + 1e-7);
+        self.moments.get(after.saturating_sub(1))
+    }
+
+    fn map_events(&self) -> impl Iterator<Item = &(i64, SessionEvent)> {
+        self.session_events.iter().filter(|(_, event)| event.kind == event_kind::STABILITY_MAP)
+    }
+
+    /// Number of the map that was in use, from 1; 0 before the first.
+    pub fn map_number(&self, at_s: f64) -> u64 {
+        self.map_events().take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7).count() as u64
+    }
+
+    /// The map of that number, computed again; `None` where there is none or it cannot be had.
+    pub fn stability_map(&self, number: u64) -> Option<Arc<StabilityMap>> {
+        let known = |maps: &VecDeque<(u64, Arc<StabilityMap>)>| {
+            maps.iter().find(|(known, _)| *known == number).map(|(_, map)| map.clone())
+        };
+        if let Some(map) = known(&self.maps.lock().unwrap_or_else(PoisonError::into_inner)) {
+            return Some(map);
+        }
+        let (_, event) = self.map_events().nth(usize::try_from(number.checked_sub(1)?).ok()?)?;
+        let point = crate::physics::OperatingPoint {
+            normal_load_n: event.normal_load_n,
+            disc_speed_rad_s: event.disc_speed_rad_s,
+            friction_coefficient: 0.0,
+        };
+        let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
+        let maps = || self.maps.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(map) = known(&maps()) {
+            return Some(map);
+        }
+        let map = Arc::new(session_map(&self.rig, &mut solver, &point).ok()?);
+        let mut maps = maps();
+        if maps.len() == MAPS {
+            maps.pop_front();
+        }
+        maps.push_back((number, map.clone()));
+        Some(map)
+    }
+}
+
+impl Source for Recorded {
+    fn about(&self) -> About {
+        About { span_s: self.span_s(), ..About::new(&self.rig, "recording") }
+    }
+
+    fn tick(&self, _listened_to: bool) -> Option<String> {
+        None
+    }
+
+    fn state(&self, at_s: Option<f64>) -> String {
+        let time_s = at_s.filter(|at_s| at_s.is_finite()).or(self.span_s().map(|span| span.0)).unwrap_or(0.0);
+        let moment = self.moment(time_s);
+        let state = State {
+            time_s,
+            age_s: moment.map(|moment| (time_s - seconds(moment.time_ns)).max(0.0)),
+            rate_hz: None,
+            prediction: moment.map(|moment| Shown::new(moment.input.as_ref(), &moment.prediction)),
+            spread: spread(&self.history, time_s),
+            trend_per_s: trend_per_s(&self.history, time_s),
+            map: self.map_number(time_s),
+            events: self.events.count(),
+            counters: None,
+            bins: vec![],
+        };
+        serde_json::to_string(&state).unwrap_or_default()
+    }
+
+    fn history(&self) -> String {
+        let bin_s = seconds(self.history.bin_ns());
+        serde_json::to_string(&serde_json::json!({ "bin_s": bin_s, "bins": self.history.bins() })).unwrap_or_default()
+    }
+
+    fn events(&self) -> Events {
+        self.events.clone()
+    }
+
+    fn map(&self, number: u64) -> Option<Arc<str>> {
+        let map = self.stability_map(number)?;
+        serde_json::to_string(&Curves::new(&map, self.rig.band_max_hz)).ok().map(Into::into)
+    }
+
+    fn shape(&self, id: u32, at_s: Option<f64>) -> Result<String, String> {
+        let time_s = at_s.or(self.span_s().map(|span| span.0)).unwrap_or(0.0);
+        let moment = self.moment(time_s).ok_or("the recording holds no prediction")?;
+        let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
+        let map = self.stability_map(self.map_number(time_s));
+        let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
+        let shape = shape(&self.rig, &mut solver, map.as_deref(), &input.point(), id)?;
+        Ok(serde_json::to_string(&shape).unwrap_or_default())
+    }
+}

@@ -1,0 +1,265 @@
+//! A recording as one HTML file that needs nothing else.
+
+use std::fmt::Write;
+
+use super::curves::Curves;
+use super::events::{Event, Events, iso, seconds};
+use super::recorded::Recorded;
+use crate::plot;
+use crate::wire::{event_kind, level};
+
+/// Moments whose stability map is drawn.
+const WORST: usize = 3;
+/// Events listed; the rest is in the CSV file.
+const LISTED: usize = 500;
+
+const STYLE: &str = include_str!("assets/report.css");
+
+/// What the report says about where its recording came from.
+#[derive(Clone, Debug)]
+pub struct Origin {
+    pub file: String,
+    pub version: Option<String>,
+}
+
+/// The report.
+///
+/// # Errors
+/// A figure cannot be drawn.
+pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::PlotError> {
+    let rig = &recorded.rig;
+    let (from_s, to_s) = recorded.span_s().unwrap_or((0.0, 0.0));
+    let title = format!("{}, {}", rig.name, iso(from_s));
+    let mut html = format!(
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\n\
+         <title>squealcast report: {}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n",
+        escaped(&title)
+    );
+    let _ = write!(html, "<h1>Session report</h1>\n<p class=\"lead\">{}</p>\n", escaped(&title));
+    html += &verdict(&recorded.events, to_s);
+    html += &section("Session", &session(recorded, origin, from_s, to_s));
+    let figure = |svg: &str, caption: &str| format!("<figure>{svg}<figcaption>{caption}</figcaption></figure>\n");
+    html += &section(
+        "Conditions and predictions",
+        &figure(
+            &inline(&plot::history("", &recorded.history, from_s)?),
+            "Smallest and largest value in each stretch of time; shaded where squeal was predicted.",
+        ),
+    );
+    html += &section("Events", &events(&recorded.events, from_s));
+    let mut maps = String::new();
+    for event in worst(&recorded.events) {
+        let at_s = event.onset_s;
+        let number = recorded.map_number(event.end_s.unwrap_or(at_s)).max(1);
+        let Some(map) = recorded.stability_map(number) else { continue };
+        let curves = Curves::new(&map, rig.band_max_hz);
+        let caption = format!(
+            "Event {}, {:.2} s after the start: {:.1} N, {:.3} rad/s, critical friction coefficient {}. The line marks \
+             the friction coefficient of the fastest growth.",
+            event.number,
+            at_s - from_s,
+            map.point.normal_load_n,
+            map.point.disc_speed_rad_s,
+            map.critical_friction().map_or_else(|| "none".to_owned(), |mu| format!("{mu:.6}")),
+        );
+        maps += &figure(&inline(&plot::map("", &curves, at_its_worst(recorded, event))?), &escaped(&caption));
+    }
+    if maps.is_empty() {
+        maps = "<p>No squeal was predicted.</p>\n".to_owned();
+    }
+    html += &section("Stability maps at the worst moments", &maps);
+    html += &section("Error bounds", &error_bounds(recorded));
+    html += &section("Skipped work and damage", &skipped(recorded));
+    html += &section("Rig", &format!("<pre>{}</pre>\n", escaped(&rig.describe())));
+    html += "</main>\n</body>\n</html>\n";
+    Ok(html)
+}
+
+fn section(title: &str, body: &str) -> String {
+    format!("<section>\n<h2>{title}</h2>\n{body}</section>\n")
+}
+
+/// One sentence for who reads no further.
+fn verdict(events: &Events, to_s: f64) -> String {
+    let squeals: Vec<&Event> = events.iter().filter(|event| event.kind == level::name(level::SQUEAL)).collect();
+    let lasted: f64 = squeals.iter().map(|event| event.end_s.unwrap_or(to_s) - event.onset_s).sum();
+    let worst = worst(events).into_iter().next();
+    match worst {
+        None if squeals.is_empty() => "<p class=\"verdict ok\">No squeal was predicted.</p>\n".to_owned(),
+        worst => format!(
+            "<p class=\"verdict squeal\">Squeal was predicted {} time{}, {lasted:.2} s in all{}.</p>\n",
+            squeals.len(),
+            if squeals.len() == 1 { "" } else { "s" },
+            worst.map_or_else(String::new, |event| format!(
+                "; worst in mode {} at {} Hz, growing by {} 1/s",
+                event.mode_id.unwrap_or_default(),
+                number(event.frequency_hz.unwrap_or(f64::NAN)),
+                number(event.growth_rate_per_s.unwrap_or(f64::NAN)),
+            ))
+        ),
+    }
+}
+
+fn session(recorded: &Recorded, origin: &Origin, from_s: f64, to_s: f64) -> String {
+    let [ok, warn, squeal, fault] = recorded.levels;
+    let mut rows = vec![
+        ("recording", origin.file.clone()),
+        ("from", iso(from_s)),
+        ("to", format!("{} ({:.2} s)", iso(to_s), to_s - from_s)),
+        ("rig", recorded.rig.name.clone()),
+        ("rig hash", recorded.rig.content_hash.clone()),
+        ("recorded by", origin.version.clone().unwrap_or_else(|| "not known".to_owned())),
+        ("report by", format!("squealcast {}", env!("CARGO_PKG_VERSION"))),
+        ("inputs", recorded.inputs.to_string()),
+        (
+            "predictions",
+            format!("{} (OK {ok}, WARN {warn}, SQUEAL {squeal}, FAULT {fault})", ok + warn + squeal + fault),
+        ),
+    ];
+    let settings = recorded.session_events.iter().filter(|(_, event)| event.kind == event_kind::PARAMETER);
+    let told: Vec<String> = settings
+        .map(|(time_ns, event)| match seconds(*time_ns) - from_s {
+            late if late > 0.5 => format!("{} = {} after {late:.2} s", event.name, event.value),
+            _ => format!("{} = {}", event.name, event.value),
+        })
+        .collect();
+    rows.push(("settings", told.join("; ")));
+    let cells: String = rows
+        .iter()
+        .map(|(name, value)| format!("<tr><th scope=\"row\">{name}</th><td>{}</td></tr>\n", escaped(value)))
+        .collect();
+    format!("<table class=\"facts\"><tbody>\n{cells}</tbody></table>\n")
+}
+
+fn events(events: &Events, from_s: f64) -> String {
+    let count = events.iter().count();
+    if count == 0 {
+        return "<p>None.</p>\n".to_owned();
+    }
+    let mut html = "<table><thead><tr><th>no.</th><th>event</th><th>after, s</th><th>duration, s</th><th>mode</th>\
+                    <th>frequency, Hz</th><th>growth, 1/s</th><th>μ</th><th>load, N</th><th>speed, rad/s</th></tr></thead>\
+                    <tbody>\n"
+        .to_owned();
+    for event in events.iter().take(LISTED) {
+        let cells = [
+            event.number.to_string(),
+            event.kind.to_owned(),
+            format!("{:.3}", event.onset_s - from_s),
+            event.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s)),
+            event.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
+            event.frequency_hz.map_or_else(|| "–".to_owned(), number),
+            event.growth_rate_per_s.map_or_else(|| "–".to_owned(), number),
+            number(event.friction_coefficient),
+            number(event.normal_load_n),
+            number(event.disc_speed_rad_s),
+        ];
+        let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
+        let _ = writeln!(html, "<tr class=\"{}\">{cells}</tr>", event.kind.to_lowercase());
+    }
+    html += "</tbody></table>\n";
+    if count > LISTED {
+        let _ = writeln!(html, "<p>{} more in events.csv.</p>", count - LISTED);
+    }
+    html
+}
+
+/// The events of the fastest growth.
+fn worst(events: &Events) -> Vec<&Event> {
+    let mut squeals: Vec<&Event> = events.iter().filter(|event| event.growth_rate_per_s.is_some()).collect();
+    squeals.sort_by(|a, b| b.growth_rate_per_s.unwrap_or(0.0).total_cmp(&a.growth_rate_per_s.unwrap_or(0.0)));
+    squeals.truncate(WORST);
+    squeals
+}
+
+/// The friction coefficient of the fastest growth during an event, as far as its moments are kept.
+fn at_its_worst(recorded: &Recorded, event: &Event) -> f64 {
+    let during = |time_s: f64| time_s >= event.onset_s - 1e-7 && event.end_s.is_none_or(|end_s| time_s <= end_s);
+    let moments = recorded.moments.iter().filter(|moment| during(seconds(moment.time_ns)));
+    let growth = |moment: &&super::recorded::Moment| moment.prediction.max_growth_rate_per_s;
+    let worst = moments.filter(|moment| growth(moment).is_finite()).max_by(|a, b| growth(a).total_cmp(&growth(b)));
+    worst
+        .and_then(|moment| moment.input.as_ref())
+        .map_or(event.friction_coefficient, |input| input.friction_coefficient)
+}
+
+/// The largest bounds over the session, by mode.
+fn error_bounds(recorded: &Recorded) -> String {
+    let mut bounds: std::collections::BTreeMap<u32, [f64; 3]> = std::collections::BTreeMap::new();
+    for mode in recorded.moments.iter().flat_map(|moment| &moment.prediction.modes) {
+        let largest = bounds.entry(mode.id).or_insert([f64::NAN; 3]);
+        let found = [mode.residual, mode.frequency_error_hz, mode.growth_rate_error_per_s];
+        for (largest, found) in largest.iter_mut().zip(found) {
+            *largest = largest.max(found);
+        }
+    }
+    let mut html = "<table><thead><tr><th>mode</th><th>largest residual</th><th>frequency, ± Hz</th>\
+                    <th>growth rate, ± 1/s</th></tr></thead><tbody>\n"
+        .to_owned();
+    for (id, [residual, frequency, growth]) in &bounds {
+        let shown = |value: f64| if value.is_finite() { format!("{value:.2e}") } else { "not computed".to_owned() };
+        let cells = [id.to_string(), shown(*residual), shown(*frequency), shown(*growth)];
+        let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
+        let _ = writeln!(html, "<tr>{cells}</tr>");
+    }
+    html += "</tbody></table>\n";
+    if recorded.stride > 1 {
+        let _ = writeln!(html, "<p>Of every {} predictions one was looked at for this table.</p>", recorded.stride);
+    }
+    html
+}
+
+fn skipped(recorded: &Recorded) -> String {
+    let predicted: u64 = recorded.levels.iter().sum();
+    let mut html = format!(
+        "<p>{} inputs were not predicted; {} predictions were reused within the dead band.</p>\n",
+        recorded.inputs.saturating_sub(predicted),
+        recorded.reused
+    );
+    if recorded.damage.is_empty() {
+        html += "<p>The recording is whole.</p>\n";
+    }
+    for damage in &recorded.damage {
+        let _ = writeln!(html, "<p>{}</p>", escaped(&damage.to_string()));
+    }
+    html
+}
+
+/// A figure without the declaration a file of its own would have.
+fn inline(svg: &str) -> String {
+    svg.find("<svg").map_or(svg, |start| &svg[start..]).to_owned()
+}
+
+/// A number with six significant digits at most.
+fn number(value: f64) -> String {
+    if !value.is_finite() {
+        return "–".to_owned();
+    }
+    let magnitude = if value == 0.0 { 0.0 } else { value.abs().log10().floor() };
+    let decimals = (5.0 - magnitude).clamp(0.0, 8.0) as usize;
+    let text = format!("{value:.decimals$}");
+    match text.contains('.') {
+        true => text.trim_end_matches('0').trim_end_matches('.').to_owned(),
+        false => text,
+    }
+}
+
+/// Text that is no markup.
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_and_text_are_written_for_html() {
+        assert_eq!(number(0.334_599_12), "0.334599");
+        assert_eq!(number(500.0), "500");
+        assert_eq!(number(1234567.0), "1234567");
+        assert_eq!(number(f64::NAN), "–");
+        assert_eq!(escaped("<a href=\"x\">&"), "&lt;a href=&quot;x&quot;&gt;&amp;");
+    }
+}

@@ -1,0 +1,122 @@
+//! The shape of a mode at an operating point, as displacements of the rig's degrees of freedom or interface nodes.
+//!
+//! A mode moves as `Re(x e^{λt})`: with `x = |x| e^{iφ}` a point moves as `|x| cos(ωt + φ)`, so that what has the
+//! larger phase moves first.
+
+use faer::{MatRef, c64};
+use serde::Serialize;
+
+use crate::physics::{OperatingPoint, Solver, StabilityMap, Vectors};
+use crate::rig::Rig;
+
+/// A mode's shape; the largest displacement has magnitude 1 and phase 0.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Shape {
+    pub id: u32,
+    pub frequency_hz: f64,
+    pub growth_rate_per_s: f64,
+    /// Pad, disc, or the whole system.
+    pub parts: Vec<Part>,
+}
+
+/// Displacements of one side.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Part {
+    pub name: String,
+    /// Whether the displacements are of nodes in space, three for each, or of numbered degrees of freedom.
+    pub spatial: bool,
+    /// Positions of the nodes, m.
+    pub nodes_m: Vec<[f64; 3]>,
+    pub re: Vec<f64>,
+    pub im: Vec<f64>,
+}
+
+/// The shape of the mode with identity `id`.
+///
+/// # Errors
+/// Why there is none, in words.
+pub fn shape(
+    rig: &Rig,
+    solver: &mut Solver,
+    map: Option<&StabilityMap>,
+    point: &OperatingPoint,
+    id: u32,
+) -> Result<Shape, String> {
+    let spectrum = solver.solve(&rig.model, point, Vectors::Right).map_err(|error| error.to_string())?;
+    let index = match map {
+        Some(map) => map.identify(&spectrum).iter().position(|&other| other == Some(id)),
+        None => Some(id as usize),
+    };
+    let index = index.filter(|&index| index < spectrum.mode_count).ok_or_else(|| format!("there is no mode {id}"))?;
+    let root = &spectrum.roots[index];
+    let mut parts = parts(rig, spectrum.shapes.as_ref(), index);
+    let all = || parts.iter().flat_map(|part| part.re.iter().zip(&part.im)).map(|(&re, &im)| c64::new(re, im));
+    let largest = all().max_by(|a, b| a.norm().total_cmp(&b.norm())).filter(|value| value.norm() > 0.0);
+    if let Some(largest) = largest {
+        for part in &mut parts {
+            for (re, im) in part.re.iter_mut().zip(&mut part.im) {
+                let scaled = c64::new(*re, *im) / largest;
+                (*re, *im) = (scaled.re, scaled.im);
+            }
+        }
+    }
+    Ok(Shape { id, frequency_hz: root.frequency_hz(), growth_rate_per_s: root.growth_rate_per_s(), parts })
+}
+
+fn parts(rig: &Rig, shapes: MatRef<'_, c64>, column: usize) -> Vec<Part> {
+    if rig.shapes.is_empty() {
+        let x: Vec<c64> = (0..shapes.nrows()).map(|k| shapes[(k, column)]).collect();
+        return vec![part("coordinates", vec![], &x)];
+    }
+    rig.shapes
+        .iter()
+        .map(|side| {
+            let displacement = |row: usize| {
+                (0..side.phi.ncols())
+                    .map(|k| shapes[(side.first_coordinate + k, column)] * side.phi[(row, k)])
+                    .fold(c64::new(0.0, 0.0), |sum, term| sum + term)
+            };
+            let u: Vec<c64> = (0..side.phi.nrows()).map(displacement).collect();
+            part(side.name, side.nodes_m.clone(), &u)
+        })
+        .collect()
+}
+
+fn part(name: &str, nodes_m: Vec<[f64; 3]>, values: &[c64]) -> Part {
+    Part {
+        name: name.to_owned(),
+        spatial: !nodes_m.is_empty(),
+        nodes_m,
+        re: values.iter().map(|value| value.re).collect(),
+        im: values.iter().map(|value| value.im).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rig::RigFile;
+
+    /// One mass on a belt: above the merging `(K - λ²...) x = 0` gives `x₁/x₂` in closed form.
+    #[test]
+    fn the_shape_of_one_mass_on_a_belt_is_the_closed_form() {
+        let text = include_str!("../../launch/rigs/hoffmann.toml");
+        let rig = Rig::from_files(&[RigFile { name: "hoffmann.toml".to_owned(), bytes: text.into() }]).unwrap();
+        let mut solver = Solver::new(2);
+        let mu = 0.8;
+        let point = rig.reference.with_friction(mu);
+        let spectrum = solver.solve(&rig.model, &point, Vectors::Right).unwrap();
+        let (id, root) =
+            spectrum.modes().iter().enumerate().max_by(|a, b| a.1.lambda.re.total_cmp(&b.1.lambda.re)).unwrap();
+        assert!(root.lambda.re > 0.0, "it flutters there");
+        let shape = shape(&rig, &mut solver, None, &point, id as u32).unwrap();
+        let u: Vec<c64> = shape.parts[0].re.iter().zip(&shape.parts[0].im).map(|(&re, &im)| c64::new(re, im)).collect();
+        // First row of the equation of motion, the paper's equation (3): λ² x + k11 x + (k12 ± μ kn) y = 0; the belt
+        // runs along +x and the normal is -y, so that the friction force on the mass is -μ kn y.
+        let k12 = 0.75 - mu * 4.0 / 3.0;
+        let ratio = -(root.square + c64::from(1.5)) / k12;
+        let found = u[1] / u[0];
+        assert!((found - ratio).norm() < 1e-9 * ratio.norm(), "{found} {ratio}");
+        assert!(u.iter().any(|u| (u - c64::new(1.0, 0.0)).norm() < 1e-12), "scaled to 1");
+    }
+}

@@ -1,0 +1,112 @@
+//! Makes a recording of operating points from a tribometer's log.
+
+use std::{
+    collections::BTreeMap,
+    fs, io,
+    path::{Path, PathBuf},
+};
+
+use mcap::records::Metadata;
+use sha2::{Digest, Sha256};
+
+use super::{
+    message::Payload,
+    recording_file::{RecordingFile, WriteError, with_suffix},
+    tribometer_log::{self, LogError, LogOptions, TribometerLog},
+};
+use crate::wire::{Header, OperatingPoint, Time, schema::Topic};
+
+/// The name of the metadata record that says where the recording is from. Its keys: `source`, `source_sha256`,
+/// `squealcast_version`, `skipped_lines`, and per quantity the column it was read from.
+pub const METADATA_NAME: &str = "squealcast_import";
+
+/// How a log is imported.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ImportOptions {
+    pub log: LogOptions,
+    /// Replace a recording of that name.
+    pub overwrite: bool,
+}
+
+/// Why nothing was imported.
+#[derive(Debug, thiserror::Error)]
+pub enum ImportError {
+    #[error("{}: {source}", .path.display())]
+    Read { path: PathBuf, source: io::Error },
+    #[error("{}: {source}", .path.display())]
+    Log { path: PathBuf, source: LogError },
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    #[error("{}: line values cannot be encoded: {reason}", .path.display())]
+    Encode { path: PathBuf, reason: String },
+}
+
+/// What was imported.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imported {
+    pub path: PathBuf,
+    pub messages: u64,
+    /// First and last stamp, ns.
+    pub span_ns: Option<(u64, u64)>,
+    /// The log, with what was found out about it.
+    pub log: TribometerLog,
+}
+
+/// Writes the recording `output` of `/rig/operating_point` from the log `input`; all of it or nothing.
+///
+/// # Errors
+///
+/// A log that cannot be read, whose lines make no sense, or an output that exists or cannot be written.
+pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Imported, ImportError> {
+    let bytes = fs::read(input).map_err(|source| ImportError::Read { path: input.to_owned(), source })?;
+    let log = tribometer_log::parse(&tribometer_log::decode_text(&bytes), &options.log)
+        .map_err(|source| ImportError::Log { path: input.to_owned(), source })?;
+    if output.exists() && !options.overwrite {
+        return Err(WriteError::Exists { path: output.to_owned() }.into());
+    }
+    // Beside, and renamed only when it is complete.
+    let beside = with_suffix(output, ".importing");
+    let mut file = RecordingFile::create_beside(&beside, ".part")?;
+    if let Err(error) = write(&mut file, input, &bytes, &log) {
+        let _ = fs::remove_file(file.abandon());
+        return Err(error);
+    }
+    let part = file.temporary().to_owned();
+    let summary = file.finish().inspect_err(|_| drop(fs::remove_file(&part)))?;
+    fs::rename(&beside, output).map_err(|source| {
+        let _ = fs::remove_file(&beside);
+        WriteError::io(output, source)
+    })?;
+    Ok(Imported { path: output.to_owned(), messages: summary.messages(), span_ns: summary.span_ns, log })
+}
+
+fn write(file: &mut RecordingFile, input: &Path, bytes: &[u8], log: &TribometerLog) -> Result<(), ImportError> {
+    let source = input.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let digest: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+    let mut metadata = BTreeMap::from([
+        ("source".to_owned(), source),
+        ("source_sha256".to_owned(), digest),
+        ("squealcast_version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
+        ("skipped_lines".to_owned(), log.skipped.to_string()),
+    ]);
+    for column in &log.columns {
+        metadata.insert(column.field.name().to_owned(), column.header.clone());
+    }
+    file.write_metadata(&Metadata { name: METADATA_NAME.to_owned(), metadata })?;
+    let channel = file.own_channel(Topic::OperatingPoint)?;
+    for (seq, sample) in (0_u32..).zip(&log.samples) {
+        let point = OperatingPoint {
+            header: Header { stamp: Time::from_ns(sample.stamp_ns), frame_id: String::new() },
+            seq: seq.into(),
+            normal_load_n: sample.normal_load_n,
+            disc_speed_rad_s: sample.disc_speed_rad_s,
+            friction_coefficient: sample.friction_coefficient,
+        };
+        let cdr = Payload::OperatingPoint(point)
+            .to_cdr()
+            .map_err(|error| ImportError::Encode { path: input.to_owned(), reason: error.to_string() })?;
+        let stamp_ns = u64::try_from(sample.stamp_ns).unwrap_or(0);
+        file.write(channel, seq, stamp_ns, stamp_ns, &cdr)?;
+    }
+    Ok(())
+}

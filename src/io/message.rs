@@ -1,0 +1,67 @@
+//! A recorded message of any of the node's topics.
+
+use crate::wire::{self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, SessionEvent, schema::Topic};
+
+/// The content of a recorded message; which it is decides its topic.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Payload {
+    OperatingPoint(OperatingPoint),
+    Prediction(Prediction),
+    SessionEvent(SessionEvent),
+    RigInfo(RigInfo),
+    Diagnostics(DiagnosticArray),
+}
+
+impl Payload {
+    /// The topic it belongs on.
+    pub fn topic(&self) -> Topic {
+        match self {
+            Self::OperatingPoint(_) => Topic::OperatingPoint,
+            Self::Prediction(_) => Topic::Prediction,
+            Self::SessionEvent(_) => Topic::SessionEvent,
+            Self::RigInfo(_) => Topic::RigInfo,
+            Self::Diagnostics(_) => Topic::Diagnostics,
+        }
+    }
+
+    /// Its CDR bytes, encapsulation header included.
+    ///
+    /// # Errors
+    ///
+    /// What CDR cannot hold, such as a string longer than 4 GiB.
+    pub fn to_cdr(&self) -> Result<Vec<u8>, cdr_encoding::Error> {
+        match self {
+            Self::OperatingPoint(message) => wire::to_cdr(message),
+            Self::Prediction(message) => wire::to_cdr(message),
+            Self::SessionEvent(message) => wire::to_cdr(message),
+            Self::RigInfo(message) => wire::to_cdr(message),
+            Self::Diagnostics(message) => wire::to_cdr(message),
+        }
+    }
+
+    /// The message of a topic from its CDR bytes.
+    ///
+    /// # Errors
+    ///
+    /// Bytes that are no such message.
+    pub fn from_cdr(topic: Topic, cdr: &[u8]) -> Result<Self, cdr_encoding::Error> {
+        Ok(match topic {
+            Topic::OperatingPoint => Self::OperatingPoint(wire::from_cdr(cdr)?),
+            Topic::Prediction => Self::Prediction(wire::from_cdr(cdr)?),
+            Topic::SessionEvent => Self::SessionEvent(wire::from_cdr(cdr)?),
+            Topic::RigInfo => Self::RigInfo(wire::from_cdr(cdr)?),
+            Topic::Diagnostics => Self::Diagnostics(wire::from_cdr(cdr)?),
+        })
+    }
+}
+
+/// A message for the recorder.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Message {
+    /// When it was heard or made, ns since the epoch; the order of a recording. The recorder raises it by as little
+    /// as makes it later than the message before.
+    pub log_time_ns: u64,
+    /// When its sender sent it, ns since the epoch.
+    pub publish_time_ns: u64,
+    pub payload: Payload,
+}

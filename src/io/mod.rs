@@ -1,0 +1,20 @@
+//! Adapters between the node and the outside: buses, clocks and recordings. No physics and no session logic lives here.
+
+pub mod bag;
+pub mod clock;
+pub mod heard;
+pub mod import;
+pub mod message;
+pub mod pace;
+pub mod params_file;
+pub mod record_walker;
+pub mod recorder;
+pub mod recording;
+pub mod recording_file;
+pub mod recover;
+pub mod ros2;
+pub mod ros_args;
+pub mod shm;
+pub mod tribometer_log;
+
+pub use heard::{Bus, Heard};

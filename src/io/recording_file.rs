@@ -1,0 +1,349 @@
+//! One MCAP file as it is written: under a temporary name and locked, in whole chunks, renamed when finished.
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    ffi::OsString,
+    fmt,
+    fs::{File, OpenOptions},
+    io::{self, BufWriter, Write},
+    path::{Path, PathBuf},
+    sync::Arc,
+};
+
+use mcap::{
+    McapError, WriteOptions, Writer,
+    records::{MessageHeader, Metadata},
+    write::NoSeek,
+};
+
+use super::{
+    bag::{self, FileSummary, TopicInfo},
+    record_walker::Attachment,
+};
+use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
+
+/// A chunk is closed by the first message after this many bytes; with that message it stays below 768 KiB.
+const CHUNK_BYTES: u64 = 640 << 10;
+
+/// The key of a channel's metadata that carries its quality of service.
+const QOS_KEY: &str = "offered_qos_profiles";
+
+/// Why a file cannot be written.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    #[error("{}: {source}", .path.display())]
+    Io { path: PathBuf, source: io::Error },
+    #[error("{}: {source}", .path.display())]
+    Mcap { path: PathBuf, source: McapError },
+    #[error("{}: exists already", .path.display())]
+    Exists { path: PathBuf },
+}
+
+impl WriteError {
+    pub(super) fn io(path: &Path, source: io::Error) -> Self {
+        Self::Io { path: path.to_owned(), source }
+    }
+}
+
+/// Where bytes go; replaced in tests by a disk that is full.
+pub trait Disk: fmt::Debug + Send + Sync {
+    /// Writes some of `bytes`.
+    ///
+    /// # Errors
+    ///
+    /// As [`Write::write`].
+    fn write(&self, file: &File, bytes: &[u8]) -> io::Result<usize>;
+
+    /// How much may still be written below a directory.
+    ///
+    /// # Errors
+    ///
+    /// What asking the file system yields.
+    fn free_bytes(&self, directory: &Path) -> io::Result<u64>;
+}
+
+/// The file system.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct FileSystem;
+
+impl Disk for FileSystem {
+    fn write(&self, mut file: &File, bytes: &[u8]) -> io::Result<usize> {
+        file.write(bytes)
+    }
+
+    fn free_bytes(&self, directory: &Path) -> io::Result<u64> {
+        let status = rustix::fs::statvfs(directory)?;
+        Ok(status.f_bavail.saturating_mul(status.f_frsize))
+    }
+}
+
+/// A file on a [`Disk`] that counts what was written.
+#[derive(Debug)]
+struct CountedFile {
+    file: File,
+    disk: Arc<dyn Disk>,
+    bytes: Arc<std::sync::atomic::AtomicU64>,
+}
+
+impl Write for CountedFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.disk.write(&self.file, bytes)?;
+        self.bytes.fetch_add(written as u64, std::sync::atomic::Ordering::Relaxed);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// A channel of a [`RecordingFile`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct ChannelId(u16);
+
+/// A file being written.
+///
+/// Chunks are gathered in memory and written whole: a killed process leaves whole chunks, not the open one of length
+/// `u64::MAX` that seeking writers leave. The file is locked (`flock`) while it is written, so that nobody recovers it.
+pub struct RecordingFile {
+    writer: Writer<NoSeek<BufWriter<CountedFile>>>,
+    file: File,
+    bytes: Arc<std::sync::atomic::AtomicU64>,
+    temporary: PathBuf,
+    path: PathBuf,
+    topics: HashMap<ChannelId, TopicInfo>,
+    summary: FileSummary,
+}
+
+impl fmt::Debug for RecordingFile {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RecordingFile").field("temporary", &self.temporary).finish_non_exhaustive()
+    }
+}
+
+impl RecordingFile {
+    /// Begins a file that will be named `path` when it is finished, and `path` + `suffix` until then.
+    ///
+    /// # Errors
+    ///
+    /// [`WriteError::Exists`] when either exists, and what writing yields.
+    pub fn create(path: &Path, suffix: &str, disk: Arc<dyn Disk>) -> Result<Self, WriteError> {
+        let temporary = with_suffix(path, suffix);
+        for taken in [path, &temporary] {
+            if taken.exists() {
+                return Err(WriteError::Exists { path: taken.to_owned() });
+            }
+        }
+        // Locked before it has the name others look for.
+        let newborn = with_suffix(&temporary, ".new");
+        let at = |source| WriteError::io(&newborn, source);
+        let file = OpenOptions::new().write(true).create(true).truncate(true).open(&newborn).map_err(at)?;
+        file.try_lock().map_err(|error| at(error.into()))?;
+        std::fs::rename(&newborn, &temporary).map_err(|source| WriteError::io(&temporary, source))?;
+
+        let bytes = Arc::default();
+        let counted = CountedFile { file: file.try_clone().map_err(at)?, disk, bytes: Arc::clone(&bytes) };
+        let options = WriteOptions::new()
+            .profile("ros2")
+            .library(concat!("squealcast ", env!("CARGO_PKG_VERSION")))
+            .chunk_size(Some(CHUNK_BYTES))
+            .compression_threads(0)
+            .disable_seeking(true);
+        let created = options.create(NoSeek::new(BufWriter::new(counted)));
+        let writer = created.map_err(|source| {
+            let _ = std::fs::remove_file(&temporary);
+            located(&temporary, source)
+        })?;
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let summary = FileSummary { name, ..FileSummary::default() };
+        Ok(Self { writer, file, bytes, temporary, path: path.to_owned(), topics: HashMap::new(), summary })
+    }
+
+    /// Begins a file that will take another's place once it is finished, on the file system. What an interrupted
+    /// attempt left under these names is removed.
+    ///
+    /// # Errors
+    ///
+    /// [`WriteError::Exists`] when another process is at it, and what writing yields.
+    pub(super) fn create_beside(path: &Path, suffix: &str) -> Result<Self, WriteError> {
+        for stale in [path, &with_suffix(path, suffix)] {
+            match File::open(stale) {
+                Ok(file) => {
+                    file.try_lock().map_err(|_| WriteError::Exists { path: stale.to_owned() })?;
+                    std::fs::remove_file(stale).map_err(|source| WriteError::io(stale, source))?;
+                }
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(source) => return Err(WriteError::io(stale, source)),
+            }
+        }
+        Self::create(path, suffix, Arc::new(FileSystem))
+    }
+
+    /// The name it has while it is written.
+    pub fn temporary(&self) -> &Path {
+        &self.temporary
+    }
+
+    /// What it holds so far.
+    pub fn summary(&self) -> &FileSummary {
+        &self.summary
+    }
+
+    /// Bytes written so far; the open chunk is not among them.
+    pub fn bytes_written(&self) -> u64 {
+        self.bytes.load(std::sync::atomic::Ordering::Relaxed)
+    }
+
+    /// Adds a file within the file. Call before the first message, so that a file cut short still has it.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields.
+    pub fn attach(&mut self, attachment: &Attachment) -> Result<(), WriteError> {
+        let Attachment { log_time_ns, create_time_ns, name, media_type, data } = attachment;
+        let attachment = mcap::Attachment {
+            log_time: *log_time_ns,
+            create_time: *create_time_ns,
+            name: name.clone(),
+            media_type: media_type.clone(),
+            data: data.into(),
+        };
+        self.writer.attach(&attachment).map_err(|source| located(&self.temporary, source))
+    }
+
+    /// Adds a metadata record.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields.
+    pub fn write_metadata(&mut self, metadata: &Metadata) -> Result<(), WriteError> {
+        self.writer.write_metadata(metadata).map_err(|source| located(&self.temporary, source))
+    }
+
+    /// The channel of one of the node's own topics; made at its first use.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields.
+    pub fn own_channel(&mut self, topic: Topic) -> Result<ChannelId, WriteError> {
+        let metadata = BTreeMap::from([(QOS_KEY.to_owned(), topic.qos_profiles())]);
+        let schema = Some((topic.type_name(), SCHEMA_ENCODING, topic.schema()));
+        let schema = schema.as_ref().map(|(name, encoding, text)| (*name, *encoding, text.as_bytes()));
+        self.channel(topic.name(), schema, MESSAGE_ENCODING, &metadata)
+    }
+
+    /// A channel; the same for the same arguments. `schema` is name, encoding and text.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields, and more than 65535 channels or schemas.
+    pub fn channel(
+        &mut self,
+        topic: &str,
+        schema: Option<(&str, &str, &[u8])>,
+        message_encoding: &str,
+        metadata: &BTreeMap<String, String>,
+    ) -> Result<ChannelId, WriteError> {
+        let at = |source| located(&self.temporary, source);
+        let schema_id = match schema {
+            Some((name, encoding, text)) => self.writer.add_schema(name, encoding, text).map_err(at)?,
+            None => 0,
+        };
+        let id = ChannelId(self.writer.add_channel(schema_id, topic, message_encoding, metadata).map_err(at)?);
+        self.topics.entry(id).or_insert_with(|| TopicInfo {
+            name: topic.to_owned(),
+            type_name: schema.map(|(name, _, _)| name.to_owned()).unwrap_or_default(),
+            message_encoding: message_encoding.to_owned(),
+            qos_profiles: metadata.get(QOS_KEY).cloned().unwrap_or_default(),
+        });
+        Ok(id)
+    }
+
+    /// Appends a message.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields.
+    pub fn write(
+        &mut self,
+        channel: ChannelId,
+        sequence: u32,
+        log_time_ns: u64,
+        publish_time_ns: u64,
+        data: &[u8],
+    ) -> Result<(), WriteError> {
+        let header =
+            MessageHeader { channel_id: channel.0, sequence, log_time: log_time_ns, publish_time: publish_time_ns };
+        self.writer.write_to_known_channel(&header, data).map_err(|source| located(&self.temporary, source))?;
+        if let Some(topic) = self.topics.get(&channel) {
+            self.summary.count(topic, log_time_ns);
+        }
+        Ok(())
+    }
+
+    /// Closes the chunk and hands everything to the operating system: a killed process does not lose it.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields.
+    pub fn flush(&mut self) -> Result<(), WriteError> {
+        self.writer.flush().map_err(|source| located(&self.temporary, source))
+    }
+
+    /// Puts what was flushed on the disk: a power failure does not lose it.
+    ///
+    /// # Errors
+    ///
+    /// What `fdatasync` yields.
+    pub fn sync(&self) -> Result<(), WriteError> {
+        self.file.sync_data().map_err(|source| WriteError::io(&self.temporary, source))
+    }
+
+    /// Writes the summary, puts everything on the disk and gives the file its name.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields; then the file keeps its temporary name, and is not locked any more.
+    pub fn finish(mut self) -> Result<FileSummary, WriteError> {
+        let finished = self.writer.finish().map(drop);
+        // Not `Drop`: it would try again and keep silent.
+        let mut buffered = self.writer.into_inner().into_inner();
+        if let Err(source) = finished.and_then(|()| Ok(buffered.flush()?)) {
+            drop(buffered.into_parts());
+            return Err(located(&self.temporary, source));
+        }
+        self.file.sync_all().map_err(|source| WriteError::io(&self.temporary, source))?;
+        std::fs::rename(&self.temporary, &self.path).map_err(|source| WriteError::io(&self.path, source))?;
+        let directory = directory_of(&self.path);
+        bag::sync_directory(directory).map_err(|source| WriteError::io(directory, source))?;
+        Ok(self.summary)
+    }
+
+    /// Lets go of the file as it is on the disk, under its temporary name, writing nothing more.
+    pub fn abandon(self) -> PathBuf {
+        drop(self.writer.into_inner().into_inner().into_parts());
+        self.temporary
+    }
+}
+
+fn located(path: &Path, source: McapError) -> WriteError {
+    match source {
+        McapError::Io(source) => WriteError::io(path, source),
+        source => WriteError::Mcap { path: path.to_owned(), source },
+    }
+}
+
+/// `path` with more behind its name.
+pub(super) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name: OsString = path.as_os_str().to_owned();
+    name.push(suffix);
+    PathBuf::from(name)
+}
+
+/// The directory a file is in.
+pub(super) fn directory_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    }
+}

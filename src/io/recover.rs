@@ -1,0 +1,341 @@
+//! Repairs interrupted recordings.
+//!
+//! What can be read is written into a finished file beside the interrupted one, which is replaced only when the new one
+//! is on the disk. An original with anything in it that could not be read is kept as `*.mcap.damaged`.
+
+use std::{
+    collections::{BTreeMap, HashMap},
+    fs::{File, TryLockError},
+    io,
+    path::{Path, PathBuf},
+};
+
+use super::{
+    bag::{self, FileSummary, TopicInfo},
+    record_walker::{Damage, Depth, Item, RecordWalker},
+    recording::{RecordingError, mcap_files, open_walker},
+    recording_file::{RecordingFile, WriteError, directory_of, with_suffix},
+};
+
+/// The suffix of a file that is being recorded.
+pub const ACTIVE: &str = ".active";
+const RECOVERING: &str = ".recovering";
+const DAMAGED: &str = ".damaged";
+
+/// Why a recording cannot be repaired.
+#[derive(Debug, thiserror::Error)]
+pub enum RecoverError {
+    #[error(transparent)]
+    Read(#[from] RecordingError),
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    #[error("{}: cannot take the place of {}, which exists", .interrupted.display(), .finished.display())]
+    TargetExists { interrupted: PathBuf, finished: PathBuf },
+}
+
+/// What became of one file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Recovery {
+    /// As it was named before.
+    pub original: PathBuf,
+    pub outcome: Outcome,
+}
+
+/// See [`Recovery`].
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// It was finished and undamaged; an interrupted renaming was done.
+    Complete { path: PathBuf, messages: u64 },
+    /// Everything readable is in a finished file now.
+    Restored(Restored),
+    /// It held nothing at all, not even the start of a recording, and was removed.
+    Empty,
+    /// A running process writes it.
+    InUse,
+}
+
+/// What was restored, and what was not.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Restored {
+    /// The finished file.
+    pub path: PathBuf,
+    pub messages: u64,
+    pub attachments: u64,
+    /// First and last log time, ns.
+    pub span_ns: Option<(u64, u64)>,
+    /// What was wrong with the original.
+    pub damage: Vec<Damage>,
+    /// The original, when it held something that could not be read.
+    pub kept_original: Option<PathBuf>,
+}
+
+impl Restored {
+    /// Whether the original held data that could not be read.
+    pub fn loses_data(&self) -> bool {
+        self.damage.iter().any(|damage| damage.loses_data)
+    }
+}
+
+/// What became of several files. One that cannot be repaired does not keep the others from it.
+#[derive(Debug, Default)]
+pub struct RecoveryReport {
+    pub recoveries: Vec<Recovery>,
+    /// Of the files that could not be repaired; they are as they were.
+    pub errors: Vec<RecoverError>,
+}
+
+impl RecoveryReport {
+    /// Messages in the files that were restored.
+    pub fn messages_restored(&self) -> u64 {
+        self.restored().map(|restored| restored.messages).sum()
+    }
+
+    /// Whether a restored file's original held data that could not be read.
+    pub fn loses_data(&self) -> bool {
+        self.restored().any(Restored::loses_data)
+    }
+
+    fn restored(&self) -> impl Iterator<Item = &Restored> {
+        self.recoveries.iter().filter_map(|recovery| match &recovery.outcome {
+            Outcome::Restored(restored) => Some(restored),
+            _ => None,
+        })
+    }
+}
+
+/// Repairs a file; of a directory every `*.mcap` and `*.mcap.active` file in it and in the directories directly below.
+/// `metadata.yaml` is written again where files of its directory changed.
+///
+/// # Errors
+///
+/// A path that cannot be read or holds no recording; what is wrong with single files is in the report.
+pub fn recover(path: &Path) -> Result<RecoveryReport, RecoverError> {
+    let is_directory = std::fs::metadata(path).map_err(|source| read_error(path, source))?.is_dir();
+    if !is_directory {
+        return Ok(recover_files(&[path.to_owned()]));
+    }
+    let files = files_below(path).map_err(|source| read_error(path, source))?;
+    if files.is_empty() {
+        return Err(RecordingError::NoFiles { path: path.to_owned() }.into());
+    }
+    Ok(recover_files(&files))
+}
+
+/// Repairs what interrupted processes left (`*.mcap.active`) in a record directory and those directly below it.
+/// Finished files are not looked at.
+///
+/// # Errors
+///
+/// A directory that cannot be read.
+pub fn recover_leftovers(directory: &Path) -> Result<RecoveryReport, RecoverError> {
+    let mut leftovers = files_below(directory).map_err(|source| read_error(directory, source))?;
+    leftovers.retain(|path| is_active(path));
+    Ok(recover_files(&leftovers))
+}
+
+fn recover_files(files: &[PathBuf]) -> RecoveryReport {
+    let mut report = RecoveryReport::default();
+    for file in files {
+        match recover_file(file) {
+            Ok(recovery) => report.recoveries.push(recovery),
+            Err(error) => report.errors.push(error),
+        }
+    }
+    let mut changed: Vec<&Path> = Vec::new();
+    for Recovery { original, outcome } in &report.recoveries {
+        let directory = directory_of(original);
+        let listed = match outcome {
+            Outcome::InUse => true,
+            Outcome::Complete { path, .. } => path == original && directory.join(bag::METADATA_FILE).exists(),
+            Outcome::Restored(_) | Outcome::Empty => false,
+        };
+        if !listed && is_bag(directory, original) && !changed.contains(&directory) {
+            changed.push(directory);
+        }
+    }
+    for directory in changed {
+        if let Err(error) = rewrite_metadata(directory) {
+            report.errors.push(error);
+        }
+    }
+    report
+}
+
+/// A lone file somewhere is no reason to litter its directory: a recording's directory is one that has a
+/// `metadata.yaml`, or has its files' name.
+fn is_bag(directory: &Path, file: &Path) -> bool {
+    let named_alike = || {
+        let directory = directory.file_name()?.to_str()?;
+        file.file_name()?.to_str()?.strip_prefix(directory)?.strip_prefix('_')
+    };
+    directory.join(bag::METADATA_FILE).exists() || named_alike().is_some()
+}
+
+fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
+    let recovery = |outcome| Recovery { original: path.to_owned(), outcome };
+    let lock = File::open(path).map_err(|source| read_error(path, source))?;
+    match lock.try_lock() {
+        Ok(()) => {}
+        Err(TryLockError::WouldBlock) => return Ok(recovery(Outcome::InUse)),
+        Err(TryLockError::Error(source)) => return Err(read_error(path, source).into()),
+    }
+    let target = finished_name(path);
+    if target != path && target.exists() {
+        return Err(RecoverError::TargetExists { interrupted: path.to_owned(), finished: target });
+    }
+    if lock.metadata().map_err(|source| read_error(path, source))?.len() == 0 && is_active(path) {
+        std::fs::remove_file(path).map_err(|source| read_error(path, source))?;
+        return Ok(recovery(Outcome::Empty));
+    }
+
+    // A first pass over everything: a sound file is left as it is.
+    let mut walker = open_walker(path, Depth::Messages)?;
+    let messages = walker.by_ref().filter(|item| matches!(item, Item::Message(_))).count() as u64;
+    if walker.damage().is_empty() {
+        if target != path {
+            rename(path, &target)?;
+        }
+        return Ok(recovery(Outcome::Complete { path: target, messages }));
+    }
+
+    let beside = with_suffix(&target, RECOVERING);
+    // Named `*.recovering` when finished, so that nothing is replaced before.
+    let mut copy = RecordingFile::create_beside(&beside, ".part")?;
+    let mut walker = open_walker(path, Depth::Messages)?;
+    let attachments = match copy_items(&mut walker, &mut copy) {
+        Ok(attachments) => attachments,
+        Err(error) => {
+            let _ = std::fs::remove_file(copy.abandon());
+            return Err(error.into());
+        }
+    };
+    let part = copy.temporary().to_owned();
+    let summary = copy.finish().inspect_err(|_| drop(std::fs::remove_file(&part)))?;
+    let damage = walker.damage().to_vec();
+    let kept_original = if damage.iter().any(|damage| damage.loses_data) {
+        let kept = free_name(&with_suffix(&target, DAMAGED));
+        rename(path, &kept)?;
+        Some(kept)
+    } else {
+        None
+    };
+    rename(&beside, &target)?;
+    if kept_original.is_none() && target != path {
+        std::fs::remove_file(path).map_err(|source| read_error(path, source))?;
+    }
+    let restored = Restored {
+        path: target,
+        messages: summary.messages(),
+        attachments,
+        span_ns: summary.span_ns,
+        damage,
+        kept_original,
+    };
+    Ok(recovery(Outcome::Restored(restored)))
+}
+
+/// Copies what can be read; the number of attachments.
+fn copy_items(walker: &mut RecordWalker, copy: &mut RecordingFile) -> Result<u64, WriteError> {
+    let mut channels = HashMap::new();
+    let mut attachments = 0;
+    for item in walker {
+        match item {
+            Item::Attachment(attachment) => {
+                copy.attach(&attachment)?;
+                attachments += 1;
+            }
+            Item::Metadata(metadata) => copy.write_metadata(&metadata)?,
+            Item::Message(message) => {
+                let channel = match channels.get(&message.channel.id) {
+                    Some(channel) => *channel,
+                    None => {
+                        let from = &message.channel;
+                        let schema = from.schema.as_ref();
+                        let schema = schema.map(|s| (s.name.as_str(), s.encoding.as_str(), s.data.as_slice()));
+                        let channel = copy.channel(&from.topic, schema, &from.message_encoding, &from.metadata)?;
+                        channels.insert(from.id, channel);
+                        channel
+                    }
+                };
+                copy.write(channel, message.sequence, message.log_time_ns, message.publish_time_ns, &message.data)?;
+            }
+        }
+    }
+    Ok(attachments)
+}
+
+/// Writes `metadata.yaml` for the finished files of a directory.
+fn rewrite_metadata(directory: &Path) -> Result<(), RecoverError> {
+    let mut summaries = Vec::new();
+    for path in mcap_files(directory).map_err(|source| read_error(directory, source))? {
+        if !is_active(&path) {
+            summaries.push(summarize(&path)?);
+        }
+    }
+    bag::write_metadata(directory, &summaries).map_err(|source| WriteError::io(directory, source))?;
+    Ok(())
+}
+
+/// Counts a file's messages.
+fn summarize(path: &Path) -> Result<FileSummary, RecoverError> {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let mut summary = FileSummary { name, ..FileSummary::default() };
+    let mut topics: BTreeMap<u16, TopicInfo> = BTreeMap::new();
+    for item in open_walker(path, Depth::Messages)? {
+        let Item::Message(message) = item else { continue };
+        let channel = &message.channel;
+        let topic = topics.entry(channel.id).or_insert_with(|| TopicInfo {
+            name: channel.topic.clone(),
+            type_name: channel.schema.as_ref().map(|schema| schema.name.clone()).unwrap_or_default(),
+            message_encoding: channel.message_encoding.clone(),
+            qos_profiles: channel.metadata.get("offered_qos_profiles").cloned().unwrap_or_default(),
+        });
+        summary.count(topic, message.log_time_ns);
+    }
+    Ok(summary)
+}
+
+fn files_below(directory: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut files = mcap_files(directory)?;
+    let mut below = Vec::new();
+    for entry in std::fs::read_dir(directory)? {
+        let path = entry?.path();
+        if path.is_dir() {
+            below.push(path);
+        }
+    }
+    below.sort();
+    for directory in below {
+        files.extend(mcap_files(&directory)?);
+    }
+    Ok(files)
+}
+
+fn is_active(path: &Path) -> bool {
+    path.as_os_str().as_encoded_bytes().ends_with(ACTIVE.as_bytes())
+}
+
+fn finished_name(path: &Path) -> PathBuf {
+    if is_active(path) { path.with_extension("") } else { path.to_owned() }
+}
+
+/// `path`, or with `.2`, `.3` ... behind it where that is taken.
+fn free_name(path: &Path) -> PathBuf {
+    if !path.exists() {
+        return path.to_owned();
+    }
+    (2_u32..)
+        .map(|n| with_suffix(path, &format!(".{n}")))
+        .find(|path| !path.exists())
+        .unwrap_or_else(|| path.to_owned())
+}
+
+fn rename(from: &Path, to: &Path) -> Result<(), WriteError> {
+    std::fs::rename(from, to)
+        .and_then(|()| bag::sync_directory(directory_of(to)))
+        .map_err(|source| WriteError::io(to, source))
+}
+
+fn read_error(path: &Path, source: io::Error) -> RecordingError {
+    RecordingError::Io { path: path.to_owned(), source }
+}

@@ -1,0 +1,199 @@
+//! One ROS 2 node with one subscription, on a thread of its own.
+
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+
+use ros2_client::{Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Subscription};
+use rustdds::policy::{History, ResourceLimits};
+use rustdds::{DomainParticipantBuilder, Duration, QosPolicies, QosPolicyBuilder, Topic, TopicKind};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::sync::oneshot;
+
+pub(super) use rustdds::policy::Durability;
+
+use super::super::heard::{Counters, Counts, Gaps, Heard};
+use super::{Ros2Error, Ros2Options, heard};
+
+/// How many messages publishers and subscriptions keep.
+const KEEP_LAST: i32 = 64;
+/// How many messages may wait for the answer of a reader before publishing fails. A killed reader is only forgotten
+/// after its lease, under a minute as a rule; RustDDS's 8192 would be full after 16 s at 500 Hz, for all readers.
+const MAX_UNANSWERED: i32 = 1 << 15;
+
+/// A node, and the thread that serves its parameters and hears its one topic of messages `M`.
+pub(super) struct Link<M> {
+    options: Ros2Options,
+    name: NodeName,
+    subscription: Option<Arc<Subscription<M>>>,
+    node: Node,
+    context: Context,
+    counters: Arc<Counters>,
+    running: Option<(oneshot::Sender<()>, JoinHandle<()>)>,
+}
+
+impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
+    /// Joins the network with a node.
+    pub(super) fn join(options: &Ros2Options, default_name: &str, node: NodeOptions) -> Result<Self, Ros2Error> {
+        let base_name = options.args.node_name(default_name);
+        let namespace = options.args.namespace(&base_name, "/");
+        let full_name = format!("{}/{base_name}", namespace.trim_end_matches('/'));
+        let failed = |reason: String| Ros2Error::Node { name: full_name.clone(), reason };
+
+        let bad_name = |error: ros2_client::names::NameError| Ros2Error::Name {
+            name: full_name.clone(),
+            reason: error.to_string(),
+        };
+        let name = NodeName::new(&namespace, &base_name).map_err(bad_name)?;
+        // The names of its services begin with it, and their rules are stricter.
+        Name::parse(&full_name).map_err(bad_name)?;
+
+        let mut participant = DomainParticipantBuilder::new(options.domain_id);
+        if options.loopback_only {
+            participant = participant.with_only_networks([Ipv4Addr::LOCALHOST]);
+        }
+        let participant = participant.build().map_err(|e| failed(e.to_string()))?;
+        let context = Context::from_domain_participant(participant).map_err(|e| failed(e.to_string()))?;
+        let node = context.new_node(name.clone(), node).map_err(|e| failed(e.to_string()))?;
+        Ok(Self {
+            options: options.clone(),
+            name,
+            context,
+            node,
+            subscription: None,
+            counters: Arc::new(Counters::default()),
+            running: None,
+        })
+    }
+
+    /// A reliable publisher that never waits.
+    pub(super) fn publisher<P: Serialize>(
+        &mut self,
+        topic: &'static str,
+        kind: MessageTypeName,
+        durability: Durability,
+    ) -> Result<Publisher<P>, Ros2Error> {
+        let limits =
+            ResourceLimits { max_samples: MAX_UNANSWERED, max_instances: 1, max_samples_per_instance: MAX_UNANSWERED };
+        // What is kept for readers that come later is the latest of it.
+        let depth = if durability == Durability::TransientLocal { 1 } else { KEEP_LAST };
+        let qos = qos(durability, depth).resource_limits(limits).build();
+        let (topic, name) = self.topic(topic, &kind, &qos)?;
+        self.node.create_publisher(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
+    }
+
+    /// Subscribes and starts the thread.
+    pub(super) fn listen(
+        &mut self,
+        topic: &'static str,
+        kind: MessageTypeName,
+        seq: fn(&M) -> u64,
+        sink: impl FnMut(Heard<M>) + Send + 'static,
+    ) -> Result<(), Ros2Error> {
+        let (topic, name) = self.topic(topic, &kind, &qos(Durability::Volatile, KEEP_LAST).build())?;
+        let failed = |reason: String| Ros2Error::Topic { name: name.clone(), reason };
+        let subscription: Subscription<M> =
+            self.node.create_subscription(&topic, None).map_err(|e| failed(e.to_string()))?;
+        let spinner = self.node.spinner().map_err(|e| failed(e.to_string()))?;
+
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let (stop, stopped) = oneshot::channel();
+        let subscription = Arc::new(subscription);
+        self.subscription = Some(Arc::clone(&subscription));
+        let counters = Arc::clone(&self.counters);
+        let thread = thread::Builder::new().name(format!("ros2 {}", self.name.base_name())).spawn(move || {
+            runtime.block_on(async {
+                let spin = async {
+                    if spinner.spin().await.is_err() {
+                        counters.failure();
+                    }
+                    // Parameters are gone, but messages go on.
+                    std::future::pending::<()>().await
+                };
+                tokio::select! {
+                    _ = stopped => (),
+                    () = spin => (),
+                    () = hear(&subscription, seq, sink, &counters) => (),
+                }
+            });
+        })?;
+        self.running = Some((stop, thread));
+        Ok(())
+    }
+
+    /// A topic, remapped, and its name.
+    fn topic(
+        &self,
+        topic: &'static str,
+        kind: &MessageTypeName,
+        qos: &QosPolicies,
+    ) -> Result<(Topic, String), Ros2Error> {
+        let full = self.options.args.topic(topic, self.name.namespace(), self.name.base_name());
+        let bad_name =
+            |error: ros2_client::names::NameError| Ros2Error::Name { name: full.clone(), reason: error.to_string() };
+        let name = Name::parse(&full).map_err(bad_name)?;
+        // Not by the node: it would not let us limit what waits for readers.
+        self.context
+            .domain_participant()
+            .create_topic(name.to_dds_name("rt", &self.name, ""), kind.dds_msg_type(), qos, TopicKind::NoKey)
+            .map(|topic| (topic, full.clone()))
+            .map_err(|e| Ros2Error::Topic { name: full, reason: e.to_string() })
+    }
+
+    pub(super) fn counts(&self) -> Counts {
+        self.counters.counts()
+    }
+
+    pub(super) fn writers(&self) -> usize {
+        self.subscription.as_ref().map_or(0, |subscription| subscription.get_publisher_count(&self.node))
+    }
+}
+
+impl<M> Link<M> {
+    pub(super) fn node(&self) -> &Node {
+        &self.node
+    }
+}
+
+impl<M> Drop for Link<M> {
+    fn drop(&mut self) {
+        if let Some((stop, thread)) = self.running.take() {
+            let _ = stop.send(());
+            // A sink that panicked has said so on its own thread.
+            let _ = thread.join();
+        }
+    }
+}
+
+async fn hear<M: DeserializeOwned + 'static>(
+    subscription: &Subscription<M>,
+    seq: fn(&M) -> u64,
+    mut sink: impl FnMut(Heard<M>),
+    counters: &Counters,
+) {
+    let mut gaps = Gaps::new();
+    loop {
+        match subscription.async_take().await {
+            Ok((message, info)) => {
+                counters.heard(gaps.note(info.publisher_gid(), seq(&message)));
+                sink(heard(message));
+            }
+            Err(ros2_client::ReadError::Deserialization { .. } | ros2_client::ReadError::Malformed) => {
+                counters.malformed();
+            }
+            Err(ros2_client::ReadError::Closed) => {
+                counters.failure();
+                return;
+            }
+            Err(_) => {
+                counters.failure();
+                tokio::time::sleep(std::time::Duration::from_millis(50)).await;
+            }
+        }
+    }
+}
+
+fn qos(durability: Durability, depth: i32) -> QosPolicyBuilder {
+    QosPolicyBuilder::new().durability(durability).reliable(Duration::ZERO).history(History::KeepLast { depth })
+}

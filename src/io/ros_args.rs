@@ -1,0 +1,346 @@
+//! ROS 2 command-line arguments: `--ros-args -r from:=to -p name:=value --params-file F ... --`.
+//!
+//! Written here because it is little, and the crate for it, `ros2args`, brings a regex engine along. The rules are those
+//! of rcl: an argument for one node carries its name before the first colon, later arguments win over earlier ones, and
+//! the first remapping rule that matches is the one that counts.
+
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
+use super::params_file::{self, ParamsFileError};
+
+/// What is wrong with ROS arguments.
+#[derive(Debug, Error)]
+pub enum RosArgsError {
+    #[error("unknown ROS argument {0:?}")]
+    Unknown(String),
+    #[error("ROS argument {0} needs a value")]
+    ValueMissing(String),
+    #[error("{rule:?} is no remapping rule from:=to")]
+    Rule { rule: String },
+    #[error("{text:?} is no parameter name:=value")]
+    Parameter { text: String },
+    #[error("parameter {name}: {value:?} is no number")]
+    NotANumber { name: String, value: String },
+    #[error("unknown parameter {name:?}, there are: {known}")]
+    UnknownParameter { name: String, known: String },
+    #[error(transparent)]
+    File(#[from] ParamsFileError),
+}
+
+/// A remapping rule.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Rule {
+    /// Only for the node of this name.
+    node: Option<String>,
+    from: String,
+    to: String,
+}
+
+/// Where parameter values come from, in the order they were given.
+#[derive(Clone, Debug, PartialEq)]
+enum ParameterSource {
+    Value { node: Option<String>, name: String, value: f64 },
+    File(PathBuf),
+}
+
+/// The ROS 2 arguments of a command line.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RosArgs {
+    rules: Vec<Rule>,
+    sources: Vec<ParameterSource>,
+    log_level: Option<String>,
+}
+
+impl RosArgs {
+    /// Takes the ROS arguments out of a command line: those between each `--ros-args` and the next `--` or the end.
+    /// Returns them and the rest, which is for the program itself.
+    ///
+    /// # Errors
+    /// The first argument that is unknown or malformed.
+    pub fn split(args: impl IntoIterator<Item = String>) -> Result<(Self, Vec<String>), RosArgsError> {
+        let mut ros = Self::default();
+        let mut rest = Vec::new();
+        let mut args = args.into_iter();
+        while let Some(arg) = args.next() {
+            if arg == "--ros-args" {
+                ros.take_section(&mut args)?;
+            } else {
+                rest.push(arg);
+            }
+        }
+        Ok((ros, rest))
+    }
+
+    fn take_section(&mut self, args: &mut impl Iterator<Item = String>) -> Result<(), RosArgsError> {
+        while let Some(arg) = args.next() {
+            let mut value = || args.next().ok_or_else(|| RosArgsError::ValueMissing(arg.clone()));
+            match arg.as_str() {
+                "--" => return Ok(()),
+                // Sections may follow each other without a `--`.
+                "--ros-args" => {}
+                "-r" | "--remap" => self.rules.push(Rule::parse(&value()?)?),
+                "-p" | "--param" => self.sources.push(parse_parameter(&value()?)?),
+                "--params-file" => self.sources.push(ParameterSource::File(value()?.into())),
+                "--log-level" => self.log_level = Some(value()?),
+                "--log-config-file" | "--log-file-name" | "-e" | "--enclave" => drop(value()?),
+                _ if LOG_SWITCHES.iter().any(|switch| {
+                    ["--enable-", "--disable-"].iter().any(|on_off| arg.strip_prefix(on_off) == Some(switch))
+                }) => {}
+                _ => return Err(RosArgsError::Unknown(arg)),
+            }
+        }
+        Ok(())
+    }
+
+    /// `--log-level`, as it was given.
+    pub fn log_level(&self) -> Option<&str> {
+        self.log_level.as_deref()
+    }
+
+    /// The same, but the node's name is `name` whatever the rules say.
+    pub fn renamed(mut self, name: &str) -> Self {
+        self.rules.retain(|rule| !matches!(rule.from.as_str(), "__node" | "__name"));
+        self.rules.push(Rule { node: None, from: "__node".to_owned(), to: name.to_owned() });
+        self
+    }
+
+    /// The name of the node after `__node` rules.
+    pub fn node_name(&self, default: &str) -> String {
+        self.special(default, &["__node", "__name"]).unwrap_or(default).to_owned()
+    }
+
+    /// The namespace of the node of this name after `__ns` rules; always absolute, without a slash at its end.
+    pub fn namespace(&self, node_name: &str, default: &str) -> String {
+        let namespace = self.special(node_name, &["__ns"]).unwrap_or(default);
+        format!("/{}", namespace.trim_matches('/'))
+    }
+
+    fn special(&self, node: &str, names: &[&str]) -> Option<&str> {
+        let rule = self.rules.iter().find(|rule| names.contains(&rule.from.as_str()) && rule.is_for(node))?;
+        Some(&rule.to)
+    }
+
+    /// The name of a topic after remapping, for a node of this namespace and name (its own remapping done). Names may be absolute, relative or private (`~/`); what comes back is absolute.
+    pub fn topic(&self, topic: &str, namespace: &str, node: &str) -> String {
+        let full = expand(topic, namespace, node);
+        self.rules
+            .iter()
+            .filter(|rule| !rule.from.starts_with("__") && rule.is_for(node))
+            .find(|rule| expand(rule.from.trim_start_matches("rostopic://"), namespace, node) == full)
+            .map_or(full, |rule| expand(&rule.to, namespace, node))
+    }
+
+    /// Values for the declared parameters: their defaults, then whatever files and `-p` say for this node, in the
+    /// order they were given.
+    ///
+    /// # Errors
+    /// A file that cannot be read, a value that is no number, a name that was not declared: a misspelt parameter
+    /// would otherwise go unnoticed. `use_sim_time`, which launch files give to every node, is passed over.
+    pub fn parameters(
+        &self,
+        declared: &[(&str, f64)],
+        namespace: &str,
+        node: &str,
+    ) -> Result<Vec<(String, f64)>, RosArgsError> {
+        let mut values: Vec<(String, f64)> = declared.iter().map(|&(name, value)| (name.to_owned(), value)).collect();
+        let mut set = |name: &str, value: f64| {
+            if let Some(slot) = values.iter_mut().find(|(known, _)| known == name) {
+                slot.1 = value;
+                return Ok(());
+            }
+            let known = declared.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ");
+            Err(RosArgsError::UnknownParameter { name: name.to_owned(), known })
+        };
+        for source in &self.sources {
+            match source {
+                ParameterSource::Value { node: only, name, value } => {
+                    if only.as_deref().is_none_or(|only| only == node) {
+                        set(name, *value)?;
+                    }
+                }
+                ParameterSource::File(path) => {
+                    for (name, value) in read_file(path, namespace, node)? {
+                        set(&name, value)?;
+                    }
+                }
+            }
+        }
+        Ok(values)
+    }
+}
+
+const LOG_SWITCHES: [&str; 3] = ["rosout-logs", "stdout-logs", "external-lib-logs"];
+
+/// The parameter every node has; ours takes no simulated time.
+pub(super) const USE_SIM_TIME: &str = "use_sim_time";
+
+fn read_file(path: &Path, namespace: &str, node: &str) -> Result<Vec<(String, f64)>, RosArgsError> {
+    let mut values = params_file::read(path, namespace, node)?;
+    values.retain(|(name, _)| name != USE_SIM_TIME);
+    values
+        .into_iter()
+        .map(|(name, value)| match value.parse() {
+            Ok(number) => Ok((name, number)),
+            Err(_) => Err(RosArgsError::NotANumber { name, value }),
+        })
+        .collect()
+}
+
+impl Rule {
+    fn parse(rule: &str) -> Result<Self, RosArgsError> {
+        let malformed = || RosArgsError::Rule { rule: rule.to_owned() };
+        let (from, to) = rule.split_once(":=").ok_or_else(malformed)?;
+        let (node, from) = split_node(from);
+        if from.is_empty() || to.is_empty() {
+            return Err(malformed());
+        }
+        Ok(Self { node, from: from.to_owned(), to: to.to_owned() })
+    }
+
+    fn is_for(&self, node: &str) -> bool {
+        self.node.as_deref().is_none_or(|only| only == node)
+    }
+}
+
+fn parse_parameter(text: &str) -> Result<ParameterSource, RosArgsError> {
+    let malformed = || RosArgsError::Parameter { text: text.to_owned() };
+    let (name, value) = text.split_once(":=").ok_or_else(malformed)?;
+    let (node, name) = split_node(name);
+    if name.is_empty() {
+        return Err(malformed());
+    }
+    if name == USE_SIM_TIME {
+        // Kept as a parameter of nobody.
+        return Ok(ParameterSource::Value { node: Some(String::new()), name: name.to_owned(), value: 0.0 });
+    }
+    match value.trim().parse() {
+        Ok(value) => Ok(ParameterSource::Value { node, name: name.to_owned(), value }),
+        Err(_) => Err(RosArgsError::NotANumber { name: name.to_owned(), value: value.to_owned() }),
+    }
+}
+
+/// The node an argument is for, if it says one, and the rest: `node:rest`. The colon of `scheme://` is none.
+fn split_node(text: &str) -> (Option<String>, &str) {
+    match text.split_once(':') {
+        Some((node, rest)) if !rest.starts_with("//") && !node.is_empty() => (Some(node.to_owned()), rest),
+        _ => (None, text),
+    }
+}
+
+/// The absolute form of a name.
+fn expand(name: &str, namespace: &str, node: &str) -> String {
+    let namespace = namespace.trim_end_matches('/');
+    match (name.strip_prefix('~'), name.starts_with('/')) {
+        (Some(rest), _) => format!("{namespace}/{node}/{}", rest.trim_start_matches('/')),
+        (None, true) => name.to_owned(),
+        (None, false) => format!("{namespace}/{name}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    fn split(line: &str) -> Result<(RosArgs, Vec<String>), RosArgsError> {
+        RosArgs::split(line.split_whitespace().map(str::to_owned))
+    }
+
+    fn ros(line: &str) -> RosArgs {
+        split(line).expect("well formed").0
+    }
+
+    #[test]
+    fn the_rest_is_left_to_the_program() {
+        let (ros, rest) =
+            split("run a.toml --ros-args -r __node:=x -- --record d --ros-args --log-level debug").unwrap();
+        assert_eq!(rest, ["run", "a.toml", "--record", "d"]);
+        assert_eq!(ros.node_name("squealcast"), "x");
+        assert_eq!(ros.log_level(), Some("debug"));
+        assert_eq!(split("run a.toml").unwrap().0, RosArgs::default());
+    }
+
+    #[test]
+    fn names_are_remapped() {
+        let args = ros("--ros-args -r __node:=left -r __ns:=/rigs -r other:__ns:=/no");
+        assert_eq!(args.node_name("squealcast"), "left");
+        assert_eq!(args.namespace("squealcast", "/"), "/rigs");
+        let args = ros("--ros-args -r squealcast:__ns:=a/b/");
+        assert_eq!(args.namespace("squealcast", "/"), "/a/b");
+        assert_eq!(args.namespace("rig", "/"), "/");
+    }
+
+    #[test]
+    fn topics_are_remapped() {
+        let args =
+            ros("--ros-args -r /rig/operating_point:=/cell2/point --remap prediction:=out -r ~/rig:=/r -r rig:/x:=/y \
+             -r rostopic:///a:=/b");
+        let topic = |name| args.topic(name, "/ns", "squealcast");
+        assert_eq!(topic("/rig/operating_point"), "/cell2/point");
+        assert_eq!(topic("/ns/prediction"), "/ns/out");
+        assert_eq!(topic("/ns/squealcast/rig"), "/r");
+        assert_eq!(topic("/x"), "/x");
+        assert_eq!(topic("/a"), "/b");
+        assert_eq!(topic("/diagnostics"), "/diagnostics");
+        assert_eq!(args.topic("/x", "/", "rig"), "/y");
+    }
+
+    #[test]
+    fn the_first_rule_counts() {
+        let args = ros("--ros-args -r /a:=/b -r /a:=/c -r /b:=/d");
+        assert_eq!(args.topic("/a", "/", "n"), "/b");
+    }
+
+    #[test]
+    fn later_parameters_win() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        write!(file, "/**:\n  ros__parameters:\n    use_sim_time: false\n    warn_margin: 0.2\n    dead_band: 3\n")
+            .unwrap();
+        let path = file.path().display();
+        let declared = [("warn_margin", 0.05), ("dead_band", 0.0), ("silence_s", 1.0)];
+        let args = ros(&format!(
+            "--ros-args -p warn_margin:=0.1 --params-file {path} -p squealcast:dead_band:=4 -p rig:dead_band:=5 \
+             -p use_sim_time:=true"
+        ));
+        let values = args.parameters(&declared, "/", "squealcast").unwrap();
+        assert_eq!(
+            values,
+            [("warn_margin".to_owned(), 0.2), ("dead_band".to_owned(), 4.0), ("silence_s".to_owned(), 1.0)]
+        );
+    }
+
+    #[test]
+    fn misspelt_parameters_are_told() {
+        let error = ros("--ros-args -p warn_margn:=1").parameters(&[("warn_margin", 0.0)], "/", "n").unwrap_err();
+        assert_eq!(error.to_string(), "unknown parameter \"warn_margn\", there are: warn_margin");
+    }
+
+    #[test]
+    fn malformed_arguments_are_told() {
+        let error = |line: &str| split(line).expect_err("malformed").to_string();
+        assert_eq!(error("--ros-args --nonsense"), "unknown ROS argument \"--nonsense\"");
+        assert_eq!(error("--ros-args -r"), "ROS argument -r needs a value");
+        assert_eq!(error("--ros-args -r a=b"), "\"a=b\" is no remapping rule from:=to");
+        assert_eq!(error("--ros-args -r :=b"), "\":=b\" is no remapping rule from:=to");
+        assert_eq!(error("--ros-args -p x"), "\"x\" is no parameter name:=value");
+        assert_eq!(error("--ros-args -p x:=wide"), "parameter x: \"wide\" is no number");
+        assert!(split("--ros-args --disable-rosout-logs --enable-stdout-logs -e /x").is_ok());
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_arguments_panic(args: Vec<String>) {
+            let _ = RosArgs::split(std::iter::once("--ros-args".to_owned()).chain(args));
+        }
+
+        #[test]
+        fn no_rule_panics(rule: String, name: String) {
+            if let Ok((args, _)) = RosArgs::split(["--ros-args".to_owned(), "-r".to_owned(), rule]) {
+                args.topic(&name, "/", "n");
+            }
+        }
+    }
+}

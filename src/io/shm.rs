@@ -1,0 +1,420 @@
+//! Shared memory: fixed-size forms over iceoryx2, with an event service of the same name beside each topic.
+//!
+//! The reading side is a thread that sleeps until the event wakes it, drains what came and hands it to a sink. The
+//! writing side is a pair of ports that any thread may use and that never waits: a reader that is too slow loses the
+//! oldest samples, which it sees as gaps in the sequence numbers.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Once};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use iceoryx2::node::NodeCreationFailure;
+use iceoryx2::port::listener::{Listener, ListenerCreateError};
+use iceoryx2::port::notifier::{Notifier, NotifierCreateError, NotifierNotifyError};
+use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
+use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
+use iceoryx2::port::{ReceiveError, SendError};
+use iceoryx2::prelude::*;
+use iceoryx2::service::builder::event::{EventCreateError, EventOpenError, EventOpenOrCreateError};
+use iceoryx2::service::builder::publish_subscribe::{
+    PublishSubscribeCreateError, PublishSubscribeOpenError, PublishSubscribeOpenOrCreateError,
+};
+use iceoryx2::service::port_factory::{event, publish_subscribe};
+use iceoryx2::waitset::{WaitSetAttachmentError, WaitSetCreateError};
+use thiserror::Error;
+
+use super::heard::{Bus, Counters, Counts, Gaps, Heard};
+use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm};
+
+/// The ports may be used from any thread; peers with single-threaded ports connect to them all the same.
+type Ipc = ipc_threadsafe::Service;
+
+/// Hears operating points: the node's input.
+pub type ShmInput = ShmReader<OperatingPointForm>;
+/// Publishes predictions: the node's output.
+pub type ShmOutput = ShmWriter<PredictionForm>;
+/// Publishes operating points: a rig, or its simulator.
+pub type ShmSource = ShmWriter<OperatingPointForm>;
+/// Hears predictions.
+pub type ShmSink = ShmReader<PredictionForm>;
+
+const MAX_PUBLISHERS: usize = 8;
+const MAX_SUBSCRIBERS: usize = 32;
+const MAX_NODES: usize = 64;
+const HISTORY_SAMPLES: usize = 16;
+const BUFFER_SAMPLES: usize = 64;
+
+/// A reader looks for samples, and whether it should stop, at least this often; with events it wakes at once.
+const TICK: Duration = Duration::from_millis(50);
+/// A reader removes what killed processes left behind this often.
+const CLEANUP_PERIOD: Duration = Duration::from_secs(10);
+/// A service that somebody creates or removes this very moment is tried again.
+const OPEN_ATTEMPTS: usize = 50;
+const OPEN_RETRY: Duration = Duration::from_millis(10);
+
+/// Where the services are.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ShmOptions {
+    /// Before every service name, so that `cell2/` gives `cell2/rig/operating_point`.
+    pub service_prefix: String,
+    /// In the names of all files instead of `iox2_`: peers with another one do not exist. For tests.
+    pub file_prefix: Option<String>,
+}
+
+/// Why shared memory failed.
+#[derive(Debug, Error)]
+pub enum ShmError {
+    #[error("{0:?} is no service name of iceoryx2")]
+    ServiceName(String),
+    #[error("{0:?} is no file name prefix")]
+    FilePrefix(String),
+    #[error("iceoryx2 node: {0:?}")]
+    Node(NodeCreationFailure),
+    #[error("service {service}: {source:?}")]
+    Topic { service: String, source: PublishSubscribeOpenOrCreateError },
+    #[error("event service {service}: {source:?}")]
+    Event { service: String, source: EventOpenOrCreateError },
+    #[error("publisher of {service}: {source:?}")]
+    Publisher { service: String, source: PublisherCreateError },
+    #[error("notifier of {service}: {source:?}")]
+    Notifier { service: String, source: NotifierCreateError },
+    #[error("subscriber of {service}: {source:?}")]
+    Subscriber { service: String, source: SubscriberCreateError },
+    #[error("listener of {service}: {source:?}")]
+    Listener { service: String, source: ListenerCreateError },
+    #[error("wait set: {0:?}")]
+    WaitSet(WaitSetCreateError),
+    #[error("wait set: {0:?}")]
+    Attach(WaitSetAttachmentError),
+    #[error("reader thread: {0}")]
+    Thread(#[from] std::io::Error),
+    #[error("reader thread ended before it was ready")]
+    ReaderGone,
+    #[error(transparent)]
+    Form(#[from] FormError),
+    #[error("sample not sent on {service}: {source:?}")]
+    Send { service: String, source: SendError },
+    #[error("sample sent on {service}, but its readers were not woken: {source:?}")]
+    Notify { service: String, source: NotifierNotifyError },
+}
+
+/// Publishes messages over shared memory, from any thread, without ever waiting. One that is dropped right after it
+/// was made takes along what its readers, who connect as they wake, have not taken yet.
+#[derive(Debug)]
+pub struct ShmWriter<F: Form> {
+    service: String,
+    publisher: Publisher<Ipc, F, ()>,
+    notifier: Notifier<Ipc>,
+    // Last: the ports go before their node.
+    _node: Node<Ipc>,
+}
+
+impl<F: Form> ShmWriter<F> {
+    /// Opens or creates the services and the ports.
+    ///
+    /// # Errors
+    /// Whatever iceoryx2 refuses.
+    pub fn new(options: &ShmOptions) -> Result<Self, ShmError> {
+        let node = new_node(options)?;
+        let Services { service, topic, event } = Services::<F>::open(&node, options)?;
+        let publisher = topic
+            .publisher_builder()
+            // Where somebody created the service without overflow, a full reader must not hold us up either.
+            .backpressure_strategy(BackpressureStrategy::DiscardData)
+            .create()
+            .map_err(|source| ShmError::Publisher { service: service.clone(), source })?;
+        let notifier = event
+            .notifier_builder()
+            .create()
+            .map_err(|source| ShmError::Notifier { service: service.clone(), source })?;
+        Ok(Self { service, publisher, notifier, _node: node })
+    }
+
+    /// Publishes a message and wakes the readers; returns how many readers got it.
+    ///
+    /// # Errors
+    /// A message that does not fit its form, or whatever iceoryx2 refuses; the next call may well succeed.
+    pub fn publish(&self, message: &F::Message) -> Result<usize, ShmError> {
+        let form = F::from_message(message)?;
+        let readers = self
+            .publisher
+            .send_copy(form)
+            .map_err(|source| ShmError::Send { service: self.service.clone(), source })?;
+        match self.notifier.notify() {
+            // A deadline is a setting of whoever created the service; the readers were woken.
+            Ok(_) | Err(NotifierNotifyError::MissedDeadline | NotifierNotifyError::UnableToAcquireElapsedTime) => {
+                Ok(readers)
+            }
+            Err(source) => Err(ShmError::Notify { service: self.service.clone(), source }),
+        }
+    }
+}
+
+/// Hears messages over shared memory on a thread of its own, until it is stopped or dropped.
+#[derive(Debug)]
+pub struct ShmReader<F: Form> {
+    stop: Arc<AtomicBool>,
+    counters: Arc<Counters>,
+    thread: Option<JoinHandle<()>>,
+    _form: std::marker::PhantomData<fn() -> F>,
+}
+
+impl<F: Form> ShmReader<F> {
+    /// Opens or creates the services and starts the thread; every message goes to `sink`, on that thread. Of each
+    /// publisher that is already there the latest messages (16 with our own settings) come first.
+    ///
+    /// # Errors
+    /// Whatever iceoryx2 refuses.
+    pub fn spawn(options: &ShmOptions, sink: impl FnMut(Heard<F::Message>) + Send + 'static) -> Result<Self, ShmError> {
+        let node = new_node(options)?;
+        let Services { service, topic, event } = Services::<F>::open(&node, options)?;
+        // The listener first: nothing can then come between that wakes nobody.
+        let listener = event
+            .listener_builder()
+            .create()
+            .map_err(|source| ShmError::Listener { service: service.clone(), source })?;
+        let subscriber = topic
+            .subscriber_builder()
+            .create()
+            .map_err(|source| ShmError::Subscriber { service: service.clone(), source })?;
+
+        let stop = Arc::new(AtomicBool::new(false));
+        let counters = Arc::new(Counters::default());
+        let (ready, is_ready) = crossbeam_channel::bounded(1);
+        let reading = Reading {
+            node,
+            subscriber,
+            stop: Arc::clone(&stop),
+            counters: Arc::clone(&counters),
+            gaps: Gaps::new(),
+            sink,
+        };
+        let thread = thread::Builder::new()
+            .name(format!("shm {}", F::SERVICE.rsplit('/').next().unwrap_or(F::SERVICE)))
+            .spawn(move || reading.run(&listener, &ready))?;
+        is_ready.recv().unwrap_or(Err(ShmError::ReaderGone))?;
+        Ok(Self { stop, counters, thread: Some(thread), _form: std::marker::PhantomData })
+    }
+
+    /// What was counted so far.
+    pub fn counts(&self) -> Counts {
+        self.counters.counts()
+    }
+
+    /// Stops the thread and waits for it, 50 ms at most plus the sink's time; dropping does the same.
+    pub fn stop(self) {}
+}
+
+impl<F: Form> Drop for ShmReader<F> {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            // A sink that panicked has said so on its own thread.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The reading thread's own.
+struct Reading<F: Form, S> {
+    subscriber: Subscriber<Ipc, F, ()>,
+    stop: Arc<AtomicBool>,
+    counters: Arc<Counters>,
+    gaps: Gaps<u128>,
+    sink: S,
+    node: Node<Ipc>,
+}
+
+impl<F: Form, S: FnMut(Heard<F::Message>)> Reading<F, S> {
+    fn run(mut self, listener: &Listener<Ipc>, ready: &crossbeam_channel::Sender<Result<(), ShmError>>) {
+        let wait_set = match WaitSetBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled).create::<Ipc>() {
+            Ok(wait_set) => wait_set,
+            Err(error) => {
+                let _ = ready.send(Err(ShmError::WaitSet(error)));
+                return;
+            }
+        };
+        let _attached = match wait_set.attach_notification(listener) {
+            Ok(attached) => attached,
+            Err(error) => {
+                let _ = ready.send(Err(ShmError::Attach(error)));
+                return;
+            }
+        };
+        let _ = ready.send(Ok(()));
+
+        let mut cleaned = Instant::now();
+        self.drain();
+        while !self.stop.load(Ordering::Acquire) {
+            let counters = Arc::clone(&self.counters);
+            let waited = wait_set.wait_and_process_once_with_timeout(
+                |_| {
+                    if listener.try_wait(|_| ()).is_err() {
+                        counters.failure();
+                    }
+                    CallbackProgression::Continue
+                },
+                TICK,
+            );
+            if waited.is_err() {
+                self.counters.failure();
+                thread::sleep(TICK);
+            }
+            self.drain();
+            if cleaned.elapsed() >= CLEANUP_PERIOD {
+                self.node.try_cleanup_dead_nodes();
+                cleaned = Instant::now();
+            }
+        }
+    }
+
+    /// Hands over all samples there are. Each is copied out and given back at once: a reader may hold only a few.
+    fn drain(&mut self) {
+        while !self.stop.load(Ordering::Acquire) {
+            let (publisher, form) = match self.subscriber.receive() {
+                Ok(Some(sample)) => (sample.origin().value(), *sample.payload()),
+                Ok(None) => return,
+                Err(ReceiveError::ExceedsMaxBorrows | ReceiveError::ConnectionFailure(_)) => {
+                    self.counters.failure();
+                    return;
+                }
+            };
+            let missed = self.gaps.note(publisher, form.seq());
+            match form.to_message() {
+                Ok(message) => {
+                    self.counters.heard(missed);
+                    (self.sink)(Heard::now(Bus::Shm, message));
+                }
+                Err(_) => self.counters.malformed(),
+            }
+        }
+    }
+}
+
+/// A topic and the event service beside it.
+struct Services<F: Form> {
+    service: String,
+    topic: publish_subscribe::PortFactory<Ipc, F, ()>,
+    event: event::PortFactory<Ipc>,
+}
+
+impl<F: Form> Services<F> {
+    fn open(node: &Node<Ipc>, options: &ShmOptions) -> Result<Self, ShmError> {
+        let service = format!("{}{}", options.service_prefix, F::SERVICE);
+        let name = ServiceName::new(&service).map_err(|_| ShmError::ServiceName(service.clone()))?;
+        let topic = retry(|| open_topic(node, &name), topic_in_flux)
+            .map_err(|source| ShmError::Topic { service: service.clone(), source })?;
+        let event = retry(|| open_event(node, &name), event_in_flux)
+            .map_err(|source| ShmError::Event { service: service.clone(), source })?;
+        Ok(Self { service, topic, event })
+    }
+}
+
+fn new_node(options: &ShmOptions) -> Result<Node<Ipc>, ShmError> {
+    // It would write to the terminal otherwise, which may be showing a table; every error reaches the caller.
+    static QUIET: Once = Once::new();
+    QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
+
+    let mut config = Config::global_config().clone();
+    if let Some(prefix) = &options.file_prefix {
+        config.global.prefix = FileName::new(prefix.as_bytes()).map_err(|_| ShmError::FilePrefix(prefix.clone()))?;
+    }
+    let node = NodeBuilder::new()
+        .config(&config)
+        .signal_handling_mode(SignalHandlingMode::Disabled)
+        .create::<Ipc>()
+        .map_err(ShmError::Node)?;
+    node.try_cleanup_dead_nodes();
+    Ok(node)
+}
+
+/// Opens the topic with whatever settings it has; creates it with ours where there is none.
+fn open_topic<F: Form>(
+    node: &Node<Ipc>,
+    name: &ServiceName,
+) -> Result<publish_subscribe::PortFactory<Ipc, F, ()>, PublishSubscribeOpenOrCreateError> {
+    type Error = PublishSubscribeOpenOrCreateError;
+    match node.service_builder(name).publish_subscribe::<F>().open() {
+        Ok(topic) => Ok(topic),
+        Err(PublishSubscribeOpenError::DoesNotExist) => node
+            .service_builder(name)
+            .publish_subscribe::<F>()
+            .max_publishers(MAX_PUBLISHERS)
+            .max_subscribers(MAX_SUBSCRIBERS)
+            .max_nodes(MAX_NODES)
+            .history_size(HISTORY_SAMPLES)
+            .subscriber_max_buffer_size(BUFFER_SAMPLES)
+            .create()
+            .map_err(Error::PublishSubscribeCreateError),
+        Err(other) => Err(Error::PublishSubscribeOpenError(other)),
+    }
+}
+
+/// Opens the event service with whatever settings it has; creates it with ours where there is none.
+fn open_event(node: &Node<Ipc>, name: &ServiceName) -> Result<event::PortFactory<Ipc>, EventOpenOrCreateError> {
+    match node.service_builder(name).event().open() {
+        Ok(event) => Ok(event),
+        Err(EventOpenError::DoesNotExist) => node
+            .service_builder(name)
+            .event()
+            .max_notifiers(MAX_PUBLISHERS)
+            .max_listeners(MAX_SUBSCRIBERS)
+            .max_nodes(MAX_NODES)
+            .create()
+            .map_err(EventOpenOrCreateError::EventCreateError),
+        Err(other) => Err(EventOpenOrCreateError::EventOpenError(other)),
+    }
+}
+
+/// Whether somebody is creating or removing the topic this very moment.
+fn topic_in_flux(error: &PublishSubscribeOpenOrCreateError) -> bool {
+    use PublishSubscribeCreateError as Create;
+    use PublishSubscribeOpenError as Open;
+    use PublishSubscribeOpenOrCreateError as Error;
+    match error {
+        Error::PublishSubscribeOpenError(open) => matches!(
+            open,
+            Open::DoesNotExist
+                | Open::IsMarkedForDestruction
+                | Open::HangsInCreation
+                | Open::ServiceInCorruptedState
+                | Open::ExceedsMaxNumberOfNodes
+        ),
+        Error::PublishSubscribeCreateError(create) => {
+            matches!(create, Create::AlreadyExists | Create::IsBeingCreatedByAnotherInstance | Create::HangsInCreation)
+        }
+        Error::SystemInFlux => true,
+    }
+}
+
+/// Whether somebody is creating or removing the event service this very moment.
+fn event_in_flux(error: &EventOpenOrCreateError) -> bool {
+    use EventCreateError as Create;
+    use EventOpenError as Open;
+    use EventOpenOrCreateError as Error;
+    match error {
+        Error::EventOpenError(open) => matches!(
+            open,
+            Open::DoesNotExist
+                | Open::IsMarkedForDestruction
+                | Open::HangsInCreation
+                | Open::ServiceInCorruptedState
+                | Open::ExceedsMaxNumberOfNodes
+        ),
+        Error::EventCreateError(create) => {
+            matches!(create, Create::AlreadyExists | Create::IsBeingCreatedByAnotherInstance)
+        }
+        Error::SystemInFlux => true,
+    }
+}
+
+fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, passes: impl Fn(&E) -> bool) -> Result<T, E> {
+    for _ in 1..OPEN_ATTEMPTS {
+        match attempt() {
+            Err(error) if passes(&error) => thread::sleep(OPEN_RETRY),
+            done => return done,
+        }
+    }
+    attempt()
+}

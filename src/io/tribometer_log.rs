@@ -1,0 +1,797 @@
+//! Reads a tribometer's log: delimited text with named columns, units in their names or in the line below.
+//!
+//! Pure: text in, samples out. What programs write differs, so the separator (`;`, tab, `,`), the decimal sign, lines
+//! before the header, a byte order mark and Latin-1 are recognised; what remains ambiguous is an error, not a guess.
+
+use std::{borrow::Cow, f64::consts::TAU, fmt};
+
+/// A quantity a column can hold, in the unit it is kept in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Field {
+    /// Time of measurement.
+    Time,
+    NormalLoadN,
+    DiscSpeedRadS,
+    FrictionCoefficient,
+    /// Instead of the friction coefficient: divided by the normal load.
+    FrictionForceN,
+}
+
+impl Field {
+    /// All of them.
+    pub const ALL: [Self; 5] =
+        [Self::Time, Self::NormalLoadN, Self::DiscSpeedRadS, Self::FrictionCoefficient, Self::FrictionForceN];
+
+    /// As options and messages name it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Time => "time_s",
+            Self::NormalLoadN => "normal_load_n",
+            Self::DiscSpeedRadS => "disc_speed_rad_s",
+            Self::FrictionCoefficient => "friction_coefficient",
+            Self::FrictionForceN => "friction_force_n",
+        }
+    }
+
+    /// The field of a [`name`](Self::name).
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|field| field.name() == name)
+    }
+
+    /// What its columns are called, words joined by `_`.
+    fn synonyms(self) -> &'static [&'static str] {
+        match self {
+            Self::Time => {
+                &["time", "t", "timestamp", "time_stamp", "datetime", "date_time", "stamp", "elapsed", "zeit"]
+            }
+            Self::NormalLoadN => {
+                &["normal_load", "load", "normal_force", "force_normal", "fn", "f_n", "normalkraft", "contact_force"]
+            }
+            Self::DiscSpeedRadS => &[
+                "disc_speed",
+                "disk_speed",
+                "speed",
+                "rotational_speed",
+                "rotation_speed",
+                "angular_speed",
+                "angular_velocity",
+                "omega",
+                "ω",
+                "drehzahl",
+                "rpm",
+            ],
+            Self::FrictionCoefficient => &[
+                "friction_coefficient",
+                "coefficient_of_friction",
+                "friction",
+                "mu",
+                "μ",
+                "cof",
+                "reibwert",
+                "reibungszahl",
+                "reibungskoeffizient",
+            ],
+            Self::FrictionForceN => {
+                &["friction_force", "tangential_force", "ft", "f_t", "ff", "f_f", "reibkraft", "reibungskraft"]
+            }
+        }
+    }
+
+    /// Units and how many of the kept unit one of them is; of time: how many ns.
+    fn units(self) -> &'static [(&'static str, f64)] {
+        const FORCES: &[(&str, f64)] = &[("N", 1.0), ("daN", 10.0), ("kN", 1e3)];
+        match self {
+            Self::Time => &[("s", 1e9), ("ms", 1e6), ("us", 1e3), ("ns", 1.0), ("min", 60e9), ("h", 3600e9)],
+            Self::NormalLoadN | Self::FrictionForceN => FORCES,
+            Self::DiscSpeedRadS => &[
+                ("rad/s", 1.0),
+                ("rad_s", 1.0),
+                ("rpm", TAU / 60.0),
+                ("1/min", TAU / 60.0),
+                ("min-1", TAU / 60.0),
+                ("min^-1", TAU / 60.0),
+                ("U/min", TAU / 60.0),
+                ("rev/min", TAU / 60.0),
+                ("Hz", TAU),
+                ("rev/s", TAU),
+                ("deg/s", TAU / 360.0),
+            ],
+            Self::FrictionCoefficient => &[("-", 1.0), ("1", 1.0), ("", 1.0)],
+        }
+    }
+
+    fn unit(self, text: &str) -> Option<(&'static str, f64)> {
+        let text = text.trim().replace(['µ', 'μ'], "u");
+        let exact = self.units().iter().find(|(unit, _)| *unit == text);
+        exact.or_else(|| self.units().iter().find(|(unit, _)| unit.eq_ignore_ascii_case(&text))).copied()
+    }
+}
+
+impl fmt::Display for Field {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// What is wrong with a log. Lines count from 1.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum LogError {
+    #[error("no line names the columns needed: {missing} not found; line {line} comes closest: {header:?}")]
+    NoHeader { line: usize, header: String, missing: String },
+    #[error("line {line}: no column is called {header:?}, which {field} is to be read from")]
+    NoSuchColumn { line: usize, field: Field, header: String },
+    #[error("line {line}: both {first:?} and {second:?} may be {field}: say which with --column {field}=NAME")]
+    TwoColumns { line: usize, field: Field, first: String, second: String },
+    #[error("line {line}, column {column:?}: unit {unit:?} of {field} is not one of {known}")]
+    Unit { line: usize, column: String, field: Field, unit: String, known: String },
+    #[error(
+        "both decimal commas and decimal points: {comma:?} in line {comma_line}, {point:?} in line {point_line}: \
+         say which with --decimal"
+    )]
+    Decimal { comma: String, comma_line: usize, point: String, point_line: usize },
+    #[error("line {line}, column {column:?}: {value:?} is not {expected}")]
+    Value { line: usize, column: String, value: String, expected: &'static str },
+    #[error("line {line}, column {column:?}: {value} is outside of {min} to {max}")]
+    Limit { line: usize, column: String, value: f64, min: f64, max: f64 },
+    #[error("line {line}: time {value:?} is not later than that of line {before}")]
+    NotLater { line: usize, before: usize, value: String },
+    #[error("line {line}: {cells} cells, where column {column:?} is the {number}th")]
+    Short { line: usize, cells: usize, column: String, number: usize },
+    #[error("line {line}: {reason}")]
+    Text { line: usize, reason: String },
+    #[error("no samples below line {line}")]
+    NoSamples { line: usize },
+}
+
+/// How a log is read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LogOptions {
+    /// Columns by their name in the log, instead of by what they are usually called. Their unit is that in the name, or
+    /// else that of the field's name.
+    pub columns: Vec<(Field, String)>,
+    /// `,` or `.`, instead of finding out.
+    pub decimal: Option<char>,
+    /// What relative times count from, ns since the epoch. Times of a billion seconds and more count from the epoch.
+    pub start_ns: i64,
+    /// Closed ranges in the kept units.
+    pub normal_load_n: [f64; 2],
+    pub disc_speed_rad_s: [f64; 2],
+    pub friction_coefficient: [f64; 2],
+    /// Leave lines out that have something wrong with them, instead of refusing the log.
+    pub skip_bad_lines: bool,
+}
+
+impl Default for LogOptions {
+    /// Relative times count from 2000-01-01, so that an import always gives the same recording.
+    fn default() -> Self {
+        Self {
+            columns: Vec::new(),
+            decimal: None,
+            start_ns: 946_684_800_000_000_000,
+            normal_load_n: [0.0, 1e6],
+            disc_speed_rad_s: [-1e4, 1e4],
+            friction_coefficient: [0.0, 2.0],
+            skip_bad_lines: false,
+        }
+    }
+}
+
+/// A line of the log.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sample {
+    /// ns since the epoch.
+    pub stamp_ns: i64,
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub friction_coefficient: f64,
+}
+
+/// A column that was read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Column {
+    pub field: Field,
+    /// Its name in the log.
+    pub header: String,
+    /// Empty where it has none (ISO 8601 times, friction coefficients).
+    pub unit: String,
+    index: usize,
+    factor: f64,
+}
+
+/// What a log holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TribometerLog {
+    pub samples: Vec<Sample>,
+    pub columns: Vec<Column>,
+    pub separator: char,
+    pub decimal: char,
+    /// Lines left out, and what was wrong with the first.
+    pub skipped: usize,
+    pub first_skipped: Option<LogError>,
+}
+
+/// Text of a log file: UTF-8 or UTF-16 by its byte order mark, else UTF-8, else Latin-1.
+pub fn decode_text(bytes: &[u8]) -> Cow<'_, str> {
+    let utf16 = |bytes: &[u8], unit: fn([u8; 2]) -> u16| {
+        let units = bytes.chunks_exact(2).map(|pair| unit([pair[0], pair[1]]));
+        char::decode_utf16(units).map(|c| c.unwrap_or(char::REPLACEMENT_CHARACTER)).collect::<String>().into()
+    };
+    match bytes {
+        [0xff, 0xfe, rest @ ..] => utf16(rest, u16::from_le_bytes),
+        [0xfe, 0xff, rest @ ..] => utf16(rest, u16::from_be_bytes),
+        _ => {
+            let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+            match std::str::from_utf8(bytes) {
+                Ok(text) => text.into(),
+                Err(_) => bytes.iter().map(|&byte| char::from(byte)).collect::<String>().into(),
+            }
+        }
+    }
+}
+
+/// Reads a log.
+///
+/// # Errors
+///
+/// See [`LogError`]; with [`LogOptions::skip_bad_lines`] only those of the log as a whole.
+pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError> {
+    let header = find_header(text, options)?;
+    let rows = rows(text, &header)?;
+    let (mut columns, rows) = match rows.split_first() {
+        Some((first, rest)) if is_unit_row(first, &header.columns) => (with_units(first, header.columns)?, rest),
+        _ => (header.columns, rows.as_slice()),
+    };
+    let iso = is_iso(rows, &columns);
+    for column in &mut columns {
+        resolve_unit(column, header.line, iso, options)?;
+    }
+    let decimal = decimal_sign(rows, &columns, iso, options)?;
+
+    let mut log = TribometerLog {
+        samples: Vec::new(),
+        columns,
+        separator: char::from(header.separator),
+        decimal,
+        skipped: 0,
+        first_skipped: None,
+    };
+    let mut last: Option<(usize, i64)> = None;
+    let mut absolute = None;
+    for row in rows {
+        let sample = sample(row, &log.columns, decimal, iso, &mut absolute, options).and_then(|sample| match last {
+            Some((before, stamp_ns)) if sample.stamp_ns <= stamp_ns => {
+                Err(LogError::NotLater { line: row.line, before, value: row.time_text(&log.columns) })
+            }
+            _ => Ok(sample),
+        });
+        match sample {
+            Ok(sample) => {
+                last = Some((row.line, sample.stamp_ns));
+                log.samples.push(sample);
+            }
+            Err(error) if options.skip_bad_lines => {
+                log.skipped += 1;
+                log.first_skipped.get_or_insert(error);
+            }
+            Err(error) => return Err(error),
+        }
+    }
+    if log.samples.is_empty() {
+        return Err(log.first_skipped.unwrap_or(LogError::NoSamples { line: header.line }));
+    }
+    Ok(log)
+}
+
+struct Header {
+    line: usize,
+    separator: u8,
+    columns: Vec<Column>,
+    /// Byte where the lines below begin.
+    end: usize,
+}
+
+/// The first line that names all columns needed.
+fn find_header(text: &str, options: &LogOptions) -> Result<Header, LogError> {
+    const SEARCHED_LINES: usize = 500;
+    let mut closest: Option<(usize, LogError)> = None;
+    let mut end = 0;
+    for (number, line) in text.split_inclusive('\n').enumerate().take(SEARCHED_LINES) {
+        end += line.len();
+        for separator in [b';', b'\t', b','] {
+            let Some(cells) = split_line(line, separator) else { continue };
+            match header_columns(&cells, number + 1, options) {
+                Ok(columns) => return Ok(Header { line: number + 1, separator, columns, end }),
+                Err((found, error)) if closest.as_ref().is_none_or(|(best, _)| found > *best) => {
+                    closest = Some((found, error));
+                }
+                Err(_) => {}
+            }
+        }
+    }
+    let nothing = LogError::NoHeader { line: 1, header: String::new(), missing: "time".to_owned() };
+    Err(closest.map_or(nothing, |(_, error)| error))
+}
+
+fn split_line(line: &str, separator: u8) -> Option<Vec<String>> {
+    let mut reader = csv::ReaderBuilder::new()
+        .delimiter(separator)
+        .has_headers(false)
+        .flexible(true)
+        .trim(csv::Trim::All)
+        .from_reader(line.as_bytes());
+    Some(reader.records().next()?.ok()?.iter().map(str::to_owned).collect())
+}
+
+/// The columns of a header line, or how many were found and what is wrong.
+fn header_columns(cells: &[String], line: usize, options: &LogOptions) -> Result<Vec<Column>, (usize, LogError)> {
+    let mut columns: Vec<Column> = Vec::new();
+    let mut trouble = None;
+    for field in Field::ALL {
+        let column = |index: usize, unit: String| Column {
+            field,
+            header: cells.get(index).cloned().unwrap_or_default(),
+            unit,
+            index,
+            factor: 1.0,
+        };
+        if let Some((_, wanted)) = options.columns.iter().find(|(mapped, _)| *mapped == field) {
+            match cells.iter().position(|cell| cell == wanted.trim()) {
+                Some(index) => {
+                    let (_, unit) = split_unit(wanted);
+                    columns.push(column(index, unit.unwrap_or_default()));
+                }
+                None => {
+                    trouble.get_or_insert(LogError::NoSuchColumn { line, field, header: wanted.clone() });
+                }
+            }
+            continue;
+        }
+        let mapped = |cell: &String| options.columns.iter().any(|(_, wanted)| wanted.trim() == cell);
+        let mut found = cells.iter().enumerate().filter(|(_, cell)| !mapped(cell));
+        let mut found = found.by_ref().filter_map(|(index, cell)| Some((index, recognise(cell, field)?)));
+        if let Some((index, unit)) = found.next() {
+            if let Some((second, _)) = found.next() {
+                trouble.get_or_insert(LogError::TwoColumns {
+                    line,
+                    field,
+                    first: cells.get(index).cloned().unwrap_or_default(),
+                    second: cells.get(second).cloned().unwrap_or_default(),
+                });
+            }
+            columns.push(column(index, unit));
+        }
+    }
+    let found = columns.len();
+    let has = |field| columns.iter().any(|column| column.field == field);
+    let mut missing: Vec<String> = [Field::Time, Field::NormalLoadN, Field::DiscSpeedRadS]
+        .into_iter()
+        .filter(|field| !has(*field))
+        .map(|field| field.name().to_owned())
+        .collect();
+    if !has(Field::FrictionCoefficient) && !has(Field::FrictionForceN) {
+        missing.push("friction_coefficient or friction_force_n".to_owned());
+    }
+    if !missing.is_empty() {
+        let missing = missing.join(", ");
+        return Err((found, trouble.unwrap_or(LogError::NoHeader { line, header: cells.join(" | "), missing })));
+    }
+    if let Some(trouble) = trouble {
+        return Err((found, trouble));
+    }
+    if has(Field::FrictionCoefficient) {
+        columns.retain(|column| column.field != Field::FrictionForceN);
+    }
+    Ok(columns)
+}
+
+/// Name and unit of `name [unit]`, `name (unit)`, `name / unit` or `name in unit`.
+fn split_unit(cell: &str) -> (&str, Option<String>) {
+    let cell = cell.trim();
+    for (open, close) in [('[', ']'), ('(', ')'), ('{', '}')] {
+        if let Some((name, unit)) = cell.strip_suffix(close).and_then(|cell| cell.rsplit_once(open)) {
+            return (name.trim(), Some(unit.trim().to_owned()));
+        }
+    }
+    for between in [" / ", " in "] {
+        if let Some((name, unit)) = cell.split_once(between) {
+            return (name.trim(), Some(unit.trim().to_owned()));
+        }
+    }
+    (cell, None)
+}
+
+/// The unit of a column when its name says it holds `field`; an empty unit when the name has none.
+fn recognise(cell: &str, field: Field) -> Option<String> {
+    let (name, unit) = split_unit(cell);
+    let name = name.to_lowercase().replace('µ', "μ");
+    let words: Vec<&str> = name.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).collect();
+    let is_name = |words: &[&str]| field.synonyms().contains(&words.join("_").as_str());
+    if is_name(&words) {
+        return Some(unit.unwrap_or_else(|| if name == "rpm" { name.clone() } else { String::new() }));
+    }
+    if unit.is_some() {
+        return None;
+    }
+    // `normal_load_n`, `disc_speed_rad_s`: the last one or two words are the unit.
+    (1..=2).find_map(|count| {
+        let (name, unit) = words.split_at_checked(words.len().checked_sub(count)?)?;
+        let unit = unit.join("_");
+        (is_name(name) && field.unit(&unit).is_some()).then_some(unit)
+    })
+}
+
+struct Row {
+    line: usize,
+    cells: csv::StringRecord,
+}
+
+impl Row {
+    fn cell(&self, column: &Column) -> Result<&str, LogError> {
+        self.cells.get(column.index).ok_or_else(|| LogError::Short {
+            line: self.line,
+            cells: self.cells.len(),
+            column: column.header.clone(),
+            number: column.index + 1,
+        })
+    }
+
+    fn time_text(&self, columns: &[Column]) -> String {
+        let time = columns.iter().find(|column| column.field == Field::Time);
+        time.and_then(|column| self.cells.get(column.index)).unwrap_or_default().to_owned()
+    }
+}
+
+/// The lines below the header; those without any content are passed over.
+fn rows(text: &str, header: &Header) -> Result<Vec<Row>, LogError> {
+    let text = text.get(header.end..).unwrap_or_default();
+    let mut reader = csv::ReaderBuilder::new()
+        .delimiter(header.separator)
+        .has_headers(false)
+        .flexible(true)
+        .trim(csv::Trim::All)
+        .from_reader(text.as_bytes());
+    let mut rows = Vec::new();
+    // The reader's own line numbers are those of the line breaks before a record: behind by the empty lines and by
+    // one where lines end in CR LF.
+    let (mut line, mut counted) = (header.line + 1, 0);
+    for record in reader.records() {
+        let cells = record.map_err(|error| LogError::Text { line, reason: error.to_string() })?;
+        let position = cells.position().map_or(0, csv::Position::byte) as usize;
+        let breaks = text.bytes().skip(position).take_while(|byte| matches!(byte, b'\r' | b'\n')).count();
+        let start = position + breaks;
+        line += text.bytes().take(start).skip(counted).filter(|byte| *byte == b'\n').count();
+        counted = start.max(counted);
+        if cells.iter().any(|cell| !cell.is_empty()) {
+            rows.push(Row { line, cells });
+        }
+    }
+    Ok(rows)
+}
+
+/// Whether the line below the header holds units: none of its cells has a digit at its start, and some are units.
+fn is_unit_row(row: &Row, columns: &[Column]) -> bool {
+    let cells = || columns.iter().filter_map(|column| Some((column, row.cells.get(column.index)?)));
+    let bare = |cell: &str| cell.trim_matches(['[', ']', '(', ')']).trim().to_owned();
+    cells()
+        .all(|(column, cell)| column.field.unit(&bare(cell)).is_some() || !cell.contains(|c: char| c.is_ascii_digit()))
+        && cells()
+            .any(|(column, cell)| column.field.unit(&bare(cell)).is_some_and(|(unit, _)| unit.len() > 1 || unit == "N"))
+}
+
+fn with_units(row: &Row, mut columns: Vec<Column>) -> Result<Vec<Column>, LogError> {
+    for column in &mut columns {
+        if column.unit.is_empty() {
+            column.unit = row.cell(column)?.trim_matches(['[', ']', '(', ')']).trim().to_owned();
+        }
+    }
+    Ok(columns)
+}
+
+/// Whether times are dates: their first holds a `:` or a `-` behind its start.
+fn is_iso(rows: &[Row], columns: &[Column]) -> bool {
+    let first = rows.first().map(|row| row.time_text(columns)).unwrap_or_default();
+    first.contains(':') || first.char_indices().any(|(at, c)| c == '-' && at >= 4 && !first.contains(['e', 'E']))
+}
+
+/// The factor of a column's unit, or that it has none it should have.
+fn resolve_unit(column: &mut Column, line: usize, iso: bool, options: &LogOptions) -> Result<(), LogError> {
+    let field = column.field;
+    if field == Field::Time && iso {
+        column.unit.clear();
+        return Ok(());
+    }
+    let mapped = options.columns.iter().any(|(mapped, _)| *mapped == field);
+    if column.unit.is_empty() && mapped {
+        // Named by the field, and the field's name has the unit.
+        column.unit = field.units().first().map(|(unit, _)| (*unit).to_owned()).unwrap_or_default();
+    }
+    match field.unit(&column.unit) {
+        Some((_, factor)) => {
+            column.factor = factor;
+            Ok(())
+        }
+        None => Err(LogError::Unit {
+            line,
+            column: column.header.clone(),
+            field,
+            unit: column.unit.clone(),
+            known: field
+                .units()
+                .iter()
+                .map(|(unit, _)| *unit)
+                .filter(|unit| *unit != "rad_s")
+                .collect::<Vec<_>>()
+                .join(", "),
+        }),
+    }
+}
+
+/// Comma or point. A cell with both settles it (the last one is the decimal sign); so do cells with only one of them,
+/// unless there are cells of both kinds.
+fn decimal_sign(rows: &[Row], columns: &[Column], iso: bool, options: &LogOptions) -> Result<char, LogError> {
+    if let Some(sign) = options.decimal {
+        return Ok(sign);
+    }
+    let mut comma: Option<(usize, &str)> = None;
+    let mut point: Option<(usize, &str)> = None;
+    for row in rows {
+        for column in columns.iter().filter(|column| !(iso && column.field == Field::Time)) {
+            let cell = row.cells.get(column.index).unwrap_or_default();
+            let seen = match (cell.rfind(','), cell.rfind('.')) {
+                (Some(c), Some(p)) if c > p => &mut comma,
+                (Some(_), None) => &mut comma,
+                (None, None) => continue,
+                _ => &mut point,
+            };
+            seen.get_or_insert((row.line, cell));
+        }
+        if let (Some((comma_line, comma)), Some((point_line, point))) = (comma, point) {
+            return Err(LogError::Decimal { comma: comma.to_owned(), comma_line, point: point.to_owned(), point_line });
+        }
+    }
+    Ok(if comma.is_some() { ',' } else { '.' })
+}
+
+fn sample(
+    row: &Row,
+    columns: &[Column],
+    decimal: char,
+    iso: bool,
+    absolute: &mut Option<bool>,
+    options: &LogOptions,
+) -> Result<Sample, LogError> {
+    let mut sample = Sample { stamp_ns: 0, normal_load_n: 0.0, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
+    for column in columns {
+        let cell = row.cell(column)?;
+        let wrong = |expected| LogError::Value {
+            line: row.line,
+            column: column.header.clone(),
+            value: cell.to_owned(),
+            expected,
+        };
+        if column.field == Field::Time {
+            sample.stamp_ns = if iso {
+                iso_ns(cell).ok_or_else(|| wrong("an ISO 8601 time between 1970 and 2038"))?
+            } else {
+                let text = plain_number(cell, decimal).ok_or_else(|| wrong("a number"))?;
+                let ns = decimal_ns(&text, column.factor as i64).ok_or_else(|| wrong("a time in range"))?;
+                let from_epoch = *absolute.get_or_insert(ns >= 1_000_000_000 * 1_000_000_000);
+                let stamp = if from_epoch { Some(ns) } else { ns.checked_add(options.start_ns) };
+                stamp.filter(is_stamp).ok_or_else(|| wrong("a time between 1970 and 2038"))?
+            };
+            continue;
+        }
+        let number = plain_number(cell, decimal).and_then(|text| text.parse::<f64>().ok());
+        let value = number.filter(|value| value.is_finite()).ok_or_else(|| wrong("a finite number"))? * column.factor;
+        let (target, range) = match column.field {
+            Field::NormalLoadN => (&mut sample.normal_load_n, Some(options.normal_load_n)),
+            Field::DiscSpeedRadS => (&mut sample.disc_speed_rad_s, Some(options.disc_speed_rad_s)),
+            Field::FrictionCoefficient => (&mut sample.friction_coefficient, None),
+            // Columns come in the order of `Field::ALL`: the load is there. Without load there is no contact and the
+            // coefficient has no meaning.
+            Field::FrictionForceN | Field::Time => {
+                let friction = if sample.normal_load_n == 0.0 { 0.0 } else { value / sample.normal_load_n };
+                check(row, column, friction, options.friction_coefficient)?;
+                sample.friction_coefficient = friction;
+                continue;
+            }
+        };
+        *target = value;
+        check(row, column, value, range.unwrap_or(options.friction_coefficient))?;
+    }
+    Ok(sample)
+}
+
+fn check(row: &Row, column: &Column, value: f64, [min, max]: [f64; 2]) -> Result<(), LogError> {
+    if (min..=max).contains(&value) {
+        Ok(())
+    } else {
+        Err(LogError::Limit { line: row.line, column: column.header.clone(), value, min, max })
+    }
+}
+
+/// A number with a decimal point and without signs between thousands; `None` when it is none.
+fn plain_number(cell: &str, decimal: char) -> Option<String> {
+    let thousands = if decimal == ',' { '.' } else { ',' };
+    let cell = cell.trim();
+    let (whole, fraction) = match cell.split_once(decimal) {
+        Some((whole, fraction)) => (whole, Some(fraction)),
+        None => (cell, None),
+    };
+    let mut groups = whole.split(thousands);
+    let first = groups.next()?;
+    let mut text = first.to_owned();
+    for group in groups {
+        let digits = group.len() == 3 && group.bytes().all(|byte| byte.is_ascii_digit());
+        let before = first.trim_start_matches(['+', '-']);
+        if !digits || before.is_empty() || before.len() > 3 {
+            return None;
+        }
+        text.push_str(group);
+    }
+    if let Some(fraction) = fraction {
+        text.push('.');
+        text.push_str(fraction);
+    }
+    // Digits only: `f64` would also take "inf" and "nan".
+    let body = text.trim_start_matches(['+', '-']);
+    (body.starts_with(|c: char| c.is_ascii_digit() || c == '.') && text.parse::<f64>().is_ok()).then_some(text)
+}
+
+/// A decimal number of units of `unit_ns`, in ns; exact, where `f64` would lose the ns of times since the epoch.
+fn decimal_ns(text: &str, unit_ns: i64) -> Option<i64> {
+    if text.contains(['e', 'E']) {
+        let ns = (text.parse::<f64>().ok()? * unit_ns as f64).round();
+        return (ns.abs() < i64::MAX as f64).then_some(ns as i64);
+    }
+    let (negative, digits) = match text.strip_prefix('-') {
+        Some(digits) => (true, digits),
+        None => (false, text.trim_start_matches('+')),
+    };
+    let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
+    let whole: i128 = if whole.is_empty() { 0 } else { whole.parse().ok()? };
+    let fraction = fraction.get(..fraction.len().min(18))?;
+    let parts: i128 = if fraction.is_empty() { 0 } else { fraction.parse().ok()? };
+    let scale = 10_i128.checked_pow(u32::try_from(fraction.len()).ok()?)?;
+    let unit = i128::from(unit_ns);
+    let ns = whole.checked_mul(unit)?.checked_add((parts * unit + scale / 2) / scale)?;
+    i64::try_from(if negative { -ns } else { ns }).ok()
+}
+
+/// Whether `builtin_interfaces/Time`, whose seconds are an `int32`, holds a time; before 1970 is a mistake.
+fn is_stamp(ns: &i64) -> bool {
+    (0..(1 << 31) * 1_000_000_000).contains(ns)
+}
+
+/// An ISO 8601 time in ns since the epoch; without an offset it is UTC.
+fn iso_ns(cell: &str) -> Option<i64> {
+    let text = cell.trim().replacen(',', ".", 1);
+    let stamp = match text.parse::<jiff::Timestamp>() {
+        Ok(stamp) => stamp,
+        Err(_) => {
+            let civil = text.parse::<jiff::civil::DateTime>().ok()?;
+            civil.to_zoned(jiff::tz::TimeZone::UTC).ok()?.timestamp()
+        }
+    };
+    i64::try_from(stamp.as_nanosecond()).ok().filter(is_stamp)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const T0: i64 = 946_684_800_000_000_000;
+
+    fn read(text: &str) -> Result<TribometerLog, LogError> {
+        parse(text, &LogOptions::default())
+    }
+
+    fn samples(text: &str) -> Vec<(i64, f64, f64, f64)> {
+        let log = read(text).unwrap_or_else(|error| panic!("{error}"));
+        let parts = |s: &Sample| (s.stamp_ns - T0, s.normal_load_n, s.disc_speed_rad_s, s.friction_coefficient);
+        log.samples.iter().map(parts).collect()
+    }
+
+    #[test]
+    fn our_own_names() {
+        let text = "time_s,normal_load_n,disc_speed_rad_s,friction_coefficient\n0,500,13,0.35\n0.002,501.5,13,0.36\n";
+        assert_eq!(samples(text), [(0, 500.0, 13.0, 0.35), (2_000_000, 501.5, 13.0, 0.36)]);
+    }
+
+    #[test]
+    fn a_german_log_in_latin_1_with_lines_before() {
+        let bytes =
+            b"Pr\xfcfstand 7\r\nDatum;31.01.2024\r\n\r\nZeit [ms];Normalkraft [kN];Drehzahl (1/min);Reibwert [-]\r\n\
+                      0,5;0,5;120;0,35\r\n1,0;1.000,25;-60;0,4\r\n";
+        let mut options = LogOptions { normal_load_n: [0.0, 1e7], ..LogOptions::default() };
+        let log = parse(&decode_text(bytes), &options).unwrap();
+        assert_eq!((log.separator, log.decimal), (';', ','));
+        assert_eq!(log.samples[0].stamp_ns, T0 + 500_000);
+        assert_eq!(log.samples[0].normal_load_n, 500.0);
+        assert!((log.samples[0].disc_speed_rad_s - 4.0 * std::f64::consts::PI).abs() < 1e-12);
+        assert_eq!(log.samples[1].normal_load_n, 1_000_250.0);
+        options.normal_load_n = [0.0, 1e6];
+        let error = parse(&decode_text(bytes), &options).unwrap_err();
+        let column = "Normalkraft [kN]".to_owned();
+        assert_eq!(error, LogError::Limit { line: 6, column, value: 1_000_250.0, min: 0.0, max: 1e6 });
+    }
+
+    #[test]
+    fn units_in_the_line_below_tabs_utf_16_and_a_friction_force() {
+        let text = "Time\tLoad\tSpeed\tFriction force\ns\tkN\trpm\tN\n0\t0.5\t60\t175\n1\t0\t60\t3\n";
+        let mut bytes = vec![0xff, 0xfe];
+        bytes.extend(text.encode_utf16().flat_map(u16::to_le_bytes));
+        let got = samples(&decode_text(&bytes));
+        assert_eq!(got[0].3, 0.35);
+        assert!((got[0].2 - TAU).abs() < 1e-12);
+        assert_eq!(got[1].3, 0.0, "no load, no contact");
+    }
+
+    #[test]
+    fn absolute_times_keep_their_nanoseconds() {
+        let head = "timestamp,load_n,speed_rad_s,mu\n";
+        let first = |line: &str| read(&format!("{head}{line},500,13,0.3\n")).unwrap().samples[0].stamp_ns;
+        assert_eq!(first("2024-01-31T12:00:00.123456789Z"), 1_706_702_400_123_456_789);
+        assert_eq!(first("2024-01-31T13:00:00.5+01:00"), 1_706_702_400_500_000_000);
+        assert_eq!(first("2024-01-31 12:00:00.25"), 1_706_702_400_250_000_000);
+        let unix = read("time_s,load_n,speed_rad_s,mu\n1706702400.123456789,500,13,0.3\n").unwrap();
+        assert_eq!(unix.samples[0].stamp_ns, 1_706_702_400_123_456_789);
+    }
+
+    #[test]
+    fn columns_can_be_named() {
+        let text = "t,F_norm,n,cof\n0,500,13,0.3\n";
+        let columns = vec![
+            (Field::Time, "t".to_owned()),
+            (Field::NormalLoadN, "F_norm".to_owned()),
+            (Field::DiscSpeedRadS, "n".to_owned()),
+        ];
+        let log = parse(text, &LogOptions { columns: columns.clone(), ..LogOptions::default() }).unwrap();
+        assert_eq!(log.samples[0].normal_load_n, 500.0);
+        let columns = vec![(Field::NormalLoadN, "F".to_owned())];
+        let error =
+            parse("t [s],F_norm,speed_rpm,cof\n", &LogOptions { columns, ..LogOptions::default() }).unwrap_err();
+        assert!(matches!(error, LogError::NoSuchColumn { field: Field::NormalLoadN, .. }), "{error}");
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        let head = "time_s,load_n,speed_rad_s,mu\n";
+        let error = |lines: &str| read(&format!("{head}{lines}")).unwrap_err().to_string();
+        assert_eq!(error("0,500,13,NaN\n"), "line 2, column \"mu\": \"NaN\" is not a finite number");
+        assert_eq!(error("0,500,13,0.3\n0,,13,0.3\n"), "line 3, column \"load_n\": \"\" is not a finite number");
+        assert_eq!(error("0,500,13,0.3\n\n0,500,13,0.3\n"), "line 4: time \"0\" is not later than that of line 2");
+        assert_eq!(error("0,500\n"), "line 2: 2 cells, where column \"speed_rad_s\" is the 3th");
+        assert_eq!(error("0,500,13,2.5\n"), "line 2, column \"mu\": 2.5 is outside of 0 to 2");
+        assert_eq!(error(""), "no samples below line 1");
+        assert!(matches!(read("time_s,load,speed_rpm,mu\n0,1,1,0\n"), Err(LogError::Unit { .. })));
+        assert!(matches!(read("time_s,load_n,load_kn,speed_rpm,mu\n"), Err(LogError::TwoColumns { .. })));
+        assert!(matches!(read("time_s,speed_rpm,mu\n"), Err(LogError::NoHeader { line: 1, .. })));
+        let mixed = "time_s;load_n;speed_rad_s;mu\n0;1.234;13;0,3\n";
+        assert!(matches!(read(mixed), Err(LogError::Decimal { .. })));
+        let log = parse(mixed, &LogOptions { decimal: Some(','), ..LogOptions::default() }).unwrap();
+        assert_eq!(log.samples[0].normal_load_n, 1234.0);
+    }
+
+    #[test]
+    fn bad_lines_can_be_left_out() {
+        let options = LogOptions { skip_bad_lines: true, ..LogOptions::default() };
+        let log = parse("time_s,load_n,speed_rad_s,mu\n0,500,13,0.3\n1,x,13,0.3\n2,500,13,0.3\n", &options).unwrap();
+        assert_eq!((log.samples.len(), log.skipped), (2, 1));
+        assert!(matches!(log.first_skipped, Some(LogError::Value { line: 3, .. })));
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_an_answer_or_an_error(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
+            let _ = read(&decode_text(&bytes));
+        }
+
+        #[test]
+        fn any_lines_below_a_header_are_an_answer_or_an_error(text in "[-0-9eE.,;:TZ +\t\"\n\u{e4}]{0,200}") {
+            let _ = read(&format!("time_s;load_n;speed_rpm;mu\n{text}"));
+            let _ = read(&format!("time_s,load_n,speed_rpm,mu\n{text}"));
+        }
+    }
+}

@@ -1,0 +1,380 @@
+//! The node: hands what it hears to the session and carries out what the session wants.
+//!
+//! One thread owns the session and publishes. Everything that shapes a prediction comes through one bounded channel
+//! and is recorded in the order in which the session gets it, so that a replay can feed it the same.
+
+mod mapper;
+mod outputs;
+mod statistics;
+mod watch;
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
+
+pub use mapper::{chart_hash, map_hash, session_chart, session_map};
+pub use outputs::Outputs;
+pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, Watch};
+
+use crate::io::clock;
+use crate::io::heard::{Bus, Heard};
+use crate::io::message::Payload;
+use crate::physics::{Chart, OperatingPoint, StabilityMap};
+use crate::rig::Rig;
+use crate::session::{Effect, Event, Session, map_serves};
+use crate::settings::Settings;
+use crate::wire::{self, Header, RigInfo, SessionEvent, Time, event_kind};
+use mapper::Mapper;
+use statistics::Statistics;
+
+/// What may wait for the node; more inputs than this are lost before they are recorded, and counted.
+const QUEUE: usize = 16_384;
+/// A backlog that can be worked off in this time is; of a longer one only the newest input is predicted.
+const CATCH_UP: Duration = Duration::from_millis(100);
+/// Inputs whose stamp and sequence number are remembered, to answer what comes over both buses once.
+const REMEMBERED: usize = 8192;
+/// Time between diagnostics.
+const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
+
+/// Something the node has to deal with.
+#[derive(Clone, Debug)]
+pub enum Incoming {
+    /// Conditions came over a bus.
+    Input(Heard<wire::OperatingPoint>),
+    /// A setting was changed, its value validated.
+    Parameter { name: String, value: f64 },
+    /// The stability map that was asked for, or why there is none.
+    Map { point: OperatingPoint, map: Result<Arc<StabilityMap>, String> },
+    /// The chart of the rig, or why there is none.
+    Chart(Result<Arc<Chart>, String>),
+    /// Finish.
+    Stop,
+}
+
+/// A channel to a node.
+pub fn channel() -> (Sender<Incoming>, Receiver<Incoming>) {
+    bounded(QUEUE)
+}
+
+/// A running session with everything around it.
+pub struct Node {
+    session: Session,
+    rig: Arc<Rig>,
+    outputs: Outputs,
+    mapper: Mapper,
+    statistics: Statistics,
+    watch: Watch,
+    heard_before: Remembered,
+    last_heard: Instant,
+    silent: bool,
+    /// What a prediction takes, solved or read off the chart, smoothed.
+    prediction_time: Duration,
+    /// The backlog was too long: until it is gone only the newest input is predicted.
+    passing_over: bool,
+    /// Tells the thread that charts the rig that nobody waits for it any more.
+    stopped: Arc<AtomicBool>,
+}
+
+impl Node {
+    /// A node for `rig` that starts with `settings`; `sender` leads to the channel that [`Node::run`] will read.
+    pub fn new(rig: Arc<Rig>, settings: Settings, outputs: Outputs, sender: Sender<Incoming>, watch: Watch) -> Self {
+        Self {
+            session: Session::new(rig.clone(), settings),
+            mapper: Mapper::spawn(rig.clone(), sender),
+            stopped: Arc::new(AtomicBool::new(false)),
+            rig,
+            outputs,
+            statistics: Statistics::default(),
+            watch,
+            heard_before: Remembered::default(),
+            last_heard: Instant::now(),
+            silent: false,
+            prediction_time: Duration::ZERO,
+            passing_over: false,
+        }
+    }
+
+    /// Charts the rig in the background; predictions are read off the chart once it is there.
+    pub fn with_chart(self, sender: Sender<Incoming>) -> Self {
+        mapper::spawn_chart(self.rig.clone(), sender, self.stopped.clone());
+        self
+    }
+
+    /// Runs until [`Incoming::Stop`] or until nobody can send any more, then gives back what it published to.
+    pub fn run(mut self, incoming: &Receiver<Incoming>) -> Outputs {
+        self.begin();
+        let mut backlog: VecDeque<Incoming> = VecDeque::new();
+        let mut next_diagnostics = Instant::now() + DIAGNOSTICS_EVERY;
+        'run: loop {
+            // Nothing is waited for while something is left to do: diagnostics interrupt a backlog.
+            if backlog.is_empty() {
+                let deadline =
+                    self.silence_deadline().map_or(next_diagnostics, |silence| silence.min(next_diagnostics));
+                match incoming.recv_deadline(deadline) {
+                    Ok(first) => self.admit(first, &mut backlog),
+                    Err(RecvTimeoutError::Timeout) => {}
+                    Err(RecvTimeoutError::Disconnected) => break,
+                }
+            }
+            while let Some(next) = backlog.pop_front() {
+                while backlog.len() < QUEUE
+                    && let Ok(later) = incoming.try_recv()
+                {
+                    self.admit(later, &mut backlog);
+                }
+                match next {
+                    Incoming::Stop => break 'run,
+                    Incoming::Input(heard) => self.input(heard, &backlog),
+                    Incoming::Parameter { name, value } => self.parameter(name, value),
+                    Incoming::Map { point, map } => self.map(point, map),
+                    Incoming::Chart(chart) => self.chart(chart),
+                }
+                if Instant::now() >= next_diagnostics {
+                    break;
+                }
+            }
+            let nothing_waits = backlog.is_empty() && incoming.is_empty();
+            if nothing_waits && self.silence_deadline().is_some_and(|deadline| Instant::now() >= deadline) {
+                self.silence();
+            }
+            if Instant::now() >= next_diagnostics {
+                next_diagnostics = Instant::now() + DIAGNOSTICS_EVERY;
+                self.diagnose(backlog.len() + incoming.len());
+            }
+        }
+        self.stopped.store(true, Ordering::Relaxed);
+        self.diagnose(0);
+        self.outputs
+    }
+
+    /// Says what the session starts from, and asks for the map of the reference conditions.
+    fn begin(&mut self) {
+        self.outputs.rig_info(&rig_info(&self.rig));
+        let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
+        for (name, value) in settings {
+            self.note(parameter_event(now_header(), name, value));
+        }
+        self.mapper.want(self.rig.reference);
+    }
+
+    /// Queues what has come. What came over the other bus already is dropped here: were it queued, the input it
+    /// repeats would be passed over for it.
+    fn admit(&mut self, next: Incoming, backlog: &mut VecDeque<Incoming>) {
+        if let Incoming::Input(Heard { bus, message, .. }) = &next
+            && !self.heard_before.is_new(*bus, message.header.stamp, message.seq)
+        {
+            self.statistics.duplicates += 1;
+            return;
+        }
+        backlog.push_back(next);
+    }
+
+    /// Predicts for an input; or, once the inputs behind it were more than can be worked off, passes all but the
+    /// newest over.
+    fn input(&mut self, heard: Heard<wire::OperatingPoint>, behind: &VecDeque<Incoming>) {
+        let input = heard.message;
+        self.last_heard = Instant::now();
+        self.silent = false;
+        self.statistics.heard(heard.bus);
+        self.outputs.record(heard.at.wall_ns, Payload::OperatingPoint(input.clone()));
+        let inputs_behind = behind.iter().filter(|next| matches!(next, Incoming::Input(_)));
+        let waiting = inputs_behind.take(if self.passing_over { 1 } else { usize::MAX }).count();
+        self.passing_over = waiting > 0 && (self.passing_over || self.prediction_time * waiting as u32 > CATCH_UP);
+        if self.passing_over {
+            self.statistics.passed_over += 1;
+            return;
+        }
+        self.watch.input(&input);
+        let worked_before = self.session.counters().worked();
+        let started = clock::monotonic_ns();
+        self.step(Event::Input(input));
+        let took = Duration::from_nanos(clock::monotonic_ns().saturating_sub(started));
+        self.statistics.predicted(took);
+        if self.session.counters().worked() > worked_before {
+            let known = if self.prediction_time.is_zero() { took } else { self.prediction_time };
+            self.prediction_time = (known * 7 + took) / 8;
+        }
+    }
+
+    fn parameter(&mut self, name: String, value: f64) {
+        self.note(parameter_event(now_header(), &name, value));
+        self.step(Event::Parameter { name, value });
+    }
+
+    fn map(&mut self, point: OperatingPoint, map: Result<Arc<StabilityMap>, String>) {
+        self.mapper.done();
+        match map {
+            Ok(map) => {
+                self.statistics.maps += 1;
+                self.statistics.map_failure = None;
+                let hash = map_hash(&map);
+                self.note(SessionEvent {
+                    header: now_header(),
+                    kind: event_kind::STABILITY_MAP,
+                    normal_load_n: point.normal_load_n,
+                    disc_speed_rad_s: point.disc_speed_rad_s,
+                    hash,
+                    ..Default::default()
+                });
+                self.mapper
+                    .go_on(|wish| map_serves(&self.rig.model, &map, wish, self.session.settings().map_tolerance));
+                self.watch.map(&map);
+                self.step(Event::MapReady(map));
+            }
+            Err(reason) => {
+                self.mapper.give_up_on(point);
+                self.mapper.go_on(|_| false);
+                self.statistics.map_failure = Some(reason);
+            }
+        }
+    }
+
+    fn chart(&mut self, chart: Result<Arc<Chart>, String>) {
+        match chart {
+            Ok(chart) => {
+                self.statistics.charted(&chart);
+                let hash = chart_hash(&chart);
+                self.note(SessionEvent { header: now_header(), kind: event_kind::CHART, hash, ..Default::default() });
+                self.step(Event::ChartReady(chart));
+            }
+            Err(reason) => self.statistics.chart_failure = Some(reason),
+        }
+    }
+
+    fn silence_deadline(&self) -> Option<Instant> {
+        let timeout = Duration::try_from_secs_f64(self.session.settings().silence_timeout_s).ok()?;
+        if self.silent { None } else { self.last_heard.checked_add(timeout) }
+    }
+
+    fn silence(&mut self) {
+        self.silent = true;
+        let header = now_header();
+        let stamp = header.stamp;
+        self.note(SessionEvent { header, kind: event_kind::SILENCE, ..Default::default() });
+        self.step(Event::Silence { stamp });
+    }
+
+    /// Records and publishes an event of the session, before the session gets it.
+    fn note(&mut self, event: SessionEvent) {
+        self.outputs.session_event(event);
+    }
+
+    fn step(&mut self, event: Event) {
+        match self.session.step(event) {
+            Ok(effects) => {
+                for effect in effects {
+                    match effect {
+                        Effect::Publish(prediction) => {
+                            self.statistics.level = prediction.level;
+                            self.outputs.prediction(&prediction);
+                            self.watch.prediction(prediction);
+                        }
+                        Effect::WantMap(point) => self.mapper.want(point),
+                    }
+                }
+            }
+            Err(refused) => self.statistics.refused = Some(refused.to_string()),
+        }
+    }
+
+    fn diagnose(&mut self, queued: usize) {
+        let counters = self.session.counters();
+        let array =
+            self.statistics.report(now_header(), &self.rig, counters, queued, self.mapper.pending(), &self.outputs);
+        self.watch.counters(counters, self.statistics.passed_over);
+        self.outputs.diagnostics(array);
+    }
+}
+
+/// What a node tells about its rig.
+pub fn rig_info(rig: &Rig) -> RigInfo {
+    RigInfo {
+        name: rig.name.clone(),
+        content_hash: rig.content_hash.clone(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        mode_count: rig.model.dimension() as u32,
+        band_max_hz: rig.band_max_hz.unwrap_or(f64::NAN),
+    }
+}
+
+fn now_header() -> Header {
+    Header { stamp: Time::from_ns(clock::now_ns()), frame_id: String::new() }
+}
+
+/// The event of a setting that was changed.
+pub fn parameter_event(header: Header, name: &str, value: f64) -> SessionEvent {
+    let name = name.to_owned();
+    SessionEvent { header, kind: event_kind::PARAMETER, name, value, ..Default::default() }
+}
+
+/// The stamps and sequence numbers heard lately, each with the bus it came over first.
+#[derive(Default)]
+struct Remembered {
+    bus: HashMap<(Time, u64), Bus>,
+    order: VecDeque<(Time, u64)>,
+}
+
+impl Remembered {
+    /// Whether this was not heard over another bus lately. What the same bus repeats is new: a recording played again.
+    fn is_new(&mut self, bus: Bus, stamp: Time, seq: u64) -> bool {
+        let key = (stamp, seq);
+        if let Some(&first) = self.bus.get(&key) {
+            return first == bus;
+        }
+        self.bus.insert(key, bus);
+        self.order.push_back(key);
+        if self.order.len() > REMEMBERED
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.bus.remove(&oldest);
+        }
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bus_may_repeat_itself_but_not_another() {
+        let mut heard = Remembered::default();
+        let stamp = Time::from_ns(1);
+        assert!(heard.is_new(Bus::Shm, stamp, 1));
+        assert!(!heard.is_new(Bus::Ros2, stamp, 1), "answered over shared memory already");
+        assert!(heard.is_new(Bus::Shm, stamp, 1), "a recording played again");
+        assert!(!heard.is_new(Bus::Ros2, stamp, 1));
+    }
+
+    #[test]
+    fn of_a_long_backlog_the_newest_is_predicted_whatever_bus_repeats_it() {
+        const COUNT: u64 = 8000;
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let settings = Settings::for_rig(&rig);
+        let (sender, receiver) = channel();
+        for seq in 0..COUNT {
+            let message = wire::OperatingPoint {
+                header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
+                seq,
+                normal_load_n: 500.0,
+                disc_speed_rad_s: 13.0,
+                friction_coefficient: 0.3 + 1e-6 * seq as f64,
+            };
+            for bus in [Bus::Ros2, Bus::Shm] {
+                sender.try_send(Incoming::Input(Heard::now(bus, message.clone()))).expect("room");
+            }
+        }
+        sender.try_send(Incoming::Stop).expect("room");
+        let watch = Watch::default();
+        let mut node = Node::new(rig, settings, Outputs::default(), sender, watch.clone());
+        // Of a rig that takes as long, not more than ten may wait.
+        node.prediction_time = Duration::from_millis(10);
+        node.run(&receiver);
+        let seen = watch.snapshot();
+        assert_eq!(seen.prediction.expect("one").input_seq, COUNT - 1);
+        assert_eq!((seen.counters.solved, seen.passed_over), (1, COUNT - 1));
+    }
+}

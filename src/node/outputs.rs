@@ -1,0 +1,82 @@
+//! Where the node's messages go. What a bus refuses is counted, never waited for.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+
+use crate::io::clock;
+use crate::io::heard::Counts;
+use crate::io::message::{Message, Payload};
+use crate::io::recorder::RecorderHandle;
+use crate::io::ros2::Ros2;
+use crate::io::shm::{ShmInput, ShmOutput};
+use crate::wire::{DiagnosticArray, Prediction, RigInfo, SessionEvent};
+
+/// The buses and the recorder of a node; any of them may be missing.
+#[derive(Default)]
+pub struct Outputs {
+    pub shm: Option<ShmOutput>,
+    pub shm_input: Option<ShmInput>,
+    pub ros2: Option<Ros2>,
+    pub recorder: Option<RecorderHandle>,
+    /// Inputs that came into a full queue.
+    pub lost_inputs: Arc<AtomicU64>,
+    /// Messages a bus refused, and what it said last.
+    pub failures: u64,
+    pub last_failure: Option<String>,
+}
+
+impl Outputs {
+    /// Records a message heard or made at `wall_ns`.
+    pub fn record(&self, wall_ns: i64, payload: Payload) {
+        if let Some(recorder) = &self.recorder {
+            let time_ns = u64::try_from(wall_ns).unwrap_or(0);
+            // A message the recorder has no room for is in its own count.
+            recorder.record(Message { log_time_ns: time_ns, publish_time_ns: time_ns, payload });
+        }
+    }
+
+    pub fn prediction(&mut self, prediction: &Prediction) {
+        if let Some(Err(error)) = self.shm.as_ref().map(|shm| shm.publish(prediction)) {
+            self.failed(&error);
+        }
+        if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_prediction(prediction)) {
+            self.failed(&error);
+        }
+        if self.recorder.is_some() {
+            self.record(clock::now_ns(), Payload::Prediction(prediction.clone()));
+        }
+    }
+
+    pub fn session_event(&mut self, event: SessionEvent) {
+        if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_session_event(&event)) {
+            self.failed(&error);
+        }
+        self.record(clock::now_ns(), Payload::SessionEvent(event));
+    }
+
+    pub fn rig_info(&mut self, info: &RigInfo) {
+        if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_rig(info)) {
+            self.failed(&error);
+        }
+        self.record(clock::now_ns(), Payload::RigInfo(info.clone()));
+    }
+
+    pub fn diagnostics(&mut self, diagnostics: DiagnosticArray) {
+        if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_diagnostics(&diagnostics)) {
+            self.failed(&error);
+        }
+        self.record(clock::now_ns(), Payload::Diagnostics(diagnostics));
+    }
+
+    /// What the listening side of each bus counted.
+    pub fn counts(&self) -> Vec<(&'static str, Counts)> {
+        let shm = self.shm_input.as_ref().map(|shm| ("shm", shm.counts()));
+        let ros2 = self.ros2.as_ref().map(|ros2| ("ros2", ros2.counts()));
+        shm.into_iter().chain(ros2).collect()
+    }
+
+    fn failed(&mut self, error: &dyn std::fmt::Display) {
+        self.failures += 1;
+        self.last_failure = Some(error.to_string());
+    }
+}

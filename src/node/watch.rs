@@ -1,0 +1,196 @@
+//! The latest state of a node, for whoever looks at it. Never waited for by the node for longer than a copy takes.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use crate::io::clock;
+use crate::physics::StabilityMap;
+use crate::session::Counters;
+use crate::wire::{OperatingPoint, Prediction};
+
+/// What there is to see.
+#[derive(Clone, Debug, Default)]
+pub struct Snapshot {
+    /// The conditions of [`Snapshot::prediction`].
+    pub input: Option<OperatingPoint>,
+    pub prediction: Option<Prediction>,
+    /// When the last input was heard.
+    pub heard: Option<Instant>,
+    pub map: Option<Arc<StabilityMap>>,
+    pub counters: Counters,
+    pub passed_over: u64,
+}
+
+/// Unstable modes kept of a [`Sample`].
+pub const SAMPLE_MODES: usize = 4;
+/// Samples that may wait for whoever follows them; what comes after is lost to them, not to the node.
+const MOST_SAMPLES: usize = 1 << 16;
+
+/// What became of one input, small enough to keep many of.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sample {
+    /// When it was predicted, ns since the epoch.
+    pub time_ns: i64,
+    /// Stamp of the prediction, ns since the epoch.
+    pub stamp_ns: i64,
+    pub input_seq: u64,
+    /// The conditions; NaN where they are not known.
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub friction_coefficient: f64,
+    pub level: u8,
+    pub unstable_modes: u32,
+    pub max_growth_rate_per_s: f64,
+    pub critical_friction: f64,
+    pub friction_margin: f64,
+    /// The fastest growing unstable modes, fastest first.
+    pub unstable: [Option<UnstableMode>; SAMPLE_MODES],
+}
+
+/// A growing mode.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct UnstableMode {
+    pub id: u32,
+    pub frequency_hz: f64,
+    pub growth_rate_per_s: f64,
+}
+
+impl Sample {
+    /// The sample of a prediction made at `time_ns` for `input`.
+    pub fn new(time_ns: i64, input: Option<&OperatingPoint>, prediction: &Prediction) -> Self {
+        let value = |of: fn(&OperatingPoint) -> f64| input.map_or(f64::NAN, of);
+        let mut unstable = [None; SAMPLE_MODES];
+        // Roots that do not oscillate count as unstable too but are not among the modes.
+        let kept = SAMPLE_MODES.min(prediction.unstable_modes as usize);
+        for mode in prediction.modes.iter().filter(|mode| mode.growth_rate_per_s > 0.0) {
+            let mut candidate = Some(UnstableMode {
+                id: mode.id,
+                frequency_hz: mode.frequency_hz,
+                growth_rate_per_s: mode.growth_rate_per_s,
+            });
+            for place in &mut unstable[..kept] {
+                let growth = |mode: &Option<UnstableMode>| mode.map_or(0.0, |mode| mode.growth_rate_per_s);
+                if growth(&candidate) > growth(place) {
+                    std::mem::swap(place, &mut candidate);
+                }
+            }
+        }
+        Self {
+            time_ns,
+            stamp_ns: prediction.header.stamp.as_ns(),
+            input_seq: prediction.input_seq,
+            normal_load_n: value(|input| input.normal_load_n),
+            disc_speed_rad_s: value(|input| input.disc_speed_rad_s),
+            friction_coefficient: value(|input| input.friction_coefficient),
+            level: prediction.level,
+            unstable_modes: prediction.unstable_modes,
+            max_growth_rate_per_s: prediction.max_growth_rate_per_s,
+            critical_friction: prediction.critical_friction,
+            friction_margin: prediction.friction_margin,
+            unstable,
+        }
+    }
+}
+
+/// A shared view of the latest state, and of the samples since somebody began to follow them.
+#[derive(Clone, Default)]
+pub struct Watch(Arc<Mutex<Watched>>);
+
+#[derive(Default)]
+struct Watched {
+    snapshot: Snapshot,
+    /// The latest input, which may not be predicted yet.
+    input: Option<OperatingPoint>,
+    /// `None` while nobody follows.
+    samples: Option<Vec<Sample>>,
+    lost: u64,
+}
+
+impl Watch {
+    /// A copy of the latest state.
+    pub fn snapshot(&self) -> Snapshot {
+        self.with(|watched| watched.snapshot.clone())
+    }
+
+    /// The samples since the last call, oldest first, in place of what `samples` held; and how many were lost so far
+    /// because nobody took them. The first call begins to follow.
+    pub fn take_samples(&self, samples: &mut Vec<Sample>) -> u64 {
+        samples.clear();
+        self.with(|watched| {
+            std::mem::swap(watched.samples.get_or_insert_with(Vec::new), samples);
+            watched.lost
+        })
+    }
+
+    fn with<T>(&self, action: impl FnOnce(&mut Watched) -> T) -> T {
+        action(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    pub(super) fn input(&self, input: &OperatingPoint) {
+        self.with(|watched| {
+            watched.snapshot.heard = Some(Instant::now());
+            watched.input = Some(input.clone());
+        });
+    }
+
+    pub(super) fn prediction(&self, prediction: Prediction) {
+        self.with(|watched| {
+            let Watched { snapshot, input, samples, lost } = watched;
+            if let Some(samples) = samples {
+                if samples.len() < MOST_SAMPLES {
+                    samples.push(Sample::new(clock::now_ns(), input.as_ref(), &prediction));
+                } else {
+                    *lost += 1;
+                }
+            }
+            snapshot.input.clone_from(input);
+            snapshot.prediction = Some(prediction);
+        });
+    }
+
+    pub(super) fn map(&self, map: &Arc<StabilityMap>) {
+        self.with(|watched| watched.snapshot.map = Some(map.clone()));
+    }
+
+    pub(super) fn counters(&self, counters: Counters, passed_over: u64) {
+        self.with(|watched| (watched.snapshot.counters, watched.snapshot.passed_over) = (counters, passed_over));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::Mode;
+
+    fn prediction(growth: &[f64], unstable_modes: u32) -> Prediction {
+        let mode =
+            |(id, &growth_rate_per_s): (usize, &f64)| Mode { id: id as u32, growth_rate_per_s, ..Default::default() };
+        Prediction { unstable_modes, modes: growth.iter().enumerate().map(mode).collect(), ..Default::default() }
+    }
+
+    #[test]
+    fn samples_keep_the_fastest_growing_modes_in_order() {
+        let sample = Sample::new(0, None, &prediction(&[0.5, -1.0, 2.0, 0.1, 3.0, 0.7], 5));
+        assert_eq!(sample.unstable.map(|mode| mode.map(|mode| mode.id)), [Some(4), Some(2), Some(5), Some(0)]);
+        let sample = Sample::new(0, None, &prediction(&[1e-12, 2.0], 1));
+        assert_eq!(
+            sample.unstable.map(|mode| mode.map(|mode| mode.id)),
+            [Some(1), None, None, None],
+            "one is unstable"
+        );
+        assert!(sample.normal_load_n.is_nan());
+    }
+
+    #[test]
+    fn samples_are_kept_only_for_a_follower_and_never_more_than_may_wait() {
+        let watch = Watch::default();
+        let mut samples = vec![];
+        watch.prediction(prediction(&[], 0));
+        assert_eq!((watch.take_samples(&mut samples), samples.len()), (0, 0), "nobody followed yet");
+        for _ in 0..MOST_SAMPLES + 3 {
+            watch.prediction(prediction(&[], 0));
+        }
+        assert_eq!((watch.take_samples(&mut samples), samples.len()), (3, MOST_SAMPLES));
+        assert_eq!((watch.take_samples(&mut samples), samples.len()), (3, 0));
+    }
+}

@@ -1,0 +1,98 @@
+//! A session without buses and without waiting: given inputs, predicted and recorded as fast as possible.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use crate::io::message::{Message, Payload};
+use crate::io::recorder::{Recorder, RecorderConfig, RecorderError};
+use crate::node::{map_hash, parameter_event, rig_info, session_map};
+use crate::physics::Solver;
+use crate::rig::Rig;
+use crate::session::{Effect, Event, Session};
+use crate::settings::Settings;
+use crate::wire::{Header, OperatingPoint, SessionEvent, Time, event_kind};
+
+/// Stamp of the first input of an offline session, ns since the epoch: 2024-01-01T00:00:00Z, so that the same command
+/// makes the same messages.
+pub const START_NS: i64 = 1_704_067_200_000_000_000;
+
+/// Why a session could not be recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum OfflineError {
+    #[error(transparent)]
+    Recorder(#[from] RecorderError),
+    #[error("no stability map: {0}")]
+    Map(String),
+    #[error("{dropped} messages were not recorded: {reason}")]
+    Dropped { dropped: u64, reason: String },
+}
+
+/// Predicts `inputs` with `rig` and records the session into a new directory in `directory`; that directory.
+///
+/// # Errors
+/// [`OfflineError`].
+pub fn record(
+    rig: &Arc<Rig>,
+    inputs: impl Iterator<Item = OperatingPoint>,
+    directory: &Path,
+) -> Result<PathBuf, OfflineError> {
+    let recorder = Recorder::start(RecorderConfig {
+        rig_name: rig.name.clone(),
+        rig_content_hash: rig.content_hash.clone(),
+        rig_files: rig.files.clone(),
+        ..RecorderConfig::new(directory)
+    })?;
+    // There is no hurry here: rather wait for the disk than drop.
+    let write = |stamp: Time, payload: Payload| {
+        let time_ns = u64::try_from(stamp.as_ns()).unwrap_or(0);
+        while recorder.status().queued > 1000 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        recorder.record(Message { log_time_ns: time_ns, publish_time_ns: time_ns, payload });
+    };
+    let mut session = Session::new(rig.clone(), Settings::for_rig(rig));
+    let mut solver = Solver::new(rig.model.dimension());
+    let mut begun = false;
+    for input in inputs {
+        let stamp = input.header.stamp;
+        let header = Header { stamp, ..Default::default() };
+        if !begun {
+            begun = true;
+            write(stamp, Payload::RigInfo(rig_info(rig)));
+            for (name, value) in session.settings().values() {
+                write(stamp, Payload::SessionEvent(parameter_event(header.clone(), name, value)));
+            }
+        }
+        write(stamp, Payload::OperatingPoint(input.clone()));
+        // Settings are the rig's own here, and inputs are no settings: nothing can be refused.
+        for effect in session.step(Event::Input(input)).unwrap_or_default() {
+            match effect {
+                Effect::Publish(prediction) => write(stamp, Payload::Prediction(prediction)),
+                Effect::WantMap(point) => {
+                    let map = session_map(rig, &mut solver, &point).map_err(OfflineError::Map)?;
+                    write(
+                        stamp,
+                        Payload::SessionEvent(SessionEvent {
+                            header: header.clone(),
+                            kind: event_kind::STABILITY_MAP,
+                            normal_load_n: point.normal_load_n,
+                            disc_speed_rad_s: point.disc_speed_rad_s,
+                            hash: map_hash(&map),
+                            ..Default::default()
+                        }),
+                    );
+                    let _ = session.step(Event::MapReady(Arc::new(map)));
+                }
+            }
+        }
+    }
+    let finished = recorder.finish(Duration::from_secs(600))?;
+    match finished.status.dropped() {
+        0 => Ok(finished.directory),
+        dropped => {
+            let reason = finished.status.last_error.unwrap_or_else(|| "the queue was full".to_owned());
+            Err(OfflineError::Dropped { dropped, reason })
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! Stability prediction: operating point, contact, model, complex eigenvalues, critical friction, mode tracking.
+//!
+//! Pure: no clock, file, bus, log or serialisation. Everything is SI, angular frequencies in rad/s.
+
+pub mod chart;
+pub mod critical;
+pub mod model;
+pub mod operating_point;
+pub mod reference;
+pub mod spectrum;
+pub mod stability_map;
+pub mod summary;
+pub mod synthetic;
+#[cfg(test)]
+mod test_models;
+pub mod tracking;
+
+pub use chart::{Chart, NotCharted};
+pub use critical::{Window, WindowKind};
+pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Term, Traces};
+pub use operating_point::{ContactState, OperatingPoint};
+pub use spectrum::{Root, RootError, SolveError, Solver, Spectrum, Vectors};
+pub use stability_map::{MapError, MapOptions, StabilityMap};
+pub use summary::{Mode, Summary};

@@ -1,0 +1,466 @@
+//! The equation of motion of a rig, `q̈ + C(p) q̇ + K(p) q = 0`, as sums of terms.
+//!
+//! Coordinates are mass-normalised (`M = I`) for every kind of rig: substructures by their modes, systems of
+//! matrices by a Cholesky factor of `M` or by a projection on modes. A term is a constant matrix times a scalar
+//! [`Law`] of the operating point; a [`ContactPairs`] becomes such terms when the model is built.
+
+use std::sync::Arc;
+
+use faer::{Mat, MatRef};
+
+use super::operating_point::{ContactState, OperatingPoint};
+
+/// A matrix times a scalar law of the operating point.
+#[derive(Clone, Debug)]
+pub struct Term {
+    /// `n×n`; in `K` rad²/s² per unit of the law, in `C` 1/s per unit of the law.
+    pub matrix: Mat<f64>,
+    /// The scalar it is multiplied by.
+    pub law: Law,
+}
+
+/// The scalar that multiplies a term, as a function of the operating point.
+#[derive(Clone, Debug)]
+pub enum Law {
+    /// `1`, whatever the conditions.
+    Constant,
+    /// `κ(N) = (N / N_ref)^α` while the contact is closed.
+    ContactStiffness,
+    /// `s μ κ(N)` while it slides, `s` the sign of the disc speed.
+    FrictionStiffness,
+    /// `1` while the contact is closed.
+    ContactDamping,
+    /// `s μ` while it slides.
+    FrictionDamping,
+    /// `dμ/dv · N` while it slides.
+    FrictionSlope,
+    /// `μ N / |ω|` while it slides.
+    LateralFriction,
+    /// Any other function, from a rig file's expression.
+    Custom(CustomLaw),
+}
+
+/// A law given from outside, with what it depends on.
+#[derive(Clone)]
+pub struct CustomLaw {
+    /// How it was written.
+    pub text: String,
+    /// Its value. The friction coefficient handed in is 0 where the contact does not slide.
+    pub evaluate: Arc<dyn Fn(&OperatingPoint) -> f64 + Send + Sync>,
+    /// Whether its value changes with the normal load.
+    pub depends_on_load: bool,
+    /// Whether its value changes with the disc speed.
+    pub depends_on_speed: bool,
+    /// Whether its value changes with the friction coefficient.
+    pub depends_on_friction: bool,
+}
+
+impl std::fmt::Debug for CustomLaw {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_tuple("CustomLaw").field(&self.text).finish()
+    }
+}
+
+/// How contact and friction depend on load and speed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ContactLaw {
+    /// `α` in `k = k_ref (N / N_ref)^α`: 0 a linear spring, 1/3 Hertzian, 1 an exponential contact.
+    pub exponent: f64,
+    /// `N_ref`, N.
+    pub reference_n: f64,
+    /// `dμ/dv`, s/m; negative where friction falls with speed.
+    pub slope_s_per_m: f64,
+    /// Whether friction turns with the direction of sliding and so damps motion along `b`.
+    pub lateral_damping: bool,
+}
+
+impl Default for ContactLaw {
+    fn default() -> Self {
+        Self { exponent: 0.0, reference_n: 500.0, slope_s_per_m: 0.0, lateral_damping: false }
+    }
+}
+
+/// Contact pairs in modal coordinates: relative displacement, pad minus disc, along the triad `n`, `t`, `b`.
+#[derive(Clone, Debug)]
+pub struct ContactPairs {
+    /// `B_n`, `c×n`, kg^-1/2: along the normal, from disc to pad.
+    pub normal: Mat<f64>,
+    /// `B_t`, `c×n`, kg^-1/2: along the sliding direction of the disc at positive speed.
+    pub sliding: Mat<f64>,
+    /// `B_b`, `c×n`, kg^-1/2: along `b = n × t`.
+    pub lateral: Mat<f64>,
+    /// `k` per pair at the reference load, N/m.
+    pub stiffness_n_per_m: Vec<f64>,
+    /// `c` per pair, N·s/m.
+    pub damping_n_s_per_m: Vec<f64>,
+    /// Distance of each pair from the disc's axis, m; only lateral damping uses it.
+    pub radius_m: Vec<f64>,
+}
+
+/// Why a model could not be built or evaluated.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ModelError {
+    #[error("{what} is {rows}x{columns}, expected {expected}x{expected}")]
+    Shape { what: String, rows: usize, columns: usize, expected: usize },
+    #[error("{what}: entry ({row}, {column}) is {value}, expected a finite number")]
+    NotFinite { what: String, row: usize, column: usize, value: f64 },
+    #[error(
+        "{what} is {value} at {normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}; expected a finite number"
+    )]
+    LawNotFinite { what: String, value: f64, normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64 },
+    #[error("{what} has {found} values, expected one for each of {expected} contact pairs")]
+    PairCount { what: &'static str, found: usize, expected: usize },
+    #[error("contact pair {pair}: radius_m is {radius_m}, expected more than 0 for lateral damping")]
+    Radius { pair: usize, radius_m: f64 },
+    #[error(
+        "operating point ({normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}) is not finite"
+    )]
+    PointNotFinite { normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64 },
+}
+
+/// A term with what its matrix is known to be.
+#[derive(Clone, Debug)]
+struct KnownTerm {
+    term: Term,
+    symmetric: bool,
+}
+
+/// The equation of motion of a rig in `n` mass-normalised coordinates.
+#[derive(Clone, Debug)]
+pub struct Model {
+    dimension: usize,
+    stiffness: Vec<KnownTerm>,
+    damping: Vec<KnownTerm>,
+    contact_law: ContactLaw,
+    has_contact: bool,
+    pad_modes: Option<usize>,
+}
+
+/// What [`Model::assemble`] found out about the matrices it wrote.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Structure {
+    /// Any damping term has a coefficient other than zero.
+    pub damped: bool,
+    /// Every term of the stiffness with a coefficient other than zero is symmetric.
+    pub symmetric_stiffness: bool,
+}
+
+impl Model {
+    /// A model from its terms, without contact.
+    ///
+    /// `pad_modes`: how many of the first coordinates belong to the pad; `None` where pad and disc are not told apart.
+    ///
+    /// # Errors
+    /// [`ModelError::Shape`], [`ModelError::NotFinite`].
+    pub fn new(
+        dimension: usize,
+        stiffness: Vec<Term>,
+        damping: Vec<Term>,
+        contact_law: ContactLaw,
+        pad_modes: Option<usize>,
+    ) -> Result<Self, ModelError> {
+        let mut model =
+            Self { dimension, stiffness: vec![], damping: vec![], contact_law, has_contact: false, pad_modes };
+        for (k, term) in stiffness.into_iter().enumerate() {
+            model.stiffness.push(model.known(term, || format!("stiffness term {k}"))?);
+        }
+        for (k, term) in damping.into_iter().enumerate() {
+            let known = model.known(term, || format!("damping term {k}"))?;
+            model.damping.push(known);
+        }
+        model.drop_zero_terms();
+        Ok(model)
+    }
+
+    /// Adds the terms of the contact between pad and disc:
+    ///
+    /// ```text
+    /// K += κ(N) (B_n + s μ B_t)ᵀ K_c B_n
+    /// C += (B_n + s μ B_t)ᵀ C_c B_n + dμ/dv B_tᵀ diag(N_0) B_t + μ B_bᵀ diag(N_0 / v) B_b,   N_0 = N / c, v_k = |ω| r_k
+    /// ```
+    ///
+    /// # Errors
+    /// [`ModelError::Shape`], [`ModelError::NotFinite`], [`ModelError::PairCount`], [`ModelError::Radius`].
+    pub fn with_contact(mut self, pairs: &ContactPairs) -> Result<Self, ModelError> {
+        let count = pairs.normal.nrows();
+        for (what, rows) in [("sliding", &pairs.sliding), ("lateral", &pairs.lateral), ("normal", &pairs.normal)] {
+            if rows.nrows() != count || rows.ncols() != self.dimension {
+                return Err(ModelError::Shape {
+                    what: format!("contact rows `{what}`"),
+                    rows: rows.nrows(),
+                    columns: rows.ncols(),
+                    expected: self.dimension,
+                });
+            }
+        }
+        for (what, values) in [
+            ("stiffness_n_per_m", &pairs.stiffness_n_per_m),
+            ("damping_n_s_per_m", &pairs.damping_n_s_per_m),
+            ("radius_m", &pairs.radius_m),
+        ] {
+            if values.len() != count {
+                return Err(ModelError::PairCount { what, found: values.len(), expected: count });
+            }
+        }
+        let each_n_0 = 1.0 / count.max(1) as f64;
+        let mut inverse_radius = vec![0.0; count];
+        if self.contact_law.lateral_damping {
+            for (pair, &radius_m) in pairs.radius_m.iter().enumerate() {
+                if radius_m.is_nan() || radius_m <= 0.0 {
+                    return Err(ModelError::Radius { pair, radius_m });
+                }
+                inverse_radius[pair] = each_n_0 / radius_m;
+            }
+        }
+        let slope = vec![each_n_0 * self.contact_law.slope_s_per_m; count];
+        let (n, t, b) = (pairs.normal.as_ref(), pairs.sliding.as_ref(), pairs.lateral.as_ref());
+        let stiffness = [
+            ("contact stiffness", congruence(n, &pairs.stiffness_n_per_m, n), Law::ContactStiffness),
+            ("friction stiffness", congruence(t, &pairs.stiffness_n_per_m, n), Law::FrictionStiffness),
+        ];
+        let damping = [
+            ("contact damping", congruence(n, &pairs.damping_n_s_per_m, n), Law::ContactDamping),
+            ("friction damping", congruence(t, &pairs.damping_n_s_per_m, n), Law::FrictionDamping),
+            ("friction slope", congruence(t, &slope, t), Law::FrictionSlope),
+            ("lateral friction", congruence(b, &inverse_radius, b), Law::LateralFriction),
+        ];
+        for (what, matrix, law) in stiffness {
+            let known = self.known(Term { matrix, law }, || what.to_owned())?;
+            self.stiffness.push(known);
+        }
+        for (what, matrix, law) in damping {
+            let known = self.known(Term { matrix, law }, || what.to_owned())?;
+            self.damping.push(known);
+        }
+        self.has_contact = true;
+        self.drop_zero_terms();
+        Ok(self)
+    }
+
+    fn known(&self, term: Term, what: impl Fn() -> String) -> Result<KnownTerm, ModelError> {
+        let (rows, columns) = term.matrix.shape();
+        if rows != self.dimension || columns != self.dimension {
+            return Err(ModelError::Shape { what: what(), rows, columns, expected: self.dimension });
+        }
+        let mut symmetric = true;
+        for column in 0..columns {
+            for row in 0..rows {
+                let value = term.matrix[(row, column)];
+                if !value.is_finite() {
+                    return Err(ModelError::NotFinite { what: what(), row, column, value });
+                }
+                symmetric &= value == term.matrix[(column, row)];
+            }
+        }
+        Ok(KnownTerm { term, symmetric })
+    }
+
+    /// A matrix of zeros is no term: it would only cost time.
+    fn drop_zero_terms(&mut self) {
+        let is_zero = |known: &KnownTerm| known.term.matrix.norm_max() == 0.0;
+        self.stiffness.retain(|known| !is_zero(known));
+        self.damping.retain(|known| !is_zero(known));
+    }
+
+    /// Number of coordinates, `n`.
+    pub fn dimension(&self) -> usize {
+        self.dimension
+    }
+
+    /// How many of the first coordinates belong to the pad; `None` where pad and disc are not told apart.
+    pub fn pad_modes(&self) -> Option<usize> {
+        self.pad_modes
+    }
+
+    /// Whether the model has contact pairs of its own, which open without load.
+    pub fn has_contact(&self) -> bool {
+        self.has_contact
+    }
+
+    /// The state of the contact, as far as this model knows contact: one without contact pairs never opens.
+    pub fn contact_state(&self, p: &OperatingPoint) -> ContactState {
+        match p.contact_state() {
+            ContactState::Open if !self.has_contact => OperatingPoint { normal_load_n: 1.0, ..*p }.contact_state(),
+            state => state,
+        }
+    }
+
+    /// Value of `law` at `p`.
+    fn coefficient(&self, law: &Law, p: &OperatingPoint) -> f64 {
+        let state = self.contact_state(p);
+        let closed = state != ContactState::Open;
+        let sliding = state == ContactState::Sliding;
+        let when = |holds: bool, value: f64| if holds { value } else { 0.0 };
+        let (load, mu) = (p.normal_load_n, p.friction_coefficient);
+        let stiffening = || match self.contact_law.exponent {
+            0.0 => 1.0,
+            exponent => (load / self.contact_law.reference_n).powf(exponent),
+        };
+        match law {
+            Law::Constant => 1.0,
+            Law::ContactStiffness => when(closed, stiffening()),
+            Law::FrictionStiffness => when(sliding, p.disc_speed_rad_s.signum() * mu * stiffening()),
+            Law::ContactDamping => when(closed, 1.0),
+            Law::FrictionDamping => when(sliding, p.disc_speed_rad_s.signum() * mu),
+            Law::FrictionSlope => when(sliding, load),
+            Law::LateralFriction => when(sliding, mu * load / p.disc_speed_rad_s.abs()),
+            Law::Custom(custom) => (custom.evaluate)(&if sliding { *p } else { p.with_friction(0.0) }),
+        }
+    }
+
+    /// Writes `K(p)` and `C(p)`, both `n×n`, and says what is known of them.
+    ///
+    /// # Errors
+    /// [`ModelError::PointNotFinite`], [`ModelError::LawNotFinite`].
+    pub fn assemble(
+        &self,
+        p: &OperatingPoint,
+        stiffness: &mut Mat<f64>,
+        damping: &mut Mat<f64>,
+    ) -> Result<Structure, ModelError> {
+        if !p.is_finite() {
+            return Err(ModelError::PointNotFinite {
+                normal_load_n: p.normal_load_n,
+                disc_speed_rad_s: p.disc_speed_rad_s,
+                friction_coefficient: p.friction_coefficient,
+            });
+        }
+        let coefficient = |law: &Law| self.coefficient(law, p);
+        let (_, symmetric_stiffness) = sum(&self.stiffness, coefficient, p, stiffness)?;
+        let (damped, _) = sum(&self.damping, coefficient, p, damping)?;
+        Ok(Structure { damped, symmetric_stiffness })
+    }
+
+    /// Writes `dK/dμ` and `dC/dμ` at `p`, both `n×n`, by central differences of the laws: exact up to rounding for
+    /// laws linear in `μ`, which all but custom ones are.
+    ///
+    /// # Errors
+    /// [`ModelError::LawNotFinite`].
+    pub fn assemble_friction_derivative(
+        &self,
+        p: &OperatingPoint,
+        stiffness: &mut Mat<f64>,
+        damping: &mut Mat<f64>,
+    ) -> Result<(), ModelError> {
+        let mu = p.friction_coefficient;
+        let step = 1e-6 * mu.abs().max(1.0);
+        let (above, below) = (p.with_friction(mu + step), p.with_friction(mu - step));
+        let derivative = |law: &Law| {
+            let (up, down) = (self.coefficient(law, &above), self.coefficient(law, &below));
+            // A law need not exist for negative friction coefficients.
+            if down.is_finite() { (up - down) / (2.0 * step) } else { (up - self.coefficient(law, p)) / step }
+        };
+        sum(&self.stiffness, derivative, p, stiffness)?;
+        sum(&self.damping, derivative, p, damping)?;
+        Ok(())
+    }
+    /// Whether any term's coefficient changes with load or with speed beyond opening, stopping and reversing.
+    pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
+        let (mut load, mut speed) = (false, false);
+        for known in self.stiffness.iter().chain(&self.damping) {
+            match &known.term.law {
+                Law::Constant | Law::ContactDamping | Law::FrictionDamping => {}
+                Law::ContactStiffness | Law::FrictionStiffness => load |= self.contact_law.exponent != 0.0,
+                Law::FrictionSlope => load = true,
+                Law::LateralFriction => (load, speed) = (true, true),
+                Law::Custom(custom) => {
+                    load |= custom.depends_on_load;
+                    speed |= custom.depends_on_speed;
+                }
+            }
+        }
+        (load, speed)
+    }
+}
+
+/// Traces of a model's matrices at any operating point, in the time it takes to evaluate its laws.
+#[derive(Clone, Debug)]
+pub struct Traces {
+    stiffness: Vec<f64>,
+    damping: Vec<f64>,
+    /// `tr(A B)` for every pair of terms, of the stiffness and of the damping.
+    stiffness_products: Mat<f64>,
+    damping_products: Mat<f64>,
+}
+
+impl Traces {
+    /// Precomputes what is constant.
+    pub fn new(model: &Model) -> Self {
+        let trace = |m: &Mat<f64>| (0..m.nrows()).map(|i| m[(i, i)]).sum();
+        let product = |a: &Mat<f64>, b: &Mat<f64>| -> f64 {
+            (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(j, i)] * b[(i, j)]).sum::<f64>()).sum()
+        };
+        let all = |terms: &[KnownTerm]| terms.iter().map(|k| trace(&k.term.matrix)).collect::<Vec<f64>>();
+        let products = |terms: &[KnownTerm]| {
+            Mat::from_fn(terms.len(), terms.len(), |i, j| product(&terms[i].term.matrix, &terms[j].term.matrix))
+        };
+        Self {
+            stiffness: all(&model.stiffness),
+            damping: all(&model.damping),
+            stiffness_products: products(&model.stiffness),
+            damping_products: products(&model.damping),
+        }
+    }
+
+    /// Sums over the roots at `p`, first and second power: of `λ²` where no damping takes part, `-tr K` and `tr K²`;
+    /// else of `λ`, conjugates and static roots included, `-tr C` and `tr C² - 2 tr K`.
+    pub fn at(&self, model: &Model, p: &OperatingPoint) -> [f64; 2] {
+        let weighted = |terms: &[KnownTerm], traces: &[f64]| -> f64 {
+            terms.iter().zip(traces).map(|(known, trace)| model.coefficient(&known.term.law, p) * trace).sum()
+        };
+        let squared = |terms: &[KnownTerm], products: &Mat<f64>| -> f64 {
+            let weight = |k: usize| model.coefficient(&terms[k].term.law, p);
+            let row = |i: usize| (0..terms.len()).map(|j| weight(j) * products[(i, j)]).sum::<f64>();
+            (0..terms.len()).map(|i| weight(i) * row(i)).sum()
+        };
+        let trace_k = weighted(&model.stiffness, &self.stiffness);
+        if model.damping.iter().all(|known| model.coefficient(&known.term.law, p) == 0.0) {
+            return [-trace_k, squared(&model.stiffness, &self.stiffness_products)];
+        }
+        let trace_c = weighted(&model.damping, &self.damping);
+        [-trace_c, squared(&model.damping, &self.damping_products) - 2.0 * trace_k]
+    }
+}
+
+/// `Σ coefficient(law) · matrix` into `out`; whether any term took part, and whether all that did are symmetric.
+fn sum(
+    terms: &[KnownTerm],
+    coefficient: impl Fn(&Law) -> f64,
+    p: &OperatingPoint,
+    out: &mut Mat<f64>,
+) -> Result<(bool, bool), ModelError> {
+    out.fill(0.0);
+    let (mut any, mut symmetric) = (false, true);
+    for known in terms {
+        let factor = coefficient(&known.term.law);
+        if !factor.is_finite() {
+            return Err(ModelError::LawNotFinite {
+                what: match &known.term.law {
+                    Law::Custom(custom) => format!("scale `{}`", custom.text),
+                    law => format!("{law:?}"),
+                },
+                value: factor,
+                normal_load_n: p.normal_load_n,
+                disc_speed_rad_s: p.disc_speed_rad_s,
+                friction_coefficient: p.friction_coefficient,
+            });
+        }
+        if factor != 0.0 {
+            faer::zip!(out.as_mut(), known.term.matrix.as_ref()).for_each(|faer::unzip!(o, m)| *o += factor * *m);
+            any = true;
+            symmetric &= known.symmetric;
+        }
+    }
+    Ok((any, symmetric))
+}
+
+/// `Aᵀ diag(d) B`.
+fn congruence(a: MatRef<'_, f64>, d: &[f64], b: MatRef<'_, f64>) -> Mat<f64> {
+    let scaled = Mat::from_fn(b.nrows(), b.ncols(), |row, column| d[row] * b[(row, column)]);
+    let product = a.transpose() * &scaled;
+    if std::ptr::eq(a.as_ptr(), b.as_ptr()) {
+        // Symmetric by construction, not only up to rounding: the solver looks for it.
+        return Mat::from_fn(product.nrows(), product.ncols(), |i, j| product[(i.min(j), i.max(j))]);
+    }
+    product
+}

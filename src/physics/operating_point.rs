@@ -1,0 +1,62 @@
+//! The conditions a rig works under, and what they mean for its contact.
+
+/// Below this disc speed the contact does not slide and friction does no work on it, rad/s.
+pub const SLIDING_SPEED_RAD_S: f64 = 0.01;
+
+/// One operating point `p` = (normal load, disc speed, friction coefficient).
+///
+/// A negative speed turns the disc the other way, which reverses the sliding direction `t`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OperatingPoint {
+    /// Total normal load, N; the static force of each contact pair is this over the number of pairs.
+    pub normal_load_n: f64,
+    /// Disc speed about the axis of the contact patch, right-handed, rad/s.
+    pub disc_speed_rad_s: f64,
+    /// Coulomb friction coefficient, dimensionless.
+    pub friction_coefficient: f64,
+}
+
+/// What an operating point makes of the contact between pad and disc.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ContactState {
+    /// Closed and sliding: springs and friction act.
+    Sliding,
+    /// Closed, slower than [`SLIDING_SPEED_RAD_S`]: springs act, the friction coefficient is taken as 0.
+    NotSliding,
+    /// No normal load: neither springs nor friction act.
+    Open,
+}
+
+impl OperatingPoint {
+    /// The state of the contact at this point.
+    pub fn contact_state(&self) -> ContactState {
+        if self.normal_load_n <= 0.0 {
+            ContactState::Open
+        } else if self.disc_speed_rad_s.abs() < SLIDING_SPEED_RAD_S {
+            ContactState::NotSliding
+        } else {
+            ContactState::Sliding
+        }
+    }
+
+    /// The same load and speed with another friction coefficient.
+    pub fn with_friction(self, friction_coefficient: f64) -> Self {
+        Self { friction_coefficient, ..self }
+    }
+
+    /// Whether all three values are finite.
+    pub fn is_finite(&self) -> bool {
+        self.normal_load_n.is_finite() && self.disc_speed_rad_s.is_finite() && self.friction_coefficient.is_finite()
+    }
+}
+
+impl ContactState {
+    /// What to tell a reader about a contact that is not sliding; `None` where there is nothing to say.
+    pub fn note(self) -> Option<&'static str> {
+        match self {
+            Self::Sliding => None,
+            Self::NotSliding => Some("not sliding: friction coefficient taken as 0"),
+            Self::Open => Some("contact open: no normal load"),
+        }
+    }
+}

@@ -1,0 +1,258 @@
+//! The spectrum followed in the friction coefficient at one load and speed: nodes dense enough that every root keeps
+//! its identity and no window of instability wider than the stated resolution hides between two of them.
+
+use faer::c64;
+
+use super::critical::{self, Window};
+use super::model::Model;
+use super::operating_point::OperatingPoint;
+use super::spectrum::{SolveError, Solver, Spectrum, Vectors};
+use super::tracking::{Continuation, continue_roots, tracked};
+
+/// Intervals the range of friction coefficients is cut into before refinement.
+const FIRST_INTERVALS: usize = 32;
+/// Times the range may be halved: the resolution is `range / 2^20`.
+const HALVINGS: i32 = 20;
+/// More nodes than this are not made; the map then says that it is not complete.
+const MAX_NODES: usize = 20_000;
+
+/// What to map.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MapOptions {
+    /// Lowest friction coefficient, at most 0: identities start at 0.
+    pub mu_min: f64,
+    /// Highest friction coefficient, at least 0.
+    pub mu_max: f64,
+    /// Modes above are followed but not judged, Hz.
+    pub band_max_hz: Option<f64>,
+    /// A root is unstable when `σ` exceeds this times `|λ|`.
+    pub instability_threshold: f64,
+    /// Whether to look for windows; without it only identities are followed, which takes fewer solves.
+    pub windows: bool,
+}
+
+/// Why there is no map.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum MapError {
+    #[error("at friction coefficient {mu}: {source}")]
+    Solve { mu: f64, source: SolveError },
+    #[error("friction coefficients {mu_min}..{mu_max}: expected a finite range that contains 0")]
+    Range { mu_min: f64, mu_max: f64 },
+}
+
+/// One solved point of the map.
+#[derive(Clone, Debug)]
+pub struct Node {
+    /// Its spectrum, with friction sensitivities.
+    pub spectrum: Spectrum,
+    /// Identity of each root; `None` for the static roots of a damped model, which are not followed.
+    pub ids: Vec<Option<u32>>,
+}
+
+impl Node {
+    /// The friction coefficient it was solved at.
+    pub fn mu(&self) -> f64 {
+        self.spectrum.point.friction_coefficient
+    }
+
+    /// The root with identity `id`.
+    pub fn find(&self, id: u32) -> Option<usize> {
+        self.ids.iter().position(|&other| other == Some(id))
+    }
+}
+
+/// The stability of a rig over the friction coefficient, at one load and speed.
+#[derive(Clone, Debug)]
+pub struct StabilityMap {
+    /// Load and speed; the friction coefficient is of no meaning.
+    pub point: OperatingPoint,
+    /// Solved points, ascending in friction coefficient.
+    pub nodes: Vec<Node>,
+    /// Windows of instability, ascending in their lower end; empty unless asked for.
+    pub windows: Vec<Window>,
+    /// Windows narrower than this may have been missed.
+    pub resolution: f64,
+    /// False where the refinement was cut short by the number of nodes.
+    pub complete: bool,
+}
+
+impl StabilityMap {
+    /// Maps `model` at the load and speed of `point`.
+    ///
+    /// # Errors
+    /// [`MapError::Range`], [`MapError::Solve`].
+    pub fn build(
+        model: &Model,
+        solver: &mut Solver,
+        point: &OperatingPoint,
+        options: &MapOptions,
+    ) -> Result<Self, MapError> {
+        let MapOptions { mu_min, mu_max, .. } = *options;
+        if !(mu_min.is_finite() && mu_max.is_finite() && mu_min <= 0.0 && mu_max >= 0.0) {
+            return Err(MapError::Range { mu_min, mu_max });
+        }
+        let mut solve = |mu: f64| {
+            let result = solver.solve(model, &point.with_friction(mu), Vectors::Both);
+            result.map_err(|source| MapError::Solve { mu, source })
+        };
+        let resolution = (mu_max - mu_min) * 0.5f64.powi(HALVINGS);
+        let mut ahead: Vec<Spectrum> =
+            first_grid(mu_min, mu_max).into_iter().rev().map(&mut solve).collect::<Result<_, _>>()?;
+        let mut spectra = Vec::with_capacity(ahead.len());
+        let mut links: Vec<Continuation> = vec![];
+        let mut complete = true;
+        spectra.extend(ahead.pop());
+        while let (Some(left), Some(right)) = (spectra.last(), ahead.last()) {
+            let (from, to) = (left.point.friction_coefficient, right.point.friction_coefficient);
+            let link = continue_roots(left, right);
+            let resolved = link.clear && (!options.windows || critical::is_resolved(left, right, &link, options));
+            let full = spectra.len() + ahead.len() >= MAX_NODES;
+            if resolved || to - from <= resolution || full {
+                complete &= resolved || !full;
+                links.push(link);
+                spectra.extend(ahead.pop());
+            } else {
+                ahead.push(solve(0.5 * (from + to))?);
+            }
+        }
+        let nodes = identify_all(spectra, &links);
+        let mut map = Self { point: *point, nodes, windows: vec![], resolution, complete };
+        if options.windows {
+            map.windows = critical::windows(model, solver, &map, options)?;
+        }
+        Ok(map)
+    }
+
+    /// Identities of the roots of `spectrum`, solved at this map's load and speed or close to them.
+    pub fn identify(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
+        let mu = spectrum.point.friction_coefficient;
+        let after = self.nodes.partition_point(|node| node.mu() < mu);
+        let nearest = match (after.checked_sub(1).and_then(|k| self.nodes.get(k)), self.nodes.get(after)) {
+            (Some(left), Some(right)) => Some(if mu - left.mu() <= right.mu() - mu { left } else { right }),
+            (left, right) => left.or(right),
+        };
+        match nearest {
+            Some(node) if node.spectrum.undamped == spectrum.undamped => continued_ids(node, spectrum),
+            _ => (0..spectrum.roots.len() as u32).map(Some).collect(),
+        }
+    }
+
+    /// The smallest friction coefficient at which an instability begins.
+    pub fn critical_friction(&self) -> Option<f64> {
+        self.windows.iter().map(|window| window.mu_from).reduce(f64::min)
+    }
+
+    /// Distance of `mu` from the nearest end of the union of the windows, negative inside; `None` without windows.
+    ///
+    /// An open end (beyond the searched range) is no end.
+    pub fn margin(&self, mu: f64) -> Option<f64> {
+        critical::margin(&self.windows, mu)
+    }
+
+    /// Every number that a prediction can depend on, as bits: two maps with equal words predict the same.
+    pub fn words(&self) -> Vec<u64> {
+        let mut words = vec![];
+        for node in &self.nodes {
+            words.push(node.mu().to_bits());
+            for (root, id) in node.spectrum.roots.iter().zip(&node.ids) {
+                words.extend([root.lambda.re.to_bits(), root.lambda.im.to_bits(), id.map_or(u64::MAX, u64::from)]);
+            }
+        }
+        for window in &self.windows {
+            words.extend([window.mu_from.to_bits(), window.mu_to.map_or(u64::MAX, f64::to_bits)]);
+        }
+        words
+    }
+}
+
+/// The friction coefficients solved first, ascending: an even grid that contains 0.
+fn first_grid(mu_min: f64, mu_max: f64) -> Vec<f64> {
+    let step = (mu_max - mu_min) / FIRST_INTERVALS as f64;
+    let mut grid: Vec<f64> = (0..=FIRST_INTERVALS).map(|k| mu_min + step * k as f64).collect();
+    grid[FIRST_INTERVALS] = mu_max;
+    grid.push(0.0);
+    grid.sort_by(f64::total_cmp);
+    grid.dedup_by(|a, b| (*a - *b).abs() < 1e-9 * step);
+    // Of two nearly equal values the first stays; 0 must be there exactly.
+    grid.iter_mut().filter(|mu| mu.abs() < 1e-9 * step).for_each(|mu| *mu = 0.0);
+    grid.dedup();
+    grid
+}
+
+/// Gives the roots at friction coefficient 0 their numbers and carries them both ways along the links.
+fn identify_all(spectra: Vec<Spectrum>, links: &[Continuation]) -> Vec<Node> {
+    let start = spectra.iter().position(|s| s.point.friction_coefficient == 0.0).unwrap_or(0);
+    let mut nodes: Vec<Node> =
+        spectra.into_iter().map(|spectrum| Node { ids: vec![None; spectrum.roots.len()], spectrum }).collect();
+    let Some(first) = nodes.get_mut(start) else { return nodes };
+    let count = tracked(&first.spectrum);
+    (0..count).for_each(|k| first.ids[k] = Some(k as u32));
+    let mut next_id = count as u32;
+    for k in start + 1..nodes.len() {
+        let (before, after) = nodes.split_at_mut(k);
+        let (from, to) = (&before[k - 1], &mut after[0]);
+        to.ids = carry(from, &to.spectrum, |j| links[k - 1].source[j], &mut next_id);
+    }
+    for k in (0..start).rev() {
+        let (before, after) = nodes.split_at_mut(k + 1);
+        let (to, from) = (&mut before[k], &after[0]);
+        let target = &links[k].source;
+        to.ids = carry(from, &to.spectrum, |j| target.iter().position(|&source| source == Some(j)), &mut next_id);
+    }
+    nodes
+}
+
+/// Identities of `to` from those of `from`; a root that continues none gets the next number.
+fn carry(from: &Node, to: &Spectrum, source: impl Fn(usize) -> Option<usize>, next_id: &mut u32) -> Vec<Option<u32>> {
+    let mut ids: Vec<Option<u32>> = vec![None; to.roots.len()];
+    for (j, id) in ids.iter_mut().enumerate().take(tracked(to)) {
+        *id = source(j).and_then(|i| from.ids[i]);
+        if id.is_none() {
+            *id = Some(*next_id);
+            *next_id += 1;
+        }
+    }
+    settle_pairs(from, to, &mut ids);
+    ids
+}
+
+fn continued_ids(node: &Node, spectrum: &Spectrum) -> Vec<Option<u32>> {
+    let link = continue_roots(&node.spectrum, spectrum);
+    // A root that continues none of the map's: a number no root of the map has.
+    let mut next_id = node.ids.iter().flatten().max().map_or(0, |id| id + 1_000_000);
+    carry(node, spectrum, |j| link.source[j], &mut next_id)
+}
+
+/// Through a merging point the two identities of a pair are its own but cannot be told apart: the lower one is given
+/// to the growing mode while the pair is coupled, and to the lower frequency when it has separated again.
+fn settle_pairs(from: &Node, to: &Spectrum, ids: &mut [Option<u32>]) {
+    for j in 0..tracked(to) {
+        let Some(partner) = mirror(to, j).filter(|&partner| partner > j) else { continue };
+        let was_coupled = ids[j].and_then(|id| from.find(id)).is_some_and(|i| mirror(&from.spectrum, i).is_some());
+        let growing_is_lower = (to.roots[j].lambda.re > 0.0) == (ids[j] < ids[partner]);
+        if !was_coupled && !growing_is_lower {
+            ids.swap(j, partner);
+        }
+    }
+    for i in 0..tracked(&from.spectrum) {
+        let Some(partner) = mirror(&from.spectrum, i).filter(|&partner| partner > i) else { continue };
+        let at = |k: usize| from.ids[k].and_then(|id| ids.iter().position(|&other| other == Some(id)));
+        let (Some(a), Some(b)) = (at(i), at(partner)) else { continue };
+        let separated = mirror(to, a).is_none() && mirror(to, b).is_none();
+        if separated && (to.roots[a].lambda.im < to.roots[b].lambda.im) != (ids[a] < ids[b]) {
+            ids.swap(a, b);
+        }
+    }
+}
+
+/// The root that mirrors root `j` at the imaginary axis (`λ → -λ̄`): the other half of an undamped flutter pair.
+pub(super) fn mirror(spectrum: &Spectrum, j: usize) -> Option<usize> {
+    let root = spectrum.roots[j];
+    if !root.oscillates() || root.lambda.re == 0.0 {
+        return None;
+    }
+    let image = c64::new(-root.lambda.re, root.lambda.im);
+    let near = 1e-9 * root.lambda.norm();
+    (0..spectrum.mode_count)
+        .find(|&k| k != j && (spectrum.roots[k].lambda - image).norm() <= near.min(root.lambda.re.abs()))
+}

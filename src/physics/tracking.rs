@@ -1,0 +1,105 @@
+//! Which root of one spectrum continues as which root of another: by shape first, by predicted value second,
+//! never by order.
+
+use faer::c64;
+
+use super::spectrum::Spectrum;
+
+/// Overlap of shapes from which two roots count as the same mode without a closer look.
+pub const CLEAR_OVERLAP: f64 = 0.8;
+
+/// `|z1 - z2|` relative to `|z1| + |z2|` below which two roots are one multiple root, whose shapes are arbitrary within
+/// their span.
+const MULTIPLE: f64 = 1e-10;
+
+/// How the roots of one spectrum continue in another.
+#[derive(Clone, Debug)]
+pub struct Continuation {
+    /// For each root of the later spectrum, the root of the earlier one it continues.
+    pub source: Vec<Option<usize>>,
+    /// Every tracked root found its counterpart, and all of them with [`CLEAR_OVERLAP`].
+    pub clear: bool,
+}
+
+/// The roots that are followed: all of an undamped spectrum (there are always `n`), the modes of a damped one.
+pub fn tracked(spectrum: &Spectrum) -> usize {
+    if spectrum.undamped { spectrum.roots.len() } else { spectrum.mode_count }
+}
+
+/// Continues the roots of `from` in `to`, two spectra of one model at nearby operating points.
+///
+/// Each candidate pair scores `|xᵢᴴ yⱼ|² - |ẑᵢ - zⱼ| / (|ẑᵢ| + |zⱼ|)`, with `ẑ` the square of the root extrapolated by its
+/// friction sensitivity where that is known; the best scores are taken first, each root once.
+pub fn continue_roots(from: &Spectrum, to: &Spectrum) -> Continuation {
+    let (count_from, count_to) = (tracked(from), tracked(to));
+    let overlap = from.shapes.get(.., ..count_from).adjoint() * to.shapes.get(.., ..count_to);
+    let predicted = extrapolated(from, to.point.friction_coefficient);
+
+    let mut scores: Vec<(f64, usize, usize)> = Vec::with_capacity(count_from * count_to);
+    for j in 0..count_to {
+        let z = to.roots[j].square;
+        for (i, &candidate) in predicted.iter().enumerate() {
+            // A sensitivity grows without bound near a merging point: there the plain value predicts better.
+            let off = relative_distance(candidate, z).min(relative_distance(from.roots[i].square, z));
+            scores.push((overlap[(i, j)].norm_sqr() - off, i, j));
+        }
+    }
+    scores.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+
+    let mut source = vec![None; to.roots.len()];
+    let mut taken = vec![false; count_from];
+    let mut clear = count_from == count_to;
+    let mut left = count_from.min(count_to);
+    for (_, i, j) in scores {
+        if left == 0 {
+            break;
+        }
+        if taken[i] || source[j].is_some() {
+            continue;
+        }
+        source[j] = Some(i);
+        taken[i] = true;
+        left -= 1;
+        clear &= overlap[(i, j)].norm_sqr() > CLEAR_OVERLAP || span_overlap(from, i, to, j) > CLEAR_OVERLAP;
+    }
+    Continuation { source, clear }
+}
+
+/// The squares of the tracked roots of `spectrum`, extrapolated to friction coefficient `mu`.
+fn extrapolated(spectrum: &Spectrum, mu: f64) -> Vec<c64> {
+    let step = mu - spectrum.point.friction_coefficient;
+    (0..tracked(spectrum))
+        .map(|i| {
+            let sensitivity = spectrum.friction_sensitivity.get(i).copied().unwrap_or(c64::ZERO);
+            spectrum.roots[i].square + sensitivity * step
+        })
+        .collect()
+}
+
+fn relative_distance(a: c64, b: c64) -> f64 {
+    let scale = a.norm() + b.norm();
+    let distance = (a - b).norm() / scale;
+    if scale > 0.0 && distance.is_finite() { distance } else { 0.0 }
+}
+
+/// Overlap of shape `i` of `from` with the span of all shapes of `to` that share root `j`, by Gram-Schmidt.
+fn span_overlap(from: &Spectrum, i: usize, to: &Spectrum, j: usize) -> f64 {
+    let n = to.shapes.nrows();
+    let z = to.roots[j].square;
+    let mut basis: Vec<Vec<c64>> = vec![];
+    for k in (0..tracked(to)).filter(|&k| relative_distance(to.roots[k].square, z) <= MULTIPLE) {
+        let mut vector: Vec<c64> = (0..n).map(|row| to.shapes[(row, k)]).collect();
+        for _ in 0..2 {
+            for unit in &basis {
+                let along: c64 = unit.iter().zip(&vector).map(|(u, v)| u.conj() * v).sum();
+                vector.iter_mut().zip(unit).for_each(|(v, u)| *v -= along * u);
+            }
+        }
+        let norm = vector.iter().map(|v| v.norm_sqr()).sum::<f64>().sqrt();
+        if norm > 1e-8 {
+            vector.iter_mut().for_each(|v| *v /= norm);
+            basis.push(vector);
+        }
+    }
+    basis.iter().map(|unit| (0..n).map(|row| unit[row].conj() * from.shapes[(row, i)]).sum::<c64>().norm_sqr()).sum()
+}

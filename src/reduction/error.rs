@@ -1,0 +1,34 @@
+//! Why a model could not be reduced.
+
+/// What went wrong, where, with which value against which limit. Rows, columns and modes are counted from 0.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ReductionError {
+    #[error("{what} is {rows}x{columns}, expected {expected}x{expected}")]
+    Shape { what: String, rows: usize, columns: usize, expected: usize },
+    #[error("{what}: entry ({row}, {column}) is {value}, expected a finite number")]
+    NotFinite { what: String, row: usize, column: usize, value: f64 },
+    #[error(
+        "{what} is not symmetric: entry ({row}, {column}) is {value}, entry ({column}, {row}) is {mirrored}; \
+         they may differ by {limit:.3e}"
+    )]
+    Unsymmetric { what: String, row: usize, column: usize, value: f64, mirrored: f64, limit: f64 },
+    #[error("{what} is not positive definite: its pivot at row {row} is {value:.6e}, expected more than {limit:.3e}")]
+    Indefinite { what: String, row: usize, value: f64, limit: f64 },
+    #[error(
+        "{what} is not positive semidefinite: mode {mode} has omega^2 = {value:.6e} rad^2/s^2, \
+         expected at least {limit:.3e}"
+    )]
+    NegativeStiffness { what: String, mode: usize, value: f64, limit: f64 },
+    #[error("{what}: {value} asked for, expected {limit}")]
+    ModeCount { what: String, value: String, limit: String },
+    #[error("{what}: no shift up to {value:.3e} rad^2/s^2 makes K + shift M positive definite")]
+    NoShift { what: String, value: f64 },
+    #[error("{what}: mode {mode} has residual {value:.3e} after {vectors} vectors, limit {limit:.1e}")]
+    NotConverged { what: String, mode: usize, value: f64, limit: f64, vectors: usize },
+    #[error(
+        "{what}: {found} modes found below {below:.6e} rad^2/s^2, but the inertia of K - shift M counts {counted} there"
+    )]
+    MissedModes { what: String, found: usize, counted: usize, below: f64 },
+    #[error("{what}: {reason}")]
+    Factorisation { what: String, reason: String },
+}

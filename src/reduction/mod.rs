@@ -1,0 +1,35 @@
+//! From full models to reduced ones: modes of substructures and of systems, and projections on them.
+//!
+//! Dense, for substructures written out in a rig file: the symmetric problem
+//!
+//! ```text
+//! K φ = ω² M φ,   M = L Lᵀ,   (L⁻¹ K L⁻ᵀ) y = ω² y,   φ = L⁻ᵀ y,   Φᵀ M Φ = I
+//! ```
+//!
+//! by [`free_interface_modes`]; [`whiten`] makes `M = I` of a whole system without leaving anything out. Sparse, for
+//! systems of finite-element matrices: [`lowest_modes`] by shift-invert block Lanczos, the count of modes proven by the
+//! inertia of `K - σ M`; [`project_sparse`] takes each term to the basis.
+//!
+//! Pure: no clock, file, bus, log or serialisation.
+
+mod dense;
+mod error;
+mod lanczos;
+mod project;
+mod sparse;
+
+pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
+pub use error::ReductionError;
+pub use lanczos::{SparseModes, lowest_modes};
+pub use project::{project_dense, project_sparse};
+pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
+
+/// Two mirrored entries of a symmetric matrix may differ by this times the largest entry: what printing with 13 digits
+/// leaves. Such matrices are taken as the mean of both triangles.
+pub const SYMMETRY_TOLERANCE: f64 = 1e-12;
+
+/// A pivot of the mass matrix must exceed this times its own diagonal entry.
+pub const DEFINITE_TOLERANCE: f64 = 1e-13;
+
+/// `ω²` may fall below zero by this times the largest `ω²`: rounding of a rigid-body motion, taken as 0.
+pub const SEMIDEFINITE_TOLERANCE: f64 = 1e-10;

@@ -1,0 +1,203 @@
+//! Kind 1: substructures written out in the rig file, contact pairs as rows over their degrees of freedom.
+
+use faer::Mat;
+
+use super::raw::{RawContact, RawSubstructure};
+use super::settings::{finite, spread, within};
+use super::{Built, RigError, SideShapes};
+use crate::physics::{ContactLaw, ContactPairs, Law, Model, Term};
+use crate::reduction::{Modes, free_interface_modes};
+
+/// Modes of one side with their damping ratios.
+pub(super) struct Side {
+    pub modes: Modes,
+    pub damping_ratio: Vec<f64>,
+}
+
+/// Builds the model of a rig of kind 1: `n = i + j` coordinates, the pad's modes first.
+///
+/// # Errors
+/// [`RigError`].
+pub(super) fn build(
+    file: &str,
+    pad: &RawSubstructure,
+    disc: Option<&RawSubstructure>,
+    contacts: &[RawContact],
+    contact_law: ContactLaw,
+) -> Result<Built, RigError> {
+    let pad = substructure(file, "pad", pad)?;
+    let disc = disc.map(|disc| substructure(file, "disc", disc)).transpose()?;
+    let pairs = contact_pairs(file, contacts, &pad.modes, disc.as_ref().map(|disc| &disc.modes))?;
+    assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), &pairs, contact_law)
+}
+
+/// `K = diag(ω²)`, `C = diag(2 ζ ω)` of both sides and the contact between them.
+pub(super) fn assemble(
+    file: &str,
+    kind: &str,
+    pad: &Side,
+    disc: Option<&Side>,
+    pairs: &ContactPairs,
+    contact_law: ContactLaw,
+) -> Result<Built, RigError> {
+    let sides: Vec<&Side> = std::iter::once(pad).chain(disc).collect();
+    let omega: Vec<f64> = sides.iter().flat_map(|side| side.modes.omega_rad_s.iter().copied()).collect();
+    let zeta: Vec<f64> = sides.iter().flat_map(|side| side.damping_ratio.iter().copied()).collect();
+    let n = omega.len();
+    let diagonal = |value: &dyn Fn(usize) -> f64| Term {
+        matrix: Mat::from_fn(n, n, |i, j| if i == j { value(i) } else { 0.0 }),
+        law: Law::Constant,
+    };
+    let stiffness = diagonal(&|k| omega[k] * omega[k]);
+    let damping = diagonal(&|k| 2.0 * zeta[k] * omega[k]);
+    let pad_modes = pad.modes.omega_rad_s.len();
+    let model = Model::new(n, vec![stiffness], vec![damping], contact_law, Some(pad_modes))
+        .and_then(|model| model.with_contact(pairs))
+        .map_err(|source| RigError::Model { file: file.to_owned(), source })?;
+
+    let mut contents = vec![
+        format!("kind       {kind}"),
+        format!(
+            "modes      {pad_modes} of the pad, {}",
+            match disc {
+                Some(disc) => format!("{} of the disc", disc.modes.omega_rad_s.len()),
+                None => "the disc rigid".to_owned(),
+            }
+        ),
+        format!(
+            "contact    {} pairs, in all {:.6e} N/m, {:.6e} N s/m",
+            pairs.stiffness_n_per_m.len(),
+            pairs.stiffness_n_per_m.iter().sum::<f64>(),
+            pairs.damping_n_s_per_m.iter().sum::<f64>()
+        ),
+        match contact_law.exponent {
+            0.0 => "stiffness  of the contact whatever the load".to_owned(),
+            exponent => format!("stiffness  of the contact times (load / {} N)^{exponent}", contact_law.reference_n),
+        },
+    ];
+    let damped = zeta.iter().filter(|zeta| **zeta != 0.0).count();
+    contents.push(format!(
+        "damping    {damped} of {n} modes; friction slope {} s/m, lateral friction {}",
+        contact_law.slope_s_per_m,
+        if contact_law.lateral_damping { "on" } else { "off" }
+    ));
+    let mut first_coordinate = 0;
+    let mut shapes = vec![];
+    for (name, side) in ["pad", "disc"].into_iter().zip(sides) {
+        shapes.push(SideShapes { name, first_coordinate, phi: side.modes.phi.clone(), nodes_m: vec![] });
+        first_coordinate += side.modes.omega_rad_s.len();
+    }
+    Ok(Built { model, contents, shapes })
+}
+
+/// Modes of one inline side.
+fn substructure(file: &str, side: &str, raw: &RawSubstructure) -> Result<Side, RigError> {
+    let matrix = |key: &str, rows: &Option<Vec<Vec<f64>>>| match rows {
+        Some(rows) => dense(file, &format!("{side}.{key}"), rows),
+        None => Err(RigError::MissingKey {
+            file: file.to_owned(),
+            field: format!("{side}.{key}"),
+            limit: "a list of rows".to_owned(),
+        }),
+    };
+    let (mass, stiffness) = (matrix("mass", &raw.mass)?, matrix("stiffness", &raw.stiffness)?);
+    let modes = free_interface_modes(side, mass.as_ref(), stiffness.as_ref(), &raw.selection())
+        .map_err(|source| RigError::Reduction { file: file.to_owned(), source })?;
+    let count = modes.omega_rad_s.len();
+    let damping_ratio = match &raw.damping_ratio {
+        Some(values) => spread(file, &format!("{side}.damping_ratio"), values, count, "modes")?,
+        None => vec![0.0; count],
+    };
+    Ok(Side { modes, damping_ratio })
+}
+
+/// A square matrix from its rows.
+fn dense(file: &str, field: &str, rows: &[Vec<f64>]) -> Result<Mat<f64>, RigError> {
+    let n = rows.len();
+    let shape = |field: String, value: String, limit: String| {
+        Err(RigError::Shape { file: file.to_owned(), field, value, limit })
+    };
+    if n == 0 {
+        return shape(field.to_owned(), "0 rows".to_owned(), "at least one".to_owned());
+    }
+    for (index, row) in rows.iter().enumerate() {
+        if row.len() != n {
+            return shape(
+                format!("{field}[{index}]"),
+                format!("{} values", row.len()),
+                format!("{n}, as many as rows"),
+            );
+        }
+        for (column, &value) in row.iter().enumerate() {
+            finite(file, &format!("{field}[{index}][{column}]"), value)?;
+        }
+    }
+    Ok(Mat::from_fn(n, n, |i, j| rows[i][j]))
+}
+
+/// Rows of relative displacement, `[pad_row Φ_p, -disc_row Φ_d]`, of every `[[contact]]`.
+fn contact_pairs(
+    file: &str,
+    contacts: &[RawContact],
+    pad: &Modes,
+    disc: Option<&Modes>,
+) -> Result<ContactPairs, RigError> {
+    let n = pad.phi.ncols() + disc.map_or(0, |disc| disc.phi.ncols());
+    let mut rows = [vec![], vec![], vec![]];
+    let (mut stiffness_n_per_m, mut damping_n_s_per_m, mut radius_m) = (vec![], vec![], vec![]);
+    for (index, contact) in contacts.iter().enumerate() {
+        let field = |key: &str| format!("contact[{index}].{key}");
+        let along = [
+            ("normal", Some(&contact.pad_normal), contact.disc_normal.as_ref(), true),
+            ("sliding", Some(&contact.pad_sliding), contact.disc_sliding.as_ref(), true),
+            ("lateral", contact.pad_lateral.as_ref(), contact.disc_lateral.as_ref(), false),
+        ];
+        for (rows, (along, pad_row, disc_row, required)) in rows.iter_mut().zip(along) {
+            let mut row = modal_row(file, &field(&format!("pad_{along}")), pad_row, Some(pad), required, 1.0)?;
+            row.extend(modal_row(file, &field(&format!("disc_{along}")), disc_row, disc, required, -1.0)?);
+            rows.push(row);
+        }
+        let checked = |key: &str, value: f64| within(file, &field(key), value, value >= 0.0, "at least 0");
+        stiffness_n_per_m.push(checked("stiffness_n_per_m", contact.stiffness_n_per_m)?);
+        damping_n_s_per_m.push(checked("damping_n_s_per_m", contact.damping_n_s_per_m)?);
+        radius_m.push(checked("radius_m", contact.radius_m)?);
+    }
+    let [normal, sliding, lateral] = rows.map(|rows| Mat::from_fn(rows.len(), n, |row, column| rows[row][column]));
+    Ok(ContactPairs { normal, sliding, lateral, stiffness_n_per_m, damping_n_s_per_m, radius_m })
+}
+
+/// `sign · row Φ` of one side; nothing for a rigid side.
+fn modal_row(
+    file: &str,
+    field: &str,
+    row: Option<&Vec<f64>>,
+    side: Option<&Modes>,
+    required: bool,
+    sign: f64,
+) -> Result<Vec<f64>, RigError> {
+    let (file, field) = (file.to_owned(), field.to_owned());
+    let (row, side) = match (row, side) {
+        (None, None) => return Ok(vec![]),
+        (None, Some(side)) if !required => return Ok(vec![0.0; side.phi.ncols()]),
+        (None, Some(side)) => {
+            let limit = format!("a row over {} degrees of freedom", side.phi.nrows());
+            return Err(RigError::MissingKey { file, field, limit });
+        }
+        (Some(_), None) => {
+            let (value, limit) = ("is given for a rigid disc".to_owned(), "[disc], or no row for it".to_owned());
+            return Err(RigError::Kind { file, field, value, limit });
+        }
+        (Some(row), Some(side)) => (row, side),
+    };
+    let n = side.phi.nrows();
+    if row.len() != n {
+        let (value, limit) = (format!("{} values", row.len()), format!("one for each of {n} degrees of freedom"));
+        return Err(RigError::Shape { file, field, value, limit });
+    }
+    for (index, &value) in row.iter().enumerate() {
+        finite(&file, &format!("{field}[{index}]"), value)?;
+    }
+    let modal =
+        |mode: usize| sign * row.iter().enumerate().map(|(dof, value)| value * side.phi[(dof, mode)]).sum::<f64>();
+    Ok((0..side.phi.ncols()).map(modal).collect())
+}

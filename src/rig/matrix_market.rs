@@ -1,0 +1,317 @@
+//! Matrix Market files: coordinate and array; real and integer; general, symmetric and skew-symmetric.
+//!
+//! Source: Boisvert, Pozo, Remington, "The Matrix Market exchange formats", NISTIR 5935 (1996).
+
+use faer::sparse::Triplet;
+
+use super::RigError;
+use crate::reduction::SparseMatrix;
+
+/// A matrix as its file lists it, mirrored where the header says so.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Listed {
+    pub rows: usize,
+    pub columns: usize,
+    /// `(row, column, value)` counted from 0; entries listed twice add up.
+    pub entries: Vec<(usize, usize, f64)>,
+}
+
+impl Listed {
+    /// The matrix in compressed columns.
+    ///
+    /// # Errors
+    /// [`RigError::Shape`] where memory does not suffice.
+    pub fn to_sparse(&self, file: &str) -> Result<SparseMatrix, RigError> {
+        let triplets: Vec<_> =
+            self.entries.iter().map(|&(row, column, value)| Triplet::new(row, column, value)).collect();
+        SparseMatrix::try_new_from_triplets(self.rows, self.columns, &triplets).map_err(|error| RigError::Shape {
+            file: file.to_owned(),
+            field: "matrix".to_owned(),
+            value: format!("{}x{} ({error:?})", self.rows, self.columns),
+            limit: "one that fits into memory".to_owned(),
+        })
+    }
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Symmetry {
+    General,
+    Symmetric,
+    Skew,
+}
+
+/// Reads a Matrix Market file; `file` is how errors name it. Memory grows with the entries that are there, never with
+/// what the header claims.
+///
+/// # Errors
+/// [`RigError::MatrixMarket`], with the line.
+pub fn read(file: &str, bytes: &[u8]) -> Result<Listed, RigError> {
+    let text = String::from_utf8_lossy(bytes);
+    let refuse = |line: usize, field: &str, value: String, limit: &str| RigError::MatrixMarket {
+        file: file.to_owned(),
+        line,
+        field: field.to_owned(),
+        value,
+        limit: limit.to_owned(),
+    };
+    let mut lines = text.lines().enumerate().map(|(index, line)| (index + 1, line.trim()));
+    let (_, header) = lines.next().unwrap_or((1, ""));
+    let (coordinate, integer, symmetry) =
+        read_header(header).map_err(|(f, value, limit)| refuse(1, f, value, limit))?;
+    let mut lines = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('%'));
+    let last_line = text.lines().count().max(1);
+
+    let size_limit = if coordinate { "rows, columns and entries" } else { "rows and columns" };
+    let (size_line, sizes) =
+        lines.next().ok_or_else(|| refuse(last_line, "size", "is missing".to_owned(), size_limit))?;
+    let numbers: Option<Vec<usize>> = sizes.split_whitespace().map(|word| word.parse().ok()).collect();
+    let bad_size = || refuse(size_line, "size", format!("is `{}`", shortened(sizes)), size_limit);
+    let (rows, columns, listed) = match (numbers.as_deref(), coordinate) {
+        (Some(&[rows, columns, listed]), true) => (rows, columns, listed as u128),
+        (Some(&[rows, columns]), false) => (rows, columns, count_of_array(rows, columns, symmetry)),
+        _ => return Err(bad_size()),
+    };
+    if symmetry != Symmetry::General && rows != columns {
+        return Err(refuse(
+            size_line,
+            "size",
+            format!("is {rows}x{columns}"),
+            "a square matrix, as its header says symmetric",
+        ));
+    }
+
+    let mut entries: Vec<(usize, usize, f64)> = vec![];
+    let (mut seen, mut array_row, mut array_column) = (0_u128, first_row(0, symmetry), 0_usize);
+    for (line, content) in lines {
+        if seen == listed {
+            return Err(refuse(
+                line,
+                "entries",
+                format!("go on with `{}`", shortened(content)),
+                "no more than the size says",
+            ));
+        }
+        seen += 1;
+        let words: Vec<&str> = content.split_whitespace().take(4).collect();
+        let (row, column, word) = match (words.as_slice(), coordinate) {
+            (&[row, column, word], true) => {
+                let index = |word: &str, limit: usize, what: &str| match word.parse::<usize>() {
+                    Ok(index) if (1..=limit).contains(&index) => Ok(index - 1),
+                    _ => Err(refuse(line, what, format!("is `{}`", shortened(word)), &format!("1 to {limit}"))),
+                };
+                (index(row, rows, "row")?, index(column, columns, "column")?, word)
+            }
+            (&[word], false) => {
+                let position = (array_row, array_column);
+                array_row += 1;
+                // Columns of a skew-symmetric array get empty towards the last one.
+                if array_row >= rows {
+                    array_column += 1;
+                    array_row = first_row(array_column, symmetry);
+                }
+                (position.0, position.1, word)
+            }
+            (_, true) => {
+                return Err(refuse(line, "entry", format!("is `{}`", shortened(content)), "row, column and value"));
+            }
+            (_, false) => return Err(refuse(line, "entry", format!("is `{}`", shortened(content)), "one value")),
+        };
+        let value = if integer { word.parse::<i64>().ok().map(|value| value as f64) } else { word.parse::<f64>().ok() };
+        let kind = if integer { "an integer" } else { "a finite number" };
+        let value = match value {
+            Some(value) if value.is_finite() => value,
+            _ => return Err(refuse(line, "value", format!("is `{}`", shortened(word)), kind)),
+        };
+        match symmetry {
+            Symmetry::General => entries.push((row, column, value)),
+            Symmetry::Symmetric if row == column => entries.push((row, column, value)),
+            Symmetry::Symmetric if row > column => entries.extend([(row, column, value), (column, row, value)]),
+            Symmetry::Skew if row > column => entries.extend([(row, column, value), (column, row, -value)]),
+            _ => {
+                let place = format!("is at row {}, column {}", row + 1, column + 1);
+                let limit =
+                    if symmetry == Symmetry::Skew { "one below the diagonal" } else { "one on or below the diagonal" };
+                return Err(refuse(line, "entry", place, limit));
+            }
+        }
+    }
+    if seen != listed {
+        return Err(refuse(last_line, "entries", format!("end after {seen}"), &format!("{listed}, as the size says")));
+    }
+    Ok(Listed { rows, columns, entries })
+}
+
+type HeaderError = (&'static str, String, &'static str);
+
+/// `%%MatrixMarket matrix <format> <field> <symmetry>`: coordinate? integer? symmetry.
+fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
+    let words: Vec<String> = header.split_whitespace().take(6).map(str::to_ascii_lowercase).collect();
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let &[banner, object, format, field, symmetry] = words.as_slice() else {
+        let value = format!("is `{}`", shortened(header));
+        return Err((
+            "header",
+            value,
+            "%%MatrixMarket matrix coordinate|array real|integer general|symmetric|skew-symmetric",
+        ));
+    };
+    let told = |word: &str| format!("is `{}`", shortened(word));
+    if banner != "%%matrixmarket" {
+        return Err(("banner", told(banner), "%%MatrixMarket"));
+    }
+    if object != "matrix" {
+        return Err(("object", told(object), "matrix"));
+    }
+    let coordinate = match format {
+        "coordinate" => true,
+        "array" => false,
+        _ => return Err(("format", told(format), "coordinate or array")),
+    };
+    let integer = match field {
+        "real" | "double" => false,
+        "integer" => true,
+        "complex" => return Err(("field", told(field), "real or integer: complex matrices have no place in a rig")),
+        "pattern" => return Err(("field", told(field), "real or integer: a pattern has no values")),
+        _ => return Err(("field", told(field), "real or integer")),
+    };
+    let symmetry = match symmetry {
+        "general" => Symmetry::General,
+        "symmetric" => Symmetry::Symmetric,
+        "skew-symmetric" => Symmetry::Skew,
+        "hermitian" => {
+            return Err((
+                "symmetry",
+                told(symmetry),
+                "general, symmetric or skew-symmetric: hermitian is for complex matrices",
+            ));
+        }
+        _ => return Err(("symmetry", told(symmetry), "general, symmetric or skew-symmetric")),
+    };
+    Ok((coordinate, integer, symmetry))
+}
+
+/// How many values an array lists.
+fn count_of_array(rows: usize, columns: usize, symmetry: Symmetry) -> u128 {
+    let (rows, columns) = (rows as u128, columns as u128);
+    match symmetry {
+        Symmetry::General => rows.saturating_mul(columns),
+        Symmetry::Symmetric => rows.saturating_mul(rows.saturating_add(1)) / 2,
+        Symmetry::Skew => rows.saturating_mul(rows.saturating_sub(1)) / 2,
+    }
+}
+
+/// The first row an array lists in a column.
+fn first_row(column: usize, symmetry: Symmetry) -> usize {
+    match symmetry {
+        Symmetry::General => 0,
+        Symmetry::Symmetric => column,
+        Symmetry::Skew => column.saturating_add(1),
+    }
+}
+
+/// A word short enough for an error message.
+fn shortened(text: &str) -> String {
+    match text.char_indices().nth(40) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn dense(text: &str) -> Vec<Vec<f64>> {
+        let listed = read("a.mtx", text.as_bytes()).unwrap_or_else(|error| panic!("{error}"));
+        let mut rows = vec![vec![0.0; listed.columns]; listed.rows];
+        for (row, column, value) in listed.entries {
+            rows[row][column] += value;
+        }
+        rows
+    }
+
+    #[test]
+    fn every_form() {
+        let head = "%%MatrixMarket matrix";
+        assert_eq!(
+            dense(&format!("{head} coordinate real general\n% a comment\n\n 2 3 2\n1 3 1.5e1\n\n%more\n2 1 -2\n")),
+            [[0.0, 0.0, 15.0], [-2.0, 0.0, 0.0]]
+        );
+        assert_eq!(
+            dense(&format!("{head} Coordinate Integer Symmetric\r\n2 2 2\r\n1 1 4\r\n2 1 3\r\n")),
+            [[4.0, 3.0], [3.0, 0.0]]
+        );
+        assert_eq!(dense(&format!("{head} coordinate real skew-symmetric\n2 2 1\n2 1 3")), [[0.0, -3.0], [3.0, 0.0]]);
+        assert_eq!(dense(&format!("{head} array real general\n2 2\n1\n2\n3\n4\n")), [[1.0, 3.0], [2.0, 4.0]]);
+        assert_eq!(
+            dense(&format!("{head} array integer symmetric\n3 3\n1\n2\n3\n4\n5\n6\n")),
+            [[1.0, 2.0, 3.0], [2.0, 4.0, 5.0], [3.0, 5.0, 6.0]]
+        );
+        assert_eq!(
+            dense(&format!("{head} array real skew-symmetric\n3 3\n1\n2\n3\n")),
+            [[0.0, -1.0, -2.0], [1.0, 0.0, -3.0], [2.0, 3.0, 0.0]]
+        );
+    }
+
+    #[test]
+    fn errors_name_line_value_and_limit() {
+        let head = "%%MatrixMarket matrix";
+        for (text, told) in [
+            (
+                "".to_owned(),
+                "a.mtx, line 1: header is ``; expected %%MatrixMarket matrix coordinate|array real|integer general|symmetric|skew-symmetric",
+            ),
+            (
+                format!("{head} coordinate pattern general\n1 1 0"),
+                "a.mtx, line 1: field is `pattern`; expected real or integer: a pattern has no values",
+            ),
+            (
+                format!("{head} coordinate complex general\n1 1 0"),
+                "a.mtx, line 1: field is `complex`; expected real or integer: complex matrices have no place in a rig",
+            ),
+            (
+                format!("{head} coordinate real hermitian\n1 1 0"),
+                "a.mtx, line 1: symmetry is `hermitian`; expected general, symmetric or skew-symmetric: hermitian is for complex matrices",
+            ),
+            (
+                format!("{head} coordinate real general\n2 2\n"),
+                "a.mtx, line 2: size is `2 2`; expected rows, columns and entries",
+            ),
+            (format!("{head} coordinate real general\n2 2 1\n3 1 1.0\n"), "a.mtx, line 3: row is `3`; expected 1 to 2"),
+            (
+                format!("{head} coordinate real general\n2 2 1\n1 0 1.0\n"),
+                "a.mtx, line 3: column is `0`; expected 1 to 2",
+            ),
+            (
+                format!("{head} coordinate real general\n2 2 1\n1 1 nan\n"),
+                "a.mtx, line 3: value is `nan`; expected a finite number",
+            ),
+            (
+                format!("{head} coordinate integer general\n2 2 1\n1 1 1.5\n"),
+                "a.mtx, line 3: value is `1.5`; expected an integer",
+            ),
+            (
+                format!("{head} coordinate real symmetric\n2 2 1\n1 2 1\n"),
+                "a.mtx, line 3: entry is at row 1, column 2; expected one on or below the diagonal",
+            ),
+            (
+                format!("{head} coordinate real general\n2 2 2\n1 1 1\n"),
+                "a.mtx, line 3: entries end after 1; expected 2, as the size says",
+            ),
+            (
+                format!("{head} coordinate real general\n2 2 1\n1 1 1\n2 2 1\n"),
+                "a.mtx, line 4: entries go on with `2 2 1`; expected no more than the size says",
+            ),
+            (
+                format!("{head} array real general\n1000000000000 1000000000000\n1\n"),
+                "a.mtx, line 3: entries end after 1; expected 1000000000000000000000000, as the size says",
+            ),
+            (
+                format!("{head} coordinate real symmetric\n2 3 0\n"),
+                "a.mtx, line 2: size is 2x3; expected a square matrix, as its header says symmetric",
+            ),
+        ] {
+            assert_eq!(read("a.mtx", text.as_bytes()).unwrap_err().to_string(), told);
+        }
+    }
+}

@@ -1,0 +1,212 @@
+//! Rig files: raw form, validation, embedded rigs.
+//!
+//! A rig file is TOML (`raw`), says which of three kinds it is by the tables it has, and is built into a [`Rig`]:
+//! `inline` substructures, `modal` substructures of a finite-element program (`npz`, touching in a `patch`), or a
+//! `system` of matrices (`matrix_market`, times a `scale`). What it refers to is read by name through `source`, so
+//! that a recording's attachments serve as well as a directory.
+
+mod embedded;
+mod error;
+mod inline;
+mod interpolation;
+pub mod matrix_market;
+mod modal;
+pub mod npz;
+mod patch;
+mod raw;
+pub mod scale;
+mod settings;
+mod source;
+mod system;
+
+use faer::Mat;
+
+use crate::physics::{Model, OperatingPoint};
+
+pub use embedded::EMBEDDED;
+pub use error::RigError;
+
+use source::Source;
+
+/// Everything the program knows about a rig, ready to predict with.
+#[derive(Clone, Debug)]
+pub struct Rig {
+    /// The rig's own name.
+    pub name: String,
+    /// Its equation of motion, mass-normalised.
+    pub model: Model,
+    /// `[reference]`: the operating point used where none is given.
+    pub reference: OperatingPoint,
+    /// `[band] max_hz`: modes above are neither listed nor judged.
+    pub band_max_hz: Option<f64>,
+    /// `[search] mu_max`: windows of instability are sought in `[0, mu_max]`.
+    pub mu_max: f64,
+    /// `[search] instability_threshold`: a root is unstable when `σ` exceeds this times `|λ|`.
+    pub instability_threshold: f64,
+    /// `[limits]`: what the node accepts as input.
+    pub limits: Limits,
+    /// `[warning]`: when the node warns.
+    pub warning: Warning,
+    /// `[chart]`: conditions for which predictions are prepared.
+    pub chart: ChartRange,
+    /// SHA-256 of the rig file and everything it refers to, hexadecimal.
+    pub content_hash: String,
+    /// The rig file (first) and everything it refers to, by the names it refers to them with.
+    pub files: Vec<RigFile>,
+    /// What the rig is made of, a line each, for [`Rig::describe`].
+    pub contents: Vec<String>,
+    /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
+    pub shapes: Vec<SideShapes>,
+}
+
+/// How a stretch of the model's coordinates moves one side of the rig.
+#[derive(Clone, Debug)]
+pub struct SideShapes {
+    /// `pad` or `disc`.
+    pub name: &'static str,
+    /// The model's coordinate that belongs to the first column of `phi`.
+    pub first_coordinate: usize,
+    /// `Φ`: degrees of freedom by coordinates, kg^-1/2; with `nodes_m` three rows for each node.
+    pub phi: Mat<f64>,
+    /// Positions of the interface nodes, m; empty where degrees of freedom are only numbered.
+    pub nodes_m: Vec<[f64; 3]>,
+}
+
+/// A file of a rig, as it was read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RigFile {
+    /// As the rig file refers to it: a relative path.
+    pub name: String,
+    pub bytes: Vec<u8>,
+}
+
+/// Closed ranges of the inputs a node accepts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    pub normal_load_n: [f64; 2],
+    pub disc_speed_rad_s: [f64; 2],
+    pub friction_coefficient: [f64; 2],
+}
+
+/// Conditions for which predictions are prepared, where the rig depends on them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ChartRange {
+    pub normal_load_n: [f64; 2],
+    pub disc_speed_rad_s: [f64; 2],
+    /// Relative error of `λ²` that is asked for.
+    pub tolerance: f64,
+}
+
+/// When the node warns.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Warning {
+    /// WARN when the margin to the critical friction is below this.
+    pub margin: f64,
+    /// SQUEAL when a mode's damping ratio falls below this (negative: growing).
+    pub damping_ratio: f64,
+    /// SQUEAL ends when every damping ratio is above `damping_ratio` by this much again.
+    pub hysteresis: f64,
+    /// FAULT after this much silence, s.
+    pub silence_s: f64,
+}
+
+impl Rig {
+    /// Loads the embedded rig of that name ([`EMBEDDED`]), else the rig file at that path.
+    ///
+    /// # Errors
+    /// [`RigError`], naming file, field, value and limit.
+    pub fn load(name_or_path: &str) -> Result<Self, RigError> {
+        if let Some(text) = embedded::text(name_or_path) {
+            return Self::from_files(&[RigFile { name: format!("{name_or_path}.toml"), bytes: text.into() }]);
+        }
+        let path = std::path::Path::new(name_or_path);
+        let bytes = std::fs::read(path).map_err(|error| RigError::NoSuchRig {
+            value: name_or_path.to_owned(),
+            reason: error.to_string(),
+            limit: EMBEDDED.map(|(name, _)| name).join(", "),
+        })?;
+        let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let directory = path.parent().unwrap_or(std::path::Path::new(""));
+        Self::build(
+            RigFile { name, bytes },
+            &|name| std::fs::read(directory.join(name)).map_err(|error| error.to_string()),
+            "a readable file, relative to the rig file",
+        )
+    }
+
+    /// The same from files in memory: the rig file first, then everything it refers to by the names it uses.
+    ///
+    /// # Errors
+    /// [`RigError`], naming file, field, value and limit.
+    pub fn from_files(files: &[RigFile]) -> Result<Self, RigError> {
+        let (first, others) = files.split_first().ok_or_else(|| RigError::NoSuchRig {
+            value: "no files at all".to_owned(),
+            reason: "the list of files is empty".to_owned(),
+            limit: EMBEDDED.map(|(name, _)| name).join(", "),
+        })?;
+        let read = |name: &str| match others.iter().find(|file| file.name == name) {
+            Some(file) => Ok(file.bytes.clone()),
+            None => Err("it is not among the files given".to_owned()),
+        };
+        let names: Vec<&str> = others.iter().map(|file| file.name.as_str()).collect();
+        let limit =
+            if names.is_empty() { "a file given along".to_owned() } else { format!("one of {}", names.join(", ")) };
+        Self::build(first.clone(), &read, &limit)
+    }
+
+    fn build(rig_file: RigFile, read: &dyn Fn(&str) -> Result<Vec<u8>, String>, limit: &str) -> Result<Self, RigError> {
+        let raw = raw::parse(&rig_file.name, &rig_file.bytes)?;
+        let mut source = Source::new(rig_file, read, limit);
+        let settings = settings::check(&source.rig_file, &raw)?;
+        let built = match settings::kind(&source.rig_file, &raw)? {
+            settings::Kind::Inline { pad, disc, contacts } => {
+                inline::build(&source.rig_file, pad, disc, contacts, settings.contact_law)?
+            }
+            settings::Kind::Modal { pad, disc, patches } => {
+                modal::build(&mut source, pad, disc, patches, settings.contact_law)?
+            }
+            settings::Kind::System(system) => system::build(&mut source, system, &settings)?,
+        };
+        Ok(Self {
+            name: raw.name,
+            model: built.model,
+            reference: settings.reference,
+            band_max_hz: settings.band_max_hz,
+            mu_max: settings.mu_max,
+            instability_threshold: settings.instability_threshold,
+            limits: settings.limits,
+            warning: settings.warning,
+            chart: settings.chart,
+            content_hash: source.content_hash(),
+            files: source.into_files(),
+            contents: built.contents,
+            shapes: built.shapes,
+        })
+    }
+
+    /// What the rig is and holds, a few lines for people.
+    pub fn describe(&self) -> String {
+        let mut lines = vec![format!("rig        {}", self.name)];
+        lines.extend(self.contents.iter().cloned());
+        lines.push(match self.band_max_hz {
+            Some(max_hz) => format!("band       up to {max_hz} Hz"),
+            None => "band       all modes".to_owned(),
+        });
+        lines.push(format!("search     friction coefficient 0 to {}", self.mu_max));
+        lines.push(format!(
+            "reference  {} N, {} rad/s, friction coefficient {}",
+            self.reference.normal_load_n, self.reference.disc_speed_rad_s, self.reference.friction_coefficient
+        ));
+        let names: Vec<&str> = self.files.iter().map(|file| file.name.as_str()).collect();
+        lines.push(format!("files      {}", names.join(", ")));
+        lines.push(format!("hash       {}", self.content_hash));
+        lines.join("\n")
+    }
+}
+
+/// What each kind of rig builds.
+struct Built {
+    model: Model,
+    contents: Vec<String>,
+    shapes: Vec<SideShapes>,
+}

@@ -1,0 +1,207 @@
+//! Modes of a substructure as a finite-element program wrote them: an `.npz` archive of numpy arrays.
+
+use std::io::{Cursor, Read};
+
+use npyz::{NpyFile, Order, TypeChar};
+
+use super::RigError;
+
+/// Largest array that is read, in bytes: a limit for archives that unpack to far more than they hold.
+const LARGEST: u64 = 2 << 30;
+/// Longest header of an array, in bytes; numpy writes 128.
+const LONGEST_HEADER: usize = 1024;
+
+/// Modes at the nodes of a contact interface.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ModalData {
+    /// `ω`, rad/s, one for each of `i` modes.
+    pub omega_rad_s: Vec<f64>,
+    /// `Φ`, kg^-1/2, `(c, 3, i)` with the mode running fastest.
+    pub phi: Vec<f64>,
+    /// Positions of the `c` nodes, m.
+    pub nodes_m: Vec<[f64; 3]>,
+    /// `ζ`, one for each mode, where given.
+    pub damping_ratio: Option<Vec<f64>>,
+}
+
+impl ModalData {
+    /// Displacement of `node` in `mode`, kg^-1/2; 0 outside.
+    pub fn shape(&self, node: usize, mode: usize) -> [f64; 3] {
+        let modes = self.omega_rad_s.len();
+        [0, 1, 2].map(|axis| self.phi.get((3 * node + axis) * modes + mode).copied().unwrap_or(0.0))
+    }
+}
+
+/// A numpy array, rewritten to C order.
+struct Array {
+    shape: Vec<usize>,
+    values: Vec<f64>,
+}
+
+/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and, where it is there, `damping_ratio` (i).
+///
+/// # Errors
+/// [`RigError::Npz`], [`RigError::NotFinite`].
+pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
+    let mut archive = npyz::npz::NpzArchive::new(Cursor::new(bytes)).map_err(|error| RigError::Npz {
+        file: file.to_owned(),
+        field: "(archive)".to_owned(),
+        value: format!("cannot be opened: {error}"),
+        limit: "an .npz archive as numpy.savez writes it".to_owned(),
+    })?;
+    let mut array = |name: &str| read_array(file, &mut archive, name);
+    let required = |name: &str, array: Option<Array>, shape: &str| {
+        array.ok_or_else(|| refuse(file, name, "is missing", &format!("an array of shape {shape}")))
+    };
+    let omega = required("omega_rad_s", array("omega_rad_s")?, "(i)")?;
+    let phi = required("phi", array("phi")?, "(c, 3, i)")?;
+    let nodes = required("nodes_m", array("nodes_m")?, "(c, 3)")?;
+    let damping = array("damping_ratio")?;
+
+    let wrong = |name: &str, array: &Array, limit: &str| {
+        Err(refuse(file, name, &format!("has shape ({})", told(&array.shape)), limit))
+    };
+    let &[modes] = omega.shape.as_slice() else { return wrong("omega_rad_s", &omega, "(i)") };
+    let &[count, 3] = nodes.shape.as_slice() else { return wrong("nodes_m", &nodes, "(c, 3)") };
+    if modes == 0 || count == 0 {
+        return wrong("phi", &phi, "at least one node and one mode");
+    }
+    if phi.shape != [count, 3, modes] {
+        return wrong("phi", &phi, &format!("({count}, 3, {modes}), by nodes_m and omega_rad_s"));
+    }
+    if let Some(damping) = &damping
+        && damping.shape != [modes]
+    {
+        return wrong("damping_ratio", damping, &format!("({modes}), as omega_rad_s"));
+    }
+    if let Some((mode, value)) = omega.values.iter().enumerate().find(|(_, value)| **value < 0.0) {
+        return Err(refuse(file, &format!("omega_rad_s[{mode}]"), &format!("is {value}"), "at least 0"));
+    }
+    let nodes_m = nodes.values.chunks_exact(3).map(|node| [node[0], node[1], node[2]]).collect();
+    Ok(ModalData {
+        omega_rad_s: omega.values,
+        phi: phi.values,
+        nodes_m,
+        damping_ratio: damping.map(|damping| damping.values),
+    })
+}
+
+fn refuse(file: &str, field: &str, value: &str, limit: &str) -> RigError {
+    RigError::Npz { file: file.to_owned(), field: field.to_owned(), value: value.to_owned(), limit: limit.to_owned() }
+}
+
+fn told(shape: &[usize]) -> String {
+    shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// An array of the archive by name; `None` where it is not there.
+fn read_array(
+    file: &str,
+    archive: &mut npyz::npz::NpzArchive<Cursor<&[u8]>>,
+    name: &str,
+) -> Result<Option<Array>, RigError> {
+    let readable = "an array of numbers as numpy writes it";
+    let unreadable = |error: &dyn std::fmt::Display| refuse(file, name, &format!("cannot be read: {error}"), readable);
+    let entry_name = npyz::npz::file_name_from_array_name(name);
+    let zip = archive.zip_archive();
+    if !zip.file_names().any(|entry| entry == entry_name) {
+        return Ok(None);
+    }
+    let entry = zip.by_name(&entry_name).map_err(|error| unreadable(&error))?;
+    let mut bytes = vec![];
+    entry.take(LARGEST + 1).read_to_end(&mut bytes).map_err(|error| unreadable(&error))?;
+    if bytes.len() as u64 > LARGEST {
+        return Err(refuse(file, name, &format!("is larger than {LARGEST} bytes"), "a smaller array"));
+    }
+    check_header(&bytes).map_err(|reason| unreadable(&reason))?;
+    let array = NpyFile::new(bytes.as_slice()).map_err(|error| unreadable(&error))?;
+    let shape: Vec<usize> = array.shape().iter().map(|&length| usize::try_from(length).unwrap_or(usize::MAX)).collect();
+    let fortran = array.order() == Order::Fortran;
+    let scalar = match array.dtype() {
+        npyz::DType::Plain(scalar) => scalar,
+        other => {
+            return Err(refuse(file, name, &format!("has type {}", other.descr()), "float64, float32 or an integer"));
+        }
+    };
+    let length = shape.iter().try_fold(1_usize, |product, &length| product.checked_mul(length));
+    let size = scalar.size_field() as usize;
+    // The values must be there before memory is asked for them.
+    if length.and_then(|length| length.checked_mul(size)).is_none_or(|needed| needed > bytes.len()) {
+        return Err(refuse(
+            file,
+            name,
+            &format!("has shape ({}) but {} bytes", told(&shape), bytes.len()),
+            "all its values",
+        ));
+    }
+    let values: std::io::Result<Vec<f64>> = match (scalar.type_char(), size) {
+        (TypeChar::Float, 8) => array.into_vec::<f64>(),
+        (TypeChar::Float, 4) => array.into_vec::<f32>().map(|values| values.into_iter().map(f64::from).collect()),
+        (TypeChar::Int, 8) => array.into_vec::<i64>().map(|values| values.into_iter().map(|v| v as f64).collect()),
+        (TypeChar::Int, 4) => array.into_vec::<i32>().map(|values| values.into_iter().map(f64::from).collect()),
+        _ => return Err(refuse(file, name, &format!("has type {scalar}"), "float64, float32, int64 or int32")),
+    };
+    let mut values = values.map_err(|error| unreadable(&error))?;
+    if fortran {
+        values = to_c_order(&shape, &values);
+    }
+    if let Some((index, &value)) = values.iter().enumerate().find(|(_, value)| !value.is_finite()) {
+        let field = format!("{name}[{}]", told(&position(&shape, index)));
+        return Err(RigError::NotFinite { file: file.to_owned(), field, value });
+    }
+    Ok(Some(Array { shape, values }))
+}
+
+/// Refuses headers on which the reader would overflow: too long, or with numbers whose product is no size.
+fn check_header(bytes: &[u8]) -> Result<(), String> {
+    let length = match bytes.get(..12) {
+        Some([0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, low, high, ..]) => {
+            10 + usize::from(u16::from_le_bytes([*low, *high]))
+        }
+        Some(&[0x93, b'N', b'U', b'M', b'P', b'Y', 2 | 3, _, a, b, c, d]) => {
+            12_usize.saturating_add(u32::from_le_bytes([a, b, c, d]) as usize)
+        }
+        _ => return Err("it does not start as an array".to_owned()),
+    };
+    if length > LONGEST_HEADER || length > bytes.len() {
+        return Err(format!("its header of {length} bytes is longer than {LONGEST_HEADER} or than the file"));
+    }
+    let mut product = 1_u64;
+    for digits in bytes[8..length].split(|byte| !byte.is_ascii_digit()).filter(|digits| !digits.is_empty()) {
+        let number = std::str::from_utf8(digits).ok().and_then(|digits| digits.parse::<u64>().ok());
+        product = number
+            .and_then(|number| product.checked_mul(number.max(1)))
+            .filter(|product| *product < 1 << 50)
+            .ok_or("the numbers in its header are too large")?;
+    }
+    Ok(())
+}
+
+/// Index of every axis of the `flat`-th value in C order.
+fn position(shape: &[usize], flat: usize) -> Vec<usize> {
+    let mut rest = flat;
+    let mut indices: Vec<usize> = shape
+        .iter()
+        .rev()
+        .map(|&length| {
+            let index = rest % length.max(1);
+            rest /= length.max(1);
+            index
+        })
+        .collect();
+    indices.reverse();
+    indices
+}
+
+fn to_c_order(shape: &[usize], values: &[f64]) -> Vec<f64> {
+    (0..values.len())
+        .map(|flat| {
+            let (mut from, mut stride) = (0, 1);
+            for (index, length) in position(shape, flat).iter().zip(shape) {
+                from += index * stride;
+                stride *= length;
+            }
+            values[from]
+        })
+        .collect()
+}

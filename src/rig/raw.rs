@@ -1,0 +1,217 @@
+//! Rig files as they are written: every key, nothing checked but its type.
+
+use serde::Deserialize;
+
+use super::RigError;
+
+/// A whole rig file.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawRig {
+    pub name: String,
+    #[serde(default)]
+    pub reference: RawReference,
+    #[serde(default)]
+    pub band: RawBand,
+    #[serde(default)]
+    pub search: RawSearch,
+    #[serde(default)]
+    pub friction: RawFriction,
+    #[serde(default)]
+    pub load: RawLoad,
+    #[serde(default)]
+    pub limits: RawLimits,
+    #[serde(default)]
+    pub warning: RawWarning,
+    #[serde(default)]
+    pub chart: RawChart,
+    pub pad: Option<RawSubstructure>,
+    pub disc: Option<RawSubstructure>,
+    pub contact: Option<Vec<RawContact>>,
+    pub contact_patch: Option<Vec<RawPatch>>,
+    pub system: Option<RawSystem>,
+}
+
+/// Declares a table whose keys all have defaults.
+macro_rules! table_with_defaults {
+    ($(#[$doc:meta])* $name:ident { $($field:ident: $type:ty = $default:expr,)* }) => {
+        $(#[$doc])*
+        #[derive(Debug, Deserialize)]
+        #[serde(deny_unknown_fields, default)]
+        pub struct $name { $(pub $field: $type,)* }
+
+        impl Default for $name {
+            fn default() -> Self {
+                Self { $($field: $default,)* }
+            }
+        }
+    };
+}
+
+table_with_defaults! {
+    /// `[reference]`: the paper's test conditions.
+    RawReference { normal_load_n: f64 = 500.0, disc_speed_rad_s: f64 = 13.0, friction_coefficient: f64 = 0.35, }
+}
+table_with_defaults! {
+    /// `[band]`.
+    RawBand { max_hz: Option<f64> = None, }
+}
+table_with_defaults! {
+    /// `[search]`.
+    RawSearch { mu_max: f64 = 2.0, instability_threshold: f64 = 1e-6, }
+}
+table_with_defaults! {
+    /// `[friction]`.
+    RawFriction { slope_s_per_m: f64 = 0.0, lateral_damping: bool = false, }
+}
+table_with_defaults! {
+    /// `[load]`: `k = k_ref (N / reference_n)^exponent`.
+    RawLoad { exponent: f64 = 0.0, reference_n: f64 = 500.0, }
+}
+table_with_defaults! {
+    /// `[limits]`: closed ranges of what the node accepts.
+    RawLimits {
+        normal_load_n: [f64; 2] = [0.0, 1e6],
+        disc_speed_rad_s: [f64; 2] = [-1e4, 1e4],
+        friction_coefficient: [f64; 2] = [0.0, 2.0],
+    }
+}
+table_with_defaults! {
+    /// `[warning]`.
+    RawWarning { margin: f64 = 0.05, damping_ratio: f64 = -1e-3, hysteresis: f64 = 5e-4, silence_s: f64 = 1.0, }
+}
+
+table_with_defaults! {
+    /// `[chart]`: conditions for which predictions are prepared.
+    RawChart {
+        normal_load_n: [f64; 2] = [50.0, 2000.0],
+        disc_speed_rad_s: [f64; 2] = [1.0, 60.0],
+        tolerance: f64 = 1e-8,
+    }
+}
+
+/// `[pad]` or `[disc]`: written out, or from a finite-element program.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawSubstructure {
+    pub mass: Option<Vec<Vec<f64>>>,
+    pub stiffness: Option<Vec<Vec<f64>>>,
+    pub modal: Option<String>,
+    pub damping_ratio: Option<OneOrMany>,
+    pub modes: Option<RawModes>,
+}
+
+/// A value for all, or one for each.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(untagged)]
+pub enum OneOrMany {
+    One(f64),
+    Many(Vec<f64>),
+}
+
+/// The `k` lowest modes, or a list of modes counted from 0.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(untagged)]
+pub enum RawModes {
+    Lowest(usize),
+    Indices(Vec<usize>),
+}
+
+/// `[[contact]]`: one pair between inline substructures.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawContact {
+    pub pad_normal: Vec<f64>,
+    pub pad_sliding: Vec<f64>,
+    pub disc_normal: Option<Vec<f64>>,
+    pub disc_sliding: Option<Vec<f64>>,
+    pub pad_lateral: Option<Vec<f64>>,
+    pub disc_lateral: Option<Vec<f64>>,
+    #[serde(default)]
+    pub stiffness_n_per_m: f64,
+    #[serde(default)]
+    pub damping_n_s_per_m: f64,
+    #[serde(default)]
+    pub radius_m: f64,
+}
+
+/// `[[contact_patch]]`: where modal substructures touch.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawPatch {
+    pub axis_point_m: [f64; 3],
+    pub axis_direction: [f64; 3],
+    pub normal: [f64; 3],
+    pub stiffness_n_per_m: OneOrMany,
+    #[serde(default = "no_damping")]
+    pub damping_n_s_per_m: OneOrMany,
+    pub pad_nodes: Option<Vec<usize>>,
+    pub disc_nodes: Option<Vec<usize>>,
+    pub search_distance_m: Option<f64>,
+}
+
+fn no_damping() -> OneOrMany {
+    OneOrMany::One(0.0)
+}
+
+/// `[system]`: sums of matrices.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawSystem {
+    pub mass: String,
+    pub modes: Option<usize>,
+    #[serde(default)]
+    pub damping: Vec<RawTerm>,
+    #[serde(default)]
+    pub stiffness: Vec<RawTerm>,
+}
+
+/// A matrix times a scale.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawTerm {
+    pub matrix: String,
+    #[serde(default = "one")]
+    pub scale: String,
+}
+
+fn one() -> String {
+    "1".to_owned()
+}
+
+/// Reads the text of a rig file.
+///
+/// # Errors
+/// [`RigError::Syntax`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
+pub fn parse(file: &str, bytes: &[u8]) -> Result<RawRig, RigError> {
+    let text = std::str::from_utf8(bytes).map_err(|error| {
+        let line = 1 + bytes.iter().take(error.valid_up_to()).filter(|byte| **byte == b'\n').count();
+        let value = format!("bytes that are not UTF-8 ({error})");
+        RigError::Syntax { file: file.to_owned(), line, value, limit: "TOML text".to_owned() }
+    })?;
+    toml::from_str(text).map_err(|error| {
+        let start = error.span().map_or(0, |span| span.start);
+        let line = 1 + bytes.iter().take(start).filter(|byte| **byte == b'\n').count();
+        explain(file, line, error.message())
+    })
+}
+
+/// Sorts the parser's complaint by what it is about.
+fn explain(file: &str, line: usize, message: &str) -> RigError {
+    let file = file.to_owned();
+    let quoted = |prefix: &str| message.strip_prefix(prefix).and_then(|rest| rest.split_once('`'));
+    if let Some((field, rest)) = quoted("unknown field `") {
+        let limit = rest.trim_start_matches(", expected ").to_owned();
+        return RigError::UnknownKey { file, line, field: field.to_owned(), limit };
+    }
+    if let Some((field, _)) = quoted("missing field `") {
+        let limit = format!("it in the table of line {line}");
+        return RigError::MissingKey { file, field: field.to_owned(), limit };
+    }
+    match message.split_once(", expected ") {
+        Some((value, limit)) => RigError::Syntax { file, line, value: value.to_owned(), limit: limit.to_owned() },
+        None => {
+            RigError::Syntax { file, line, value: message.trim().replace('\n', ", "), limit: "valid TOML".to_owned() }
+        }
+    }
+}

@@ -1,0 +1,196 @@
+//! What every kind of rig has in common, and which kind it is.
+
+use super::raw::{OneOrMany, RawContact, RawModes, RawPatch, RawRig, RawSubstructure, RawSystem};
+use super::{ChartRange, Limits, RigError, Warning};
+use crate::physics::{ContactLaw, OperatingPoint};
+use crate::reduction::ModeSelection;
+
+/// The common tables, checked.
+pub struct Settings {
+    pub reference: OperatingPoint,
+    pub band_max_hz: Option<f64>,
+    pub mu_max: f64,
+    pub instability_threshold: f64,
+    pub contact_law: ContactLaw,
+    pub limits: Limits,
+    pub warning: Warning,
+    pub chart: ChartRange,
+}
+
+/// The kind of a rig, by the tables it has.
+pub enum Kind<'a> {
+    Inline { pad: &'a RawSubstructure, disc: Option<&'a RawSubstructure>, contacts: &'a [RawContact] },
+    Modal { pad: &'a RawSubstructure, disc: Option<&'a RawSubstructure>, patches: &'a [RawPatch] },
+    System(&'a RawSystem),
+}
+
+/// A finite value.
+pub fn finite(file: &str, field: &str, value: f64) -> Result<f64, RigError> {
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(RigError::NotFinite { file: file.into(), field: field.into(), value })
+    }
+}
+
+/// A finite value for which `holds`, told as `limit`.
+pub fn within(file: &str, field: &str, value: f64, holds: bool, limit: &str) -> Result<f64, RigError> {
+    finite(file, field, value)?;
+    if holds {
+        return Ok(value);
+    }
+    Err(RigError::Range { file: file.into(), field: field.into(), value: value.to_string(), limit: limit.into() })
+}
+
+/// Checks the common tables.
+///
+/// # Errors
+/// [`RigError::NotFinite`], [`RigError::Range`].
+pub fn check(file: &str, raw: &RawRig) -> Result<Settings, RigError> {
+    let number = |field: &str, value: f64| finite(file, field, value);
+    let positive = |field: &str, value: f64| within(file, field, value, value > 0.0, "more than 0");
+    let not_negative = |field: &str, value: f64| within(file, field, value, value >= 0.0, "at least 0");
+    let range = |field: &str, [low, high]: [f64; 2]| {
+        number(&format!("{field}[0]"), low)?;
+        within(file, &format!("{field}[1]"), high, low <= high, &format!("at least {field}[0] = {low}"))?;
+        Ok([low, high])
+    };
+    let positive_range = |field: &str, [low, high]: [f64; 2]| {
+        positive(&format!("{field}[0]"), low)?;
+        within(file, &format!("{field}[1]"), high, low < high, &format!("more than {field}[0] = {low}"))?;
+        Ok([low, high])
+    };
+    Ok(Settings {
+        reference: OperatingPoint {
+            normal_load_n: number("reference.normal_load_n", raw.reference.normal_load_n)?,
+            disc_speed_rad_s: number("reference.disc_speed_rad_s", raw.reference.disc_speed_rad_s)?,
+            friction_coefficient: number("reference.friction_coefficient", raw.reference.friction_coefficient)?,
+        },
+        band_max_hz: raw.band.max_hz.map(|value| positive("band.max_hz", value)).transpose()?,
+        mu_max: positive("search.mu_max", raw.search.mu_max)?,
+        instability_threshold: not_negative("search.instability_threshold", raw.search.instability_threshold)?,
+        contact_law: ContactLaw {
+            exponent: number("load.exponent", raw.load.exponent)?,
+            reference_n: positive("load.reference_n", raw.load.reference_n)?,
+            slope_s_per_m: number("friction.slope_s_per_m", raw.friction.slope_s_per_m)?,
+            lateral_damping: raw.friction.lateral_damping,
+        },
+        limits: Limits {
+            normal_load_n: range("limits.normal_load_n", raw.limits.normal_load_n)?,
+            disc_speed_rad_s: range("limits.disc_speed_rad_s", raw.limits.disc_speed_rad_s)?,
+            friction_coefficient: range("limits.friction_coefficient", raw.limits.friction_coefficient)?,
+        },
+        warning: Warning {
+            margin: not_negative("warning.margin", raw.warning.margin)?,
+            damping_ratio: number("warning.damping_ratio", raw.warning.damping_ratio)?,
+            hysteresis: not_negative("warning.hysteresis", raw.warning.hysteresis)?,
+            silence_s: positive("warning.silence_s", raw.warning.silence_s)?,
+        },
+        chart: ChartRange {
+            normal_load_n: positive_range("chart.normal_load_n", raw.chart.normal_load_n)?,
+            disc_speed_rad_s: positive_range("chart.disc_speed_rad_s", raw.chart.disc_speed_rad_s)?,
+            tolerance: within(
+                file,
+                "chart.tolerance",
+                raw.chart.tolerance,
+                (1e-12..=1e-2).contains(&raw.chart.tolerance),
+                "1e-12 to 0.01",
+            )?,
+        },
+    })
+}
+
+/// Which of the three kinds a rig file is.
+///
+/// # Errors
+/// [`RigError::Kind`] where tables or keys of two kinds meet, [`RigError::MissingKey`] where one is not complete.
+pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
+    let mixed = |field: &str, value: &str, limit: &str| {
+        Err(RigError::Kind { file: file.into(), field: field.into(), value: value.into(), limit: limit.into() })
+    };
+    let missing = |field: &str, limit: &str| {
+        Err(RigError::MissingKey { file: file.into(), field: field.into(), limit: limit.into() })
+    };
+    if let Some(system) = &raw.system {
+        let other = [
+            ("pad", raw.pad.is_some()),
+            ("disc", raw.disc.is_some()),
+            ("contact", raw.contact.is_some()),
+            ("contact_patch", raw.contact_patch.is_some()),
+        ];
+        if let Some((field, _)) = other.iter().find(|(_, present)| *present) {
+            return mixed(field, "stands beside [system]", "either [system] or [pad] with its contact");
+        }
+        let friction_or_load = [
+            ("friction.slope_s_per_m", raw.friction.slope_s_per_m != 0.0),
+            ("friction.lateral_damping", raw.friction.lateral_damping),
+            ("load.exponent", raw.load.exponent != 0.0),
+        ];
+        if let Some((field, _)) = friction_or_load.iter().find(|(_, set)| *set) {
+            return mixed(field, "has nothing to act on beside [system]", "a scale of a matrix instead");
+        }
+        return Ok(Kind::System(system));
+    }
+    let Some(pad) = &raw.pad else {
+        return missing("pad", "[pad] with mass and stiffness, [pad] with modal, or [system]");
+    };
+    let modal = pad.modal.is_some();
+    for (side, substructure) in [("pad", Some(pad)), ("disc", raw.disc.as_ref())] {
+        let Some(substructure) = substructure else { continue };
+        let inline = substructure.mass.is_some() || substructure.stiffness.is_some();
+        if substructure.modal.is_some() && (inline || !modal) {
+            let limit = "mass and stiffness on both sides, or modal on both sides";
+            return mixed(&format!("{side}.modal"), "stands beside mass and stiffness", limit);
+        }
+        if modal && inline {
+            let limit = "mass and stiffness on both sides, or modal on both sides";
+            return mixed(&format!("{side}.mass"), "stands beside a modal pad", limit);
+        }
+        if modal && substructure.modal.is_none() {
+            return missing(&format!("{side}.modal"), "an .npz file");
+        }
+    }
+    match (modal, &raw.contact, &raw.contact_patch) {
+        (true, Some(_), _) => mixed("contact", "stands beside modal substructures", "[[contact_patch]]"),
+        (false, _, Some(_)) => mixed("contact_patch", "stands beside inline substructures", "[[contact]]"),
+        (true, None, Some(patches)) if !patches.is_empty() => Ok(Kind::Modal { pad, disc: raw.disc.as_ref(), patches }),
+        (false, Some(contacts), None) if !contacts.is_empty() => {
+            Ok(Kind::Inline { pad, disc: raw.disc.as_ref(), contacts })
+        }
+        (true, ..) => missing("contact_patch", "at least one [[contact_patch]]"),
+        (false, ..) => missing("contact", "at least one [[contact]]"),
+    }
+}
+
+impl RawSubstructure {
+    /// Which modes take part.
+    pub fn selection(&self) -> ModeSelection {
+        match &self.modes {
+            None => ModeSelection::All,
+            Some(RawModes::Lowest(count)) => ModeSelection::Lowest(*count),
+            Some(RawModes::Indices(list)) => ModeSelection::Indices(list.clone()),
+        }
+    }
+}
+
+/// One value for each of `count`, finite; `each` says of what.
+///
+/// # Errors
+/// [`RigError::Shape`], [`RigError::NotFinite`].
+pub fn spread(file: &str, field: &str, values: &OneOrMany, count: usize, each: &str) -> Result<Vec<f64>, RigError> {
+    let values = match values {
+        OneOrMany::One(value) => {
+            finite(file, field, *value)?;
+            vec![*value; count]
+        }
+        OneOrMany::Many(values) => values.clone(),
+    };
+    if values.len() != count {
+        let (value, limit) = (format!("{}", values.len()), format!("one value or one for each of {count} {each}"));
+        return Err(RigError::Shape { file: file.into(), field: field.into(), value, limit });
+    }
+    for (index, &value) in values.iter().enumerate() {
+        finite(file, &format!("{field}[{index}]"), value)?;
+    }
+    Ok(values)
+}

@@ -1,0 +1,199 @@
+//! Predicting a recorded session again and comparing, byte for byte.
+//!
+//! Exactly the inputs that were predicted are predicted again, in the recorded order, with the recorded session events
+//! between them; stability maps are computed anew at the load and speed their events name.
+
+use std::collections::{HashSet, VecDeque};
+use std::sync::Arc;
+
+use crate::io::message::Payload;
+use crate::io::recording::{Recorded, Recording, RecordingError};
+use crate::node::{chart_hash, map_hash, session_chart, session_map};
+use crate::physics::{OperatingPoint, Solver};
+use crate::rig::Rig;
+use crate::session::{Effect, Event, Session};
+use crate::settings::Settings;
+use crate::wire::{self, Prediction, SessionEvent, Time, event_kind};
+
+/// Differences described one by one; the rest is only counted.
+const DESCRIBED: usize = 10;
+
+/// What came of it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Verification {
+    /// Operating points in the recording, and those of them that were predicted.
+    pub inputs: u64,
+    pub predicted: u64,
+    /// Predictions that are the same, byte for byte.
+    pub identical: u64,
+    /// Predictions that differ.
+    pub different: u64,
+    /// Recorded predictions that were not predicted now, and the other way round.
+    pub missing: u64,
+    pub extra: u64,
+    /// Stability maps and charts whose hash differs.
+    pub different_maps: u64,
+    /// Largest relative difference of a frequency, and difference of a growth rate in 1/s, over modes of equal identity.
+    pub frequency_difference: f64,
+    pub growth_rate_difference_per_s: f64,
+    /// The first differences in words.
+    pub described: Vec<String>,
+}
+
+impl Verification {
+    /// Whether every prediction came out the same.
+    pub fn agrees(&self) -> bool {
+        self.different + self.missing + self.extra + self.different_maps == 0
+    }
+
+    fn describe(&mut self, text: impl FnOnce() -> String) {
+        if self.described.len() < DESCRIBED {
+            self.described.push(text());
+        }
+    }
+}
+
+/// Why nothing could be compared.
+#[derive(Debug, thiserror::Error)]
+pub enum VerifyError {
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    #[error("the recording begins in the middle of a session (split {split}): give the directory of all its files")]
+    Split { split: String },
+    #[error("the recording holds no predictions")]
+    NoPredictions,
+    #[error("cannot compute the stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s: {reason}")]
+    Map { normal_load_n: f64, disc_speed_rad_s: f64, reason: String },
+    #[error("cannot chart the rig: {0}")]
+    Chart(String),
+    #[error("session event of unknown kind {kind}: recorded by a later version?")]
+    EventKind { kind: u8 },
+    #[error("{0}")]
+    Encode(String),
+}
+
+/// Predicts the session in `recording` again with `rig` and compares.
+///
+/// # Errors
+/// [`VerifyError`].
+pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, VerifyError> {
+    if let Some(split) = recording.session_metadata("split_index").filter(|&split| split != "0") {
+        return Err(VerifyError::Split { split: split.to_owned() });
+    }
+    let mut answered: HashSet<(Time, u64)> = HashSet::new();
+    for entry in recording.messages() {
+        if let Recorded::Known(Payload::Prediction(prediction)) = &entry.message {
+            answered.insert((prediction.header.stamp, prediction.input_seq));
+        }
+    }
+    if answered.is_empty() {
+        return Err(VerifyError::NoPredictions);
+    }
+
+    let mut found = Verification::default();
+    let mut session = Session::new(rig.clone(), Settings::for_rig(rig));
+    let mut solver = Solver::new(rig.model.dimension());
+    let mut computed: VecDeque<Prediction> = VecDeque::new();
+    let step = |session: &mut Session, computed: &mut VecDeque<Prediction>, event: Event| {
+        // A parameter that the session refuses changed nothing when it was recorded either.
+        for effect in session.step(event).unwrap_or_default() {
+            if let Effect::Publish(prediction) = effect {
+                computed.push_back(prediction);
+            }
+        }
+    };
+    for entry in recording.messages() {
+        match entry.message {
+            Recorded::Known(Payload::OperatingPoint(input)) => {
+                found.inputs += 1;
+                if answered.contains(&(input.header.stamp, input.seq)) {
+                    found.predicted += 1;
+                    step(&mut session, &mut computed, Event::Input(input));
+                }
+            }
+            Recorded::Known(Payload::SessionEvent(event)) => {
+                let event = session_event(event, rig, &mut solver, &mut found)?;
+                step(&mut session, &mut computed, event);
+            }
+            Recorded::Known(Payload::Prediction(recorded)) => match computed.pop_front() {
+                Some(computed) => compare(&entry.cdr, &recorded, &computed, &mut found)?,
+                None => {
+                    found.missing += 1;
+                    found.describe(|| format!("seq {}: recorded, not predicted now", recorded.input_seq));
+                }
+            },
+            _ => {}
+        }
+    }
+    for prediction in computed {
+        found.extra += 1;
+        found.describe(|| format!("seq {}: predicted now, not recorded", prediction.input_seq));
+    }
+    Ok(found)
+}
+
+/// The event that was recorded, a stability map computed anew.
+fn session_event(
+    event: SessionEvent,
+    rig: &Rig,
+    solver: &mut Solver,
+    found: &mut Verification,
+) -> Result<Event, VerifyError> {
+    match event.kind {
+        event_kind::PARAMETER => Ok(Event::Parameter { name: event.name, value: event.value }),
+        event_kind::SILENCE => Ok(Event::Silence { stamp: event.header.stamp }),
+        event_kind::STABILITY_MAP => {
+            let SessionEvent { normal_load_n, disc_speed_rad_s, hash, .. } = event;
+            let point = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient: 0.0 };
+            let map = session_map(rig, solver, &point).map_err(|reason| VerifyError::Map {
+                normal_load_n,
+                disc_speed_rad_s,
+                reason,
+            })?;
+            if map_hash(&map) != hash {
+                found.different_maps += 1;
+                found.describe(|| format!("stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s differs"));
+            }
+            Ok(Event::MapReady(Arc::new(map)))
+        }
+        event_kind::CHART => {
+            let chart = session_chart(rig, std::thread::available_parallelism().map_or(1, usize::from), &|| true)
+                .map_err(VerifyError::Chart)?;
+            if chart_hash(&chart) != event.hash {
+                found.different_maps += 1;
+                found.describe(|| "chart differs".to_owned());
+            }
+            Ok(Event::ChartReady(Arc::new(chart)))
+        }
+        kind => Err(VerifyError::EventKind { kind }),
+    }
+}
+
+fn compare(
+    recorded_bytes: &[u8],
+    recorded: &Prediction,
+    computed: &Prediction,
+    found: &mut Verification,
+) -> Result<(), VerifyError> {
+    let computed_bytes = wire::to_cdr(computed).map_err(|error| VerifyError::Encode(error.to_string()))?;
+    if recorded_bytes == computed_bytes {
+        found.identical += 1;
+        return Ok(());
+    }
+    found.different += 1;
+    for mode in &recorded.modes {
+        let Some(other) = computed.modes.iter().find(|other| other.id == mode.id) else { continue };
+        let frequency = (other.frequency_hz / mode.frequency_hz - 1.0).abs();
+        found.frequency_difference = found.frequency_difference.max(frequency);
+        let growth = (other.growth_rate_per_s - mode.growth_rate_per_s).abs();
+        found.growth_rate_difference_per_s = found.growth_rate_difference_per_s.max(growth);
+    }
+    found.describe(|| {
+        let words = |p: &Prediction| {
+            let (level, count) = (wire::level::name(p.level), p.modes.len());
+            format!("{level}, {count} modes, margin {}, growth {} 1/s", p.friction_margin, p.max_growth_rate_per_s)
+        };
+        format!("seq {}: recorded {}; now {}", recorded.input_seq, words(recorded), words(computed))
+    });
+    Ok(())
+}

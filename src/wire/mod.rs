@@ -1,0 +1,192 @@
+//! The messages of `msgs/`, as they go over ROS 2 and into recordings, and their shared-memory forms.
+//!
+//! The structs below are the `.msg` files field for field; serde gives their CDR form.
+
+pub mod schema;
+pub mod shm;
+
+use serde::{Deserialize, Serialize};
+
+use crate::physics;
+
+/// Topic names on ROS 2 and in recordings.
+pub mod topic {
+    /// Conditions in.
+    pub const OPERATING_POINT: &str = "/rig/operating_point";
+    /// Predictions out.
+    pub const PREDICTION: &str = "/squealcast/prediction";
+    /// What the node predicts for; transient local.
+    pub const RIG: &str = "/squealcast/rig";
+    /// What else shaped the predictions; transient local is not needed, it is for recordings.
+    pub const SESSION_EVENT: &str = "/squealcast/session_event";
+    /// How the node does.
+    pub const DIAGNOSTICS: &str = "/diagnostics";
+}
+
+/// At most this many modes in a [`Prediction`].
+pub const MAX_MODES: usize = 64;
+
+/// `builtin_interfaces/Time`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct Time {
+    pub sec: i32,
+    pub nanosec: u32,
+}
+
+/// `std_msgs/Header`.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Header {
+    pub stamp: Time,
+    pub frame_id: String,
+}
+
+/// `squealcast_msgs/OperatingPoint`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct OperatingPoint {
+    pub header: Header,
+    pub seq: u64,
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub friction_coefficient: f64,
+}
+
+/// `squealcast_msgs/Mode`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Mode {
+    pub id: u32,
+    pub frequency_hz: f64,
+    pub growth_rate_per_s: f64,
+    pub damping_ratio: f64,
+    pub pad_participation: f64,
+    pub residual: f64,
+    pub frequency_error_hz: f64,
+    pub growth_rate_error_per_s: f64,
+}
+
+/// `squealcast_msgs/Prediction`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Prediction {
+    pub header: Header,
+    pub input_seq: u64,
+    pub level: u8,
+    pub reused: bool,
+    pub unstable_modes: u32,
+    pub max_growth_rate_per_s: f64,
+    pub worst_frequency_hz: f64,
+    pub critical_friction: f64,
+    pub friction_margin: f64,
+    pub reason: String,
+    pub modes: Vec<Mode>,
+}
+
+/// The values of [`Prediction::level`].
+pub mod level {
+    pub const OK: u8 = 0;
+    pub const WARN: u8 = 1;
+    pub const SQUEAL: u8 = 2;
+    pub const FAULT: u8 = 3;
+
+    /// The name of a level.
+    pub fn name(level: u8) -> &'static str {
+        match level {
+            OK => "OK",
+            WARN => "WARN",
+            SQUEAL => "SQUEAL",
+            _ => "FAULT",
+        }
+    }
+}
+
+/// `squealcast_msgs/RigInfo`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RigInfo {
+    pub name: String,
+    pub content_hash: String,
+    pub version: String,
+    pub mode_count: u32,
+    pub band_max_hz: f64,
+}
+
+/// `squealcast_msgs/SessionEvent`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SessionEvent {
+    pub header: Header,
+    pub kind: u8,
+    pub name: String,
+    pub value: f64,
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub hash: String,
+}
+
+/// The values of [`SessionEvent::kind`].
+pub mod event_kind {
+    pub const PARAMETER: u8 = 0;
+    pub const SILENCE: u8 = 1;
+    pub const STABILITY_MAP: u8 = 2;
+    pub const CHART: u8 = 3;
+}
+
+/// `diagnostic_msgs/DiagnosticArray`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct DiagnosticArray {
+    pub header: Header,
+    pub status: Vec<DiagnosticStatus>,
+}
+
+/// `diagnostic_msgs/DiagnosticStatus`; level OK=0, WARN=1, ERROR=2, STALE=3.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct DiagnosticStatus {
+    pub level: u8,
+    pub name: String,
+    pub message: String,
+    pub hardware_id: String,
+    pub values: Vec<KeyValue>,
+}
+
+/// `diagnostic_msgs/KeyValue`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct KeyValue {
+    pub key: String,
+    pub value: String,
+}
+
+impl Time {
+    /// From nanoseconds since the epoch; beyond what the message can hold it saturates.
+    pub fn from_ns(ns: i64) -> Self {
+        let sec = ns.div_euclid(1_000_000_000);
+        Self { sec: sec.clamp(i32::MIN.into(), i32::MAX.into()) as i32, nanosec: ns.rem_euclid(1_000_000_000) as u32 }
+    }
+
+    /// Nanoseconds since the epoch.
+    pub fn as_ns(self) -> i64 {
+        i64::from(self.sec) * 1_000_000_000 + i64::from(self.nanosec)
+    }
+}
+
+impl OperatingPoint {
+    /// What the physics needs of it.
+    pub fn point(&self) -> physics::OperatingPoint {
+        physics::OperatingPoint {
+            normal_load_n: self.normal_load_n,
+            disc_speed_rad_s: self.disc_speed_rad_s,
+            friction_coefficient: self.friction_coefficient,
+        }
+    }
+}
+
+/// The CDR bytes of a message: encapsulation header `00 01 00 00`, then little-endian CDR.
+pub fn to_cdr<M: Serialize>(message: &M) -> Result<Vec<u8>, cdr_encoding::Error> {
+    let mut bytes = vec![0, 1, 0, 0];
+    bytes.extend(cdr_encoding::to_vec::<_, byteorder::LittleEndian>(message)?);
+    Ok(bytes)
+}
+
+/// A message from its CDR bytes, encapsulation header included; either byte order.
+pub fn from_cdr<M: for<'de> Deserialize<'de>>(bytes: &[u8]) -> Result<M, cdr_encoding::Error> {
+    match bytes {
+        [0, 0, _, _, payload @ ..] => Ok(cdr_encoding::from_bytes::<M, byteorder::BigEndian>(payload)?.0),
+        [0, 1, _, _, payload @ ..] => Ok(cdr_encoding::from_bytes::<M, byteorder::LittleEndian>(payload)?.0),
+        _ => Err(cdr_encoding::Error::Message("no plain CDR encapsulation header".to_owned())),
+    }
+}

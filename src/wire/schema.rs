@@ -1,0 +1,179 @@
+//! The `ros2msg` schemas of the messages, as recordings carry them.
+//!
+//! A schema is the text of the `.msg` file, then for every message it refers to a line of 80 `=`, a line
+//! `MSG: package/Type` and that message's text, as `ros2 bag record` writes it.
+
+use super::topic;
+
+/// A topic the node records, with what a recording must say of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Topic {
+    /// [`topic::OPERATING_POINT`]
+    OperatingPoint,
+    /// [`topic::PREDICTION`]
+    Prediction,
+    /// [`topic::SESSION_EVENT`]
+    SessionEvent,
+    /// [`topic::RIG`]
+    RigInfo,
+    /// [`topic::DIAGNOSTICS`]
+    Diagnostics,
+}
+
+const HEADER: (&str, &str) = (
+    "std_msgs/Header",
+    "# Standard metadata for higher-level stamped data types.\nbuiltin_interfaces/Time stamp\nstring frame_id\n",
+);
+const TIME: (&str, &str) = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n");
+const MODE: (&str, &str) = ("squealcast_msgs/Mode", include_str!("../../msgs/msg/Mode.msg"));
+const DIAGNOSTIC_STATUS: (&str, &str) = (
+    "diagnostic_msgs/DiagnosticStatus",
+    "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\nstring hardware_id\n\
+     KeyValue[] values\n",
+);
+const KEY_VALUE: (&str, &str) = ("diagnostic_msgs/KeyValue", "string key\nstring value\n");
+const DIAGNOSTIC_ARRAY: &str = "std_msgs/Header header\nDiagnosticStatus[] status\n";
+
+impl Topic {
+    /// All of them, in the order recordings list them.
+    pub const ALL: [Self; 5] =
+        [Self::OperatingPoint, Self::Prediction, Self::SessionEvent, Self::RigInfo, Self::Diagnostics];
+
+    /// The topic's name on ROS 2 and in recordings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::OperatingPoint => topic::OPERATING_POINT,
+            Self::Prediction => topic::PREDICTION,
+            Self::SessionEvent => topic::SESSION_EVENT,
+            Self::RigInfo => topic::RIG,
+            Self::Diagnostics => topic::DIAGNOSTICS,
+        }
+    }
+
+    /// The ROS 2 name of its messages, `package/msg/Type`.
+    pub fn type_name(self) -> &'static str {
+        match self {
+            Self::OperatingPoint => "squealcast_msgs/msg/OperatingPoint",
+            Self::Prediction => "squealcast_msgs/msg/Prediction",
+            Self::SessionEvent => "squealcast_msgs/msg/SessionEvent",
+            Self::RigInfo => "squealcast_msgs/msg/RigInfo",
+            Self::Diagnostics => "diagnostic_msgs/msg/DiagnosticArray",
+        }
+    }
+
+    /// The topic whose messages have this ROS 2 type, `package/msg/Type`.
+    pub fn of_type(type_name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|topic| topic.type_name() == type_name)
+    }
+
+    /// Whether a late subscriber gets the last message (`TRANSIENT_LOCAL`).
+    pub fn is_latched(self) -> bool {
+        self == Self::RigInfo
+    }
+
+    /// The text of its messages' own `.msg` file.
+    pub fn definition(self) -> &'static str {
+        match self {
+            Self::OperatingPoint => include_str!("../../msgs/msg/OperatingPoint.msg"),
+            Self::Prediction => include_str!("../../msgs/msg/Prediction.msg"),
+            Self::SessionEvent => include_str!("../../msgs/msg/SessionEvent.msg"),
+            Self::RigInfo => include_str!("../../msgs/msg/RigInfo.msg"),
+            Self::Diagnostics => DIAGNOSTIC_ARRAY,
+        }
+    }
+
+    /// The messages it refers to: `package/Type` and text.
+    fn dependencies(self) -> &'static [(&'static str, &'static str)] {
+        match self {
+            Self::OperatingPoint | Self::SessionEvent => &[HEADER, TIME],
+            Self::Prediction => &[HEADER, TIME, MODE],
+            Self::RigInfo => &[],
+            Self::Diagnostics => &[HEADER, TIME, DIAGNOSTIC_STATUS, KEY_VALUE],
+        }
+    }
+
+    /// The whole schema, encoding [`SCHEMA_ENCODING`].
+    pub fn schema(self) -> String {
+        let mut text = self.definition().to_owned();
+        for (name, definition) in self.dependencies() {
+            text.push_str(&format!("{:=<80}\nMSG: {name}\n{definition}", ""));
+        }
+        text
+    }
+
+    /// The quality of service it is offered with, in the form channels and `metadata.yaml` carry. Integers, since
+    /// older `rosbags` and `ros2 bag` read no names; the two places must agree.
+    pub fn qos_profiles(self) -> String {
+        let durability = if self.is_latched() { 1 } else { 2 };
+        let depth = if self.is_latched() { 1 } else { 64 };
+        let forever = "sec: 2147483647\n    nsec: 4294967295";
+        format!(
+            "- history: 1\n  depth: {depth}\n  reliability: 1\n  durability: {durability}\n  deadline:\n    {forever}\n  \
+             lifespan:\n    {forever}\n  liveliness: 1\n  liveliness_lease_duration:\n    {forever}\n  \
+             avoid_ros_namespace_conventions: false"
+        )
+    }
+}
+
+/// The encoding of [`Topic::schema`], as MCAP names it.
+pub const SCHEMA_ENCODING: &str = "ros2msg";
+/// The encoding of the messages, as MCAP names it.
+pub const MESSAGE_ENCODING: &str = "cdr";
+
+/// Whether two `ros2msg` definitions lay out the same fields: comments, blank lines, spacing and constants do not
+/// count, and nothing after the first separator (dependencies) does.
+pub fn same_fields(a: &str, b: &str) -> bool {
+    fn fields(text: &str) -> impl Iterator<Item = Vec<&str>> {
+        text.lines()
+            .take_while(|line| !line.starts_with("===="))
+            .map(|line| line.split('#').next().unwrap_or_default())
+            .filter(|line| !line.contains('='))
+            .map(|line| line.split_whitespace().collect::<Vec<_>>())
+            .filter(|words| !words.is_empty())
+            .map(|mut words| {
+                // `std_msgs/Header`, `std_msgs/msg/Header` and `Header` are one type.
+                if let Some(kind) = words.first_mut() {
+                    *kind = kind.rsplit('/').next().unwrap_or(kind);
+                }
+                words
+            })
+    }
+    fields(a).eq(fields(b))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_referenced_message_is_defined() {
+        for topic in Topic::ALL {
+            let schema = topic.schema();
+            let own_package = topic.type_name().split('/').next().unwrap_or_default();
+            let defined: Vec<&str> = schema.lines().filter_map(|line| line.strip_prefix("MSG: ")).collect();
+            for line in schema.lines().map(|line| line.split('#').next().unwrap_or_default()) {
+                let Some(kind) = line.split_whitespace().next().map(|kind| kind.trim_end_matches("[]")) else {
+                    continue;
+                };
+                if !kind.starts_with(|c: char| c.is_ascii_uppercase()) && !kind.contains('/') || line.contains("===") {
+                    continue;
+                }
+                let full = if kind.contains('/') { kind.to_owned() } else { format!("{own_package}/{kind}") };
+                assert!(
+                    line.starts_with("MSG:") || defined.contains(&full.as_str()),
+                    "{topic:?}: {full} is not defined"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn comments_and_constants_do_not_make_a_schema_differ() {
+        let ours = Topic::Prediction.definition();
+        let theirs: String = ours.lines().filter(|l| !l.starts_with('#')).map(|l| format!("{l}  # note\n\n")).collect();
+        assert!(same_fields(ours, &theirs));
+        assert!(same_fields("std_msgs/msg/Header header\n", "std_msgs/Header   header"));
+        assert!(!same_fields(ours, &ours.replace("bool reused\n", "")));
+        assert!(!same_fields("float64 a\nfloat64 b", "float64 b\nfloat64 a"));
+    }
+}

@@ -1,0 +1,461 @@
+//! Fixed-size forms of the messages for shared memory, field for field; `frame_id` is not carried.
+//!
+//! Any peer, in any language, may map these bytes, so the layout is part of the interface: native byte order, no
+//! implicit padding, and a type name that ends in a version. A change of layout is a new version.
+//!
+//! | `squealcast/OperatingPoint/1` | offset | type |
+//! |---|---|---|
+//! | `stamp_ns` (since the epoch) | 0 | i64 |
+//! | `seq` | 8 | u64 |
+//! | `normal_load_n` | 16 | f64 |
+//! | `disc_speed_rad_s` | 24 | f64 |
+//! | `friction_coefficient` | 32 | f64 |
+//! | *size 40, alignment 8* | | |
+//!
+//! | `squealcast/Prediction/1` | offset | type |
+//! |---|---|---|
+//! | `stamp_ns` (of the input) | 0 | i64 |
+//! | `input_seq` | 8 | u64 |
+//! | `max_growth_rate_per_s` | 16 | f64 |
+//! | `worst_frequency_hz` | 24 | f64 |
+//! | `critical_friction` | 32 | f64 |
+//! | `friction_margin` | 40 | f64 |
+//! | `unstable_modes` | 48 | u32 |
+//! | `mode_count` (0..=64) | 52 | u32 |
+//! | `level` (0..=3) | 56 | u8 |
+//! | `reused` (0 or 1) | 57 | u8 |
+//! | `reason_len` (0..=128) | 58 | u8 |
+//! | zero | 59 | u8 × 5 |
+//! | `reason` (UTF-8, zero-filled) | 64 | u8 × 128 |
+//! | `modes` (zero-filled) | 192 | mode × 64 |
+//! | *size 4288, alignment 8* | | |
+//!
+//! | mode | offset | type |
+//! |---|---|---|
+//! | `id` | 0 | u32 |
+//! | zero | 4 | u32 |
+//! | `frequency_hz` | 8 | f64 |
+//! | `growth_rate_per_s` | 16 | f64 |
+//! | `damping_ratio` | 24 | f64 |
+//! | `pad_participation` | 32 | f64 |
+//! | `residual` | 40 | f64 |
+//! | `frequency_error_hz` | 48 | f64 |
+//! | `growth_rate_error_per_s` | 56 | f64 |
+//! | *size 64, alignment 8* | | |
+
+use iceoryx2::prelude::ZeroCopySend;
+use thiserror::Error;
+
+use super::{Header, MAX_MODES, Mode, OperatingPoint, Prediction, Time, level};
+
+/// At most this many bytes of [`Prediction::reason`] are carried.
+pub const REASON_BYTES: usize = 128;
+
+/// A message that does not fit its shared-memory form, or bytes that are no message.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+pub enum FormError {
+    #[error("stamp_ns {0} is beyond what a message stamp can hold (seconds as i32)")]
+    Stamp(i64),
+    #[error("{found} modes, at most {MAX_MODES} are carried")]
+    ModeCount { found: usize },
+    #[error("level {0}, expected 0 to {fault}", fault = level::FAULT)]
+    Level(u8),
+    #[error("reused {0}, expected 0 or 1")]
+    Reused(u8),
+    #[error("reason_len {0}, at most {REASON_BYTES} bytes are carried")]
+    ReasonLength(u8),
+    #[error("reason is valid UTF-8 only up to byte {valid_up_to}")]
+    ReasonUtf8 { valid_up_to: usize },
+}
+
+/// A shared-memory form of a message.
+pub trait Form: ZeroCopySend + Copy + std::fmt::Debug + Send + 'static {
+    /// The message it is a form of.
+    type Message: Clone + Send + 'static;
+    /// The service that carries it; its event service has the same name.
+    const SERVICE: &'static str;
+
+    /// The form of a message.
+    ///
+    /// # Errors
+    /// What does not fit; a long reason is cut, not refused.
+    fn from_message(message: &Self::Message) -> Result<Self, FormError>;
+
+    /// The message of a form.
+    ///
+    /// # Errors
+    /// Whatever in it is not a value of the message.
+    fn to_message(&self) -> Result<Self::Message, FormError>;
+
+    /// The sequence number that readers look for gaps in.
+    fn seq(&self) -> u64;
+}
+
+/// `squealcast/OperatingPoint/1`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/OperatingPoint/1")]
+pub struct OperatingPointForm {
+    pub stamp_ns: i64,
+    pub seq: u64,
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub friction_coefficient: f64,
+}
+
+/// One mode of a [`PredictionForm`].
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/Mode/1")]
+pub struct ModeForm {
+    pub id: u32,
+    pub zero: u32,
+    pub frequency_hz: f64,
+    pub growth_rate_per_s: f64,
+    pub damping_ratio: f64,
+    pub pad_participation: f64,
+    pub residual: f64,
+    pub frequency_error_hz: f64,
+    pub growth_rate_error_per_s: f64,
+}
+
+/// `squealcast/Prediction/1`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/Prediction/1")]
+pub struct PredictionForm {
+    pub stamp_ns: i64,
+    pub input_seq: u64,
+    pub max_growth_rate_per_s: f64,
+    pub worst_frequency_hz: f64,
+    pub critical_friction: f64,
+    pub friction_margin: f64,
+    pub unstable_modes: u32,
+    pub mode_count: u32,
+    pub level: u8,
+    pub reused: u8,
+    pub reason_len: u8,
+    pub zero: [u8; 5],
+    pub reason: [u8; REASON_BYTES],
+    pub modes: [ModeForm; MAX_MODES],
+}
+
+impl Form for OperatingPointForm {
+    type Message = OperatingPoint;
+    const SERVICE: &'static str = "rig/operating_point";
+
+    fn from_message(message: &OperatingPoint) -> Result<Self, FormError> {
+        Ok(Self {
+            stamp_ns: message.header.stamp.as_ns(),
+            seq: message.seq,
+            normal_load_n: message.normal_load_n,
+            disc_speed_rad_s: message.disc_speed_rad_s,
+            friction_coefficient: message.friction_coefficient,
+        })
+    }
+
+    fn to_message(&self) -> Result<OperatingPoint, FormError> {
+        Ok(OperatingPoint {
+            header: header(self.stamp_ns)?,
+            seq: self.seq,
+            normal_load_n: self.normal_load_n,
+            disc_speed_rad_s: self.disc_speed_rad_s,
+            friction_coefficient: self.friction_coefficient,
+        })
+    }
+
+    fn seq(&self) -> u64 {
+        self.seq
+    }
+}
+
+impl Form for PredictionForm {
+    type Message = Prediction;
+    const SERVICE: &'static str = "squealcast/prediction";
+
+    fn from_message(message: &Prediction) -> Result<Self, FormError> {
+        if message.modes.len() > MAX_MODES {
+            return Err(FormError::ModeCount { found: message.modes.len() });
+        }
+        if message.level > level::FAULT {
+            return Err(FormError::Level(message.level));
+        }
+        let mut modes = [ModeForm::default(); MAX_MODES];
+        for (form, mode) in modes.iter_mut().zip(&message.modes) {
+            *form = ModeForm::from(mode);
+        }
+        let cut = cut_at_char(&message.reason, REASON_BYTES).as_bytes();
+        let mut reason = [0; REASON_BYTES];
+        for (to, from) in reason.iter_mut().zip(cut) {
+            *to = *from;
+        }
+        Ok(Self {
+            stamp_ns: message.header.stamp.as_ns(),
+            input_seq: message.input_seq,
+            max_growth_rate_per_s: message.max_growth_rate_per_s,
+            worst_frequency_hz: message.worst_frequency_hz,
+            critical_friction: message.critical_friction,
+            friction_margin: message.friction_margin,
+            unstable_modes: message.unstable_modes,
+            mode_count: message.modes.len() as u32,
+            level: message.level,
+            reused: message.reused.into(),
+            reason_len: cut.len() as u8,
+            zero: [0; 5],
+            reason,
+            modes,
+        })
+    }
+
+    fn to_message(&self) -> Result<Prediction, FormError> {
+        let found = self.mode_count as usize;
+        let modes = self.modes.get(..found).ok_or(FormError::ModeCount { found })?;
+        let reason = self.reason.get(..usize::from(self.reason_len)).ok_or(FormError::ReasonLength(self.reason_len))?;
+        let reason = std::str::from_utf8(reason).map_err(|e| FormError::ReasonUtf8 { valid_up_to: e.valid_up_to() })?;
+        if self.level > level::FAULT {
+            return Err(FormError::Level(self.level));
+        }
+        if self.reused > 1 {
+            return Err(FormError::Reused(self.reused));
+        }
+        Ok(Prediction {
+            header: header(self.stamp_ns)?,
+            input_seq: self.input_seq,
+            level: self.level,
+            reused: self.reused == 1,
+            unstable_modes: self.unstable_modes,
+            max_growth_rate_per_s: self.max_growth_rate_per_s,
+            worst_frequency_hz: self.worst_frequency_hz,
+            critical_friction: self.critical_friction,
+            friction_margin: self.friction_margin,
+            reason: reason.to_owned(),
+            modes: modes.iter().map(Mode::from).collect(),
+        })
+    }
+
+    fn seq(&self) -> u64 {
+        self.input_seq
+    }
+}
+
+impl From<&Mode> for ModeForm {
+    fn from(mode: &Mode) -> Self {
+        Self {
+            id: mode.id,
+            zero: 0,
+            frequency_hz: mode.frequency_hz,
+            growth_rate_per_s: mode.growth_rate_per_s,
+            damping_ratio: mode.damping_ratio,
+            pad_participation: mode.pad_participation,
+            residual: mode.residual,
+            frequency_error_hz: mode.frequency_error_hz,
+            growth_rate_error_per_s: mode.growth_rate_error_per_s,
+        }
+    }
+}
+
+impl From<&ModeForm> for Mode {
+    fn from(form: &ModeForm) -> Self {
+        Self {
+            id: form.id,
+            frequency_hz: form.frequency_hz,
+            growth_rate_per_s: form.growth_rate_per_s,
+            damping_ratio: form.damping_ratio,
+            pad_participation: form.pad_participation,
+            residual: form.residual,
+            frequency_error_hz: form.frequency_error_hz,
+            growth_rate_error_per_s: form.growth_rate_error_per_s,
+        }
+    }
+}
+
+/// A header with this stamp. One that the message cannot hold is refused: it would come back as another time.
+fn header(stamp_ns: i64) -> Result<Header, FormError> {
+    let stamp = Time::from_ns(stamp_ns);
+    if stamp.as_ns() != stamp_ns {
+        return Err(FormError::Stamp(stamp_ns));
+    }
+    Ok(Header { stamp, frame_id: String::new() })
+}
+
+/// The longest start of `text` that has at most `limit` bytes and ends between characters.
+fn cut_at_char(text: &str, limit: usize) -> &str {
+    let end = (0..=limit.min(text.len())).rev().find(|&end| text.is_char_boundary(end)).unwrap_or(0);
+    text.get(..end).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::mem::{align_of, offset_of, size_of};
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn prediction(modes: usize, reason: &str) -> Prediction {
+        Prediction {
+            header: Header { stamp: Time { sec: 7, nanosec: 8 }, frame_id: String::new() },
+            input_seq: u64::MAX,
+            level: level::SQUEAL,
+            reused: true,
+            unstable_modes: 2,
+            max_growth_rate_per_s: 12.5,
+            worst_frequency_hz: 1750.25,
+            critical_friction: 0.4,
+            friction_margin: -0.1,
+            reason: reason.to_owned(),
+            modes: (0..modes)
+                .map(|i| Mode { id: i as u32, frequency_hz: 100.0 * i as f64, residual: 1e-12, ..Mode::default() })
+                .collect(),
+        }
+    }
+
+    /// Peers in other languages map these bytes: sizes and offsets are those of the module's tables.
+    #[test]
+    fn layout_is_the_documented_one() {
+        assert_eq!((size_of::<OperatingPointForm>(), align_of::<OperatingPointForm>()), (40, 8));
+        assert_eq!(
+            [
+                offset_of!(OperatingPointForm, stamp_ns),
+                offset_of!(OperatingPointForm, seq),
+                offset_of!(OperatingPointForm, normal_load_n),
+                offset_of!(OperatingPointForm, disc_speed_rad_s),
+                offset_of!(OperatingPointForm, friction_coefficient),
+            ],
+            [0, 8, 16, 24, 32]
+        );
+        assert_eq!((size_of::<ModeForm>(), align_of::<ModeForm>()), (64, 8));
+        assert_eq!(
+            [
+                offset_of!(ModeForm, id),
+                offset_of!(ModeForm, zero),
+                offset_of!(ModeForm, frequency_hz),
+                offset_of!(ModeForm, growth_rate_per_s),
+                offset_of!(ModeForm, damping_ratio),
+                offset_of!(ModeForm, pad_participation),
+                offset_of!(ModeForm, residual),
+                offset_of!(ModeForm, frequency_error_hz),
+                offset_of!(ModeForm, growth_rate_error_per_s),
+            ],
+            [0, 4, 8, 16, 24, 32, 40, 48, 56]
+        );
+        assert_eq!((size_of::<PredictionForm>(), align_of::<PredictionForm>()), (4288, 8));
+        assert_eq!(
+            [
+                offset_of!(PredictionForm, stamp_ns),
+                offset_of!(PredictionForm, input_seq),
+                offset_of!(PredictionForm, max_growth_rate_per_s),
+                offset_of!(PredictionForm, worst_frequency_hz),
+                offset_of!(PredictionForm, critical_friction),
+                offset_of!(PredictionForm, friction_margin),
+                offset_of!(PredictionForm, unstable_modes),
+                offset_of!(PredictionForm, mode_count),
+                offset_of!(PredictionForm, level),
+                offset_of!(PredictionForm, reused),
+                offset_of!(PredictionForm, reason_len),
+                offset_of!(PredictionForm, zero),
+                offset_of!(PredictionForm, reason),
+                offset_of!(PredictionForm, modes),
+            ],
+            [0, 8, 16, 24, 32, 40, 48, 52, 56, 57, 58, 59, 64, 192]
+        );
+    }
+
+    #[test]
+    fn type_names_carry_a_version() {
+        let names = unsafe {
+            [
+                <OperatingPointForm as ZeroCopySend>::type_name(),
+                <PredictionForm as ZeroCopySend>::type_name(),
+                <ModeForm as ZeroCopySend>::type_name(),
+            ]
+        };
+        assert_eq!(names, ["squealcast/OperatingPoint/1", "squealcast/Prediction/1", "squealcast/Mode/1"]);
+    }
+
+    #[test]
+    fn predictions_come_back_whole() {
+        for modes in [0, 1, MAX_MODES] {
+            let message = prediction(modes, "margin pending");
+            let form = PredictionForm::from_message(&message).expect("fits");
+            assert_eq!(form.to_message().expect("is one"), message);
+        }
+    }
+
+    #[test]
+    fn nan_keeps_its_bits() {
+        let message = Prediction { critical_friction: f64::NAN, ..prediction(0, "") };
+        let back = PredictionForm::from_message(&message).expect("fits").to_message().expect("is one");
+        assert_eq!(back.critical_friction.to_bits(), message.critical_friction.to_bits());
+    }
+
+    #[test]
+    fn a_long_reason_is_cut_between_characters() {
+        // 127 bytes, then a character of two: it does not fit into 128.
+        let reason = format!("{}ä tail", "x".repeat(127));
+        let form = PredictionForm::from_message(&prediction(0, &reason)).expect("fits");
+        assert_eq!(form.reason_len, 127);
+        assert_eq!(form.to_message().expect("is one").reason, "x".repeat(127));
+        let exact = "y".repeat(REASON_BYTES);
+        let form = PredictionForm::from_message(&prediction(0, &exact)).expect("fits");
+        assert_eq!(form.to_message().expect("is one").reason, exact);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused() {
+        assert_eq!(PredictionForm::from_message(&prediction(65, "")), Err(FormError::ModeCount { found: 65 }));
+        let bad_level = Prediction { level: 4, ..prediction(0, "") };
+        assert_eq!(PredictionForm::from_message(&bad_level), Err(FormError::Level(4)));
+    }
+
+    #[test]
+    fn bytes_that_are_no_message_are_refused() {
+        let good = PredictionForm::from_message(&prediction(2, "why")).expect("fits");
+        let refused = |form: PredictionForm| form.to_message().expect_err("is none");
+        assert_eq!(refused(PredictionForm { mode_count: 65, ..good }), FormError::ModeCount { found: 65 });
+        assert_eq!(refused(PredictionForm { level: 9, ..good }), FormError::Level(9));
+        assert_eq!(refused(PredictionForm { reused: 2, ..good }), FormError::Reused(2));
+        assert_eq!(refused(PredictionForm { reason_len: 129, ..good }), FormError::ReasonLength(129));
+        let mut broken = good;
+        broken.reason[1] = 0xff;
+        assert_eq!(refused(broken), FormError::ReasonUtf8 { valid_up_to: 1 });
+        assert_eq!(refused(PredictionForm { stamp_ns: i64::MAX, ..good }), FormError::Stamp(i64::MAX));
+    }
+
+    proptest! {
+        #[test]
+        fn operating_points_come_back_whole(
+            sec: i32, nanosec in 0u32..1_000_000_000, seq: u64, load: u64, speed: u64, friction: u64,
+        ) {
+            let message = OperatingPoint {
+                header: Header { stamp: Time { sec, nanosec }, frame_id: String::new() },
+                seq,
+                normal_load_n: f64::from_bits(load),
+                disc_speed_rad_s: f64::from_bits(speed),
+                friction_coefficient: f64::from_bits(friction),
+            };
+            let back = OperatingPointForm::from_message(&message).expect("fits").to_message().expect("is one");
+            prop_assert_eq!(back.header, message.header);
+            prop_assert_eq!(back.seq, seq);
+            prop_assert_eq!(
+                [back.normal_load_n, back.disc_speed_rad_s, back.friction_coefficient].map(f64::to_bits),
+                [load, speed, friction]
+            );
+        }
+
+        #[test]
+        fn no_bytes_panic(stamp_ns: i64, mode_count: u32, level: u8, reused: u8, reason_len: u8, byte: u8) {
+            let good = PredictionForm::from_message(&prediction(3, "")).expect("fits");
+            let reason = [byte; REASON_BYTES];
+            let _ = PredictionForm { stamp_ns, mode_count, level, reused, reason_len, reason, ..good }.to_message();
+        }
+
+        #[test]
+        fn any_reason_is_carried_up_to_a_character(reason: String) {
+            let form = PredictionForm::from_message(&prediction(0, &reason)).expect("fits");
+            let back = form.to_message().expect("is one").reason;
+            prop_assert!(reason.starts_with(&back));
+            prop_assert!(back == reason || back.len() + 4 > REASON_BYTES);
+        }
+    }
+}

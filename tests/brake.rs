@@ -1,0 +1,82 @@
+//! Real input: the matrices of an industrial disc brake, 4669 degrees of freedom, projected on 150 modes.
+//!
+//! They are no part of the project. They are looked for in `$SQUEALCAST_SHARED/data/brake4669`, by default in `../shared`
+//! beside the project; without them the test says that it is skipped.
+#![cfg(feature = "node")]
+
+mod program;
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use program::{json, launch, number, run, text};
+use tempfile::TempDir;
+
+/// Files the rig file refers to.
+const MATRICES: [&str; 8] = ["M.mtx", "K1.mtx", "KR.mtx", "KGeo.mtx", "D1.mtx", "DG.mtx", "DR.mtx", "D4.mtx"];
+
+/// The rig file with the matrices beside it, if they are there.
+fn rig() -> Option<(TempDir, String)> {
+    let shared = std::env::var_os("SQUEALCAST_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
+    let data = shared.join("data/brake4669");
+    if !MATRICES.iter().all(|name| data.join(name).exists()) {
+        eprintln!("skipped: no matrices in {} (set SQUEALCAST_SHARED)", data.display());
+        return None;
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    for name in MATRICES {
+        let file = data.join(name).canonicalize().expect("a path");
+        std::os::unix::fs::symlink(file, folder.path().join(name)).expect("a link");
+    }
+    let path = folder.path().join("brake4669.toml");
+    std::fs::copy(launch("brake4669.toml"), &path).expect("the rig file");
+    let path = text(&path);
+    Some((folder, path))
+}
+
+#[test]
+fn the_brake_on_150_modes_squeals_where_its_reference_does() {
+    let Some((_folder, rig)) = rig() else { return };
+    // scipy (eigsh on M and K1 + (Ω² - 1) KGeo, then dense eigenvalues), printed with three digits of 1/s and two of
+    // Hz: compared to half a unit of the last digit. No other mode below 6 kHz grows.
+    let reference = [(782.55, 1.499), (2775.71, 70.134), (4190.19, 111.972), (5799.21, 110.389)];
+    let started = Instant::now();
+    let prediction = json(["predict", &rig, "--json"]);
+    eprintln!("predicted in {:.1} s", started.elapsed().as_secs_f64());
+    let modes = prediction["modes"].as_array().expect("modes");
+    let unstable: Vec<(f64, f64)> = modes
+        .iter()
+        .map(|mode| (number(mode, "frequency_hz"), number(mode, "growth_rate_per_s")))
+        .filter(|(_, growth)| *growth > 0.0)
+        .collect();
+    eprintln!("growing: {unstable:?}");
+    assert_eq!(unstable.len(), reference.len(), "{unstable:?}");
+    assert_eq!(prediction["unstable_modes"], reference.len());
+    for ((hz, growth), (expected_hz, expected_growth)) in unstable.into_iter().zip(reference) {
+        assert!((hz - expected_hz).abs() <= 0.005, "{hz} Hz instead of {expected_hz}");
+        assert!((growth - expected_growth).abs() <= 0.0005, "{growth} 1/s instead of {expected_growth} at {hz} Hz");
+    }
+    // What is listed lies in the band, ascending, each identity once; the solve is good to rounding.
+    let frequencies: Vec<f64> = modes.iter().map(|mode| number(mode, "frequency_hz")).collect();
+    assert!(frequencies.is_sorted() && frequencies.iter().all(|hz| *hz <= 6000.0), "{frequencies:?}");
+    let mut ids: Vec<u64> = modes.iter().map(|mode| mode["id"].as_u64().expect("a number")).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    assert_eq!(ids.len(), modes.len(), "identities: {ids:?}");
+    assert!(modes.iter().all(|mode| number(mode, "residual") < 1e-12));
+    assert!(modes.iter().all(|mode| mode["pad_participation"].is_null()));
+}
+
+#[test]
+fn the_brake_is_told_what_it_holds() {
+    let Some((_folder, rig)) = rig() else { return };
+    let started = Instant::now();
+    let check = run(["check", &rig]).exits(0).says("150 lowest of 4669 degrees of freedom");
+    eprintln!("checked in {:.1} s", started.elapsed().as_secs_f64());
+    // Friction and gyroscopic terms are the unsymmetric ones.
+    check
+        .says("KR.mtx times friction_coefficient / 0.35, unsymmetric")
+        .says("DG.mtx times disc_speed_rad_s, unsymmetric")
+        .says("KGeo.mtx times disc_speed_rad_s^2 - 1, symmetric");
+}

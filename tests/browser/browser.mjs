@@ -1,0 +1,53 @@
+// What every browser test shares: Debian's Chromium, an eye on errors and on requests to elsewhere, and a picture folder.
+import { mkdirSync } from "node:fs";
+import { createRequire } from "node:module";
+import { chromium } from "playwright-core";
+
+export const require = createRequire(import.meta.url);
+const ARGS = [
+  "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+  "--disable-background-networking", "--disable-component-update", "--disable-sync",
+  // three.js without a graphics card
+  "--enable-unsafe-swiftshader",
+];
+
+export const launch = () => chromium.launch({ executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium", headless: true, args: ARGS });
+
+/** A page whose console errors and requests to other origins are collected in `faults`. */
+export async function open(browser, url, options, faults) {
+  const context = await browser.newContext({ viewport: { width: 1280, height: 900 }, ...options });
+  const page = await context.newPage();
+  const { origin } = new URL(url);
+  page.on("console", (message) => {
+    // Software rendering says that taking a picture waits for it.
+    if (/GL Driver Message .*Performance/.test(message.text())) return;
+    if (["error", "warning"].includes(message.type())) faults.push(`console: ${message.text()}`);
+  });
+  page.on("pageerror", (error) => faults.push(`error: ${error.stack}`));
+  page.on("request", (request) => {
+    if (new URL(request.url()).origin !== origin) faults.push(`request to elsewhere: ${request.url()}`);
+  });
+  page.on("requestfailed", (request) => {
+    // The stream and what is under way end with the page.
+    if (!request.failure()?.errorText.includes("ERR_ABORTED")) faults.push(`request failed: ${request.url()} ${request.failure()?.errorText}`);
+  });
+  await page.goto(url);
+  return page;
+}
+
+export async function picture(page, folder, name) {
+  if (!folder) return;
+  mkdirSync(folder, { recursive: true });
+  await page.screenshot({ path: `${folder}/${name}.png`, fullPage: true });
+}
+
+/** axe-core's violations, each in a line. */
+export async function violations(page) {
+  await page.evaluate(require("node:fs").readFileSync(require.resolve("axe-core/axe.min.js"), "utf8"));
+  const { violations } = await page.evaluate(() => window.axe.run());
+  return violations.map((found) => `${found.id} (${found.impact}): ${found.help}: ${found.nodes.slice(0, 4).map((node) => `${node.html} ${node.any[0]?.message ?? ""}`).join(" | ")}`);
+}
+
+export function check(condition, what) {
+  if (!condition) throw new Error(what);
+}

@@ -1,0 +1,605 @@
+//! Both buses, both ways, against their own mirror; loopback, private names and domains. Peers in other languages are
+//! in `tests/peers`.
+#![cfg(feature = "node")]
+
+use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crossbeam_channel::{Receiver, Sender, unbounded};
+use squealcast::io::heard::{Bus, Heard};
+use squealcast::io::ros_args::RosArgs;
+use squealcast::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
+use squealcast::io::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource};
+use squealcast::wire::{Header, Mode, OperatingPoint, Prediction, RigInfo, Time, level};
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn point(seq: u64) -> OperatingPoint {
+    OperatingPoint {
+        header: Header { stamp: Time { sec: 1_000, nanosec: seq as u32 }, frame_id: String::new() },
+        seq,
+        normal_load_n: 500.0,
+        disc_speed_rad_s: 13.0,
+        friction_coefficient: 0.35 + seq as f64 * 1e-6,
+    }
+}
+
+/// What a node would answer; as many modes as a message holds.
+fn answer(point: &OperatingPoint) -> Prediction {
+    Prediction {
+        header: point.header.clone(),
+        input_seq: point.seq,
+        level: level::WARN,
+        reused: point.seq % 2 == 1,
+        friction_margin: point.friction_coefficient,
+        reason: "margin below 0.05 µ".to_owned(),
+        modes: (0..64).map(|id| Mode { id, frequency_hz: f64::from(id) * 10.0, ..Mode::default() }).collect(),
+        ..Prediction::default()
+    }
+}
+
+fn into<M: Send + 'static>(sender: Sender<Heard<M>>) -> impl FnMut(Heard<M>) + Send + 'static {
+    move |heard| drop(sender.send(heard))
+}
+
+fn next<M>(receiver: &Receiver<Heard<M>>) -> Heard<M> {
+    receiver.recv_timeout(PATIENCE).expect("heard in time")
+}
+
+fn wait_until(what: &str, condition: impl Fn() -> bool) {
+    let started = Instant::now();
+    while !condition() {
+        assert!(started.elapsed() < PATIENCE, "waited too long: {what}");
+        thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn shm(name: &str) -> ShmOptions {
+    ShmOptions { service_prefix: format!("test-{}-{name}/", std::process::id()), file_prefix: None }
+}
+
+/// A domain of its own for each test: not 0, the default, and below 102, where ports of other programs begin.
+fn ros_options(offset: u16) -> Ros2Options {
+    let base = 20 + (std::process::id() % 8) as u16 * 10;
+    Ros2Options::new(Some(base + offset), true, RosArgs::default()).expect("a valid domain")
+}
+
+/// This test binary once more, running one `#[ignore]`d test as another process.
+fn spawn_peer(test: &str, name: &str, value: &str) -> Peer {
+    let child = Command::new(std::env::current_exe().expect("own path"))
+        .args(["--exact", test, "--ignored", "--nocapture"])
+        .env(name, value)
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("started");
+    Peer(child)
+}
+
+/// Another process; it ends by SIGKILL, whatever becomes of the test.
+struct Peer(Child);
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn shared_memory_carries_both_ways() {
+    let options = shm("both-ways");
+    let output = Arc::new(Mutex::new(ShmOutput::new(&options).expect("output")));
+    let (points, heard_points) = unbounded();
+    let (predictions, heard_predictions) = unbounded();
+    let answering = Arc::clone(&output);
+    let input = ShmInput::spawn(&options, move |heard: Heard<OperatingPoint>| {
+        answering.lock().expect("whole").publish(&answer(&heard.message)).expect("published");
+        points.send(heard).expect("test is there");
+    })
+    .expect("input");
+    let sink = ShmSink::spawn(&options, into(predictions)).expect("sink");
+    let source = ShmSource::new(&options).expect("source");
+
+    for seq in 0..1000 {
+        assert_eq!(source.publish(&point(seq)).expect("published"), 1);
+        let prediction = next(&heard_predictions);
+        assert_eq!((prediction.bus, prediction.message), (Bus::Shm, answer(&point(seq))));
+    }
+    for seq in 0..1000 {
+        assert_eq!(next(&heard_points).message, point(seq));
+    }
+    for counts in [input.counts(), sink.counts()] {
+        assert_eq!((counts.heard, counts.missed, counts.malformed, counts.failures), (1000, 0, 0, 0));
+    }
+    let stopping = Instant::now();
+    input.stop();
+    sink.stop();
+    assert!(stopping.elapsed() < Duration::from_secs(1), "readers stop at once");
+}
+
+#[test]
+fn a_slow_shared_memory_reader_sees_what_it_lost() {
+    let options = shm("slow");
+    let (sender, heard) = unbounded();
+    let (gate, opened) = unbounded::<()>();
+    let input = ShmInput::spawn(&options, move |point: Heard<OperatingPoint>| {
+        if point.message.seq == 0 {
+            let _ = opened.recv();
+        }
+        let _ = sender.send(point);
+    })
+    .expect("input");
+    let source = ShmSource::new(&options).expect("source");
+    source.publish(&point(0)).expect("published");
+    // The reader sits in its sink by now or soon; either way it holds at most one of these.
+    thread::sleep(Duration::from_millis(200));
+    let publishing = Instant::now();
+    for seq in 1..1000 {
+        source.publish(&point(seq)).expect("published");
+    }
+    assert!(publishing.elapsed() < Duration::from_secs(2), "a writer does not wait for readers");
+    drop(gate);
+    wait_until("the newest", || input.counts().heard + input.counts().missed == 1000);
+    let seqs: Vec<u64> = heard.try_iter().map(|heard| heard.message.seq).collect();
+    assert_eq!(seqs.last(), Some(&999), "the oldest are lost, not the newest");
+    assert!(input.counts().missed >= 900, "{:?}", input.counts());
+}
+
+#[test]
+fn a_late_shared_memory_reader_gets_the_latest() {
+    let options = shm("late");
+    let source = ShmSource::new(&options).expect("source");
+    for seq in 0..100 {
+        source.publish(&point(seq)).expect("published");
+    }
+    let (sender, heard) = unbounded();
+    let _input = ShmInput::spawn(&options, into(sender)).expect("input");
+    // iceoryx2 delivers history when the writer next looks at its readers.
+    source.publish(&point(100)).expect("published");
+    let seqs: Vec<u64> = (0..17).map(|_| next(&heard).message.seq).collect();
+    assert_eq!(seqs, (84..=100).collect::<Vec<_>>());
+}
+
+#[test]
+fn services_with_other_settings_are_taken_as_they_are() {
+    use iceoryx2::prelude::*;
+    use squealcast::wire::shm::OperatingPointForm;
+    let options = shm("foreign");
+    let node = NodeBuilder::new().create::<ipc::Service>().expect("node");
+    let name = format!("{}rig/operating_point", options.service_prefix);
+    let name = ServiceName::new(&name).expect("name");
+    let _topic = node
+        .service_builder(&name)
+        .publish_subscribe::<OperatingPointForm>()
+        .max_publishers(1)
+        .max_subscribers(1)
+        .subscriber_max_buffer_size(3)
+        .history_size(0)
+        .enable_safe_overflow(false)
+        .create()
+        .expect("topic");
+    let _event = node.service_builder(&name).event().max_listeners(1).max_notifiers(1).create().expect("event");
+
+    let (sender, heard) = unbounded();
+    let _input = ShmInput::spawn(&options, into(sender)).expect("input");
+    let source = ShmSource::new(&options).expect("source");
+    source.publish(&point(7)).expect("published");
+    assert_eq!(next(&heard).message, point(7));
+    assert!(ShmSource::new(&options).is_err(), "its limits are respected, as an error");
+    let publishing = Instant::now();
+    for seq in 8..1000 {
+        let _ = source.publish(&point(seq));
+    }
+    assert!(publishing.elapsed() < Duration::from_secs(2), "without overflow it does not wait either");
+}
+
+#[test]
+fn another_type_on_the_service_is_an_error() {
+    use iceoryx2::prelude::*;
+    let options = shm("type");
+    let node = NodeBuilder::new().create::<ipc::Service>().expect("node");
+    let name = format!("{}rig/operating_point", options.service_prefix);
+    let name = ServiceName::new(&name).expect("name");
+    let _topic = node.service_builder(&name).publish_subscribe::<u64>().create().expect("topic");
+    let error = ShmSource::new(&options).expect_err("another type").to_string();
+    assert!(error.contains("IncompatibleTypes"), "{error}");
+    let bad = ShmOptions { service_prefix: "x".repeat(10_000), file_prefix: None };
+    assert!(ShmSource::new(&bad).is_err());
+}
+
+#[test]
+fn a_file_prefix_keeps_strangers_apart() {
+    let options = shm("apart");
+    // The same in every run: iceoryx2 leaves one small file per prefix.
+    let apart = ShmOptions { file_prefix: Some("squealcast_test_".to_owned()), ..options.clone() };
+    let (sender, heard) = unbounded();
+    let _input = ShmInput::spawn(&apart, into(sender)).expect("input");
+    assert_eq!(ShmSource::new(&options).expect("stranger").publish(&point(1)).expect("published"), 0);
+    // It stays: what a writer leaves behind that nobody has connected to yet goes with it.
+    let source = ShmSource::new(&apart).expect("source");
+    assert_eq!(source.publish(&point(2)).expect("published"), 1);
+    assert_eq!(next(&heard).message, point(2));
+    let bad = ShmOptions { file_prefix: Some("a/b".to_owned()), ..options };
+    assert!(ShmSource::new(&bad).is_err());
+}
+
+#[test]
+fn shared_memory_outlives_killed_peers() {
+    let options = shm("killed");
+    let (sender, heard) = unbounded();
+    let input = ShmInput::spawn(&options, into(sender)).expect("input");
+    let output = ShmOutput::new(&options).expect("output");
+    // More peers one after another than the service has room for at once: the dead make room.
+    for _ in 0..10 {
+        let peer = spawn_peer("peer_on_shared_memory", "SQUEALCAST_TEST_SHM", &options.service_prefix);
+        let first = next(&heard).message;
+        output.publish(&answer(&first)).expect("published");
+        drop(peer);
+        while heard.try_recv().is_ok() {}
+        output.publish(&answer(&first)).expect("published after the reader was killed");
+    }
+    let source = ShmSource::new(&options).expect("source");
+    source.publish(&point(u64::MAX)).expect("published");
+    while next(&heard).message.seq != u64::MAX {}
+    assert_eq!(input.counts().malformed, 0);
+}
+
+#[test]
+#[ignore = "the other process of a test above"]
+fn peer_on_shared_memory() {
+    let Ok(service_prefix) = std::env::var("SQUEALCAST_TEST_SHM") else { return };
+    let options = ShmOptions { service_prefix, file_prefix: None };
+    let source = ShmSource::new(&options).expect("source");
+    let _sink = ShmSink::spawn(&options, |_| ()).expect("sink");
+    for seq in 0..20_000 {
+        source.publish(&point(seq)).expect("published");
+        thread::sleep(Duration::from_millis(1));
+    }
+}
+
+fn echoing_node(options: &Ros2Options, parameters: Parameters) -> Arc<Ros2> {
+    let (points, heard) = unbounded();
+    let ros = Arc::new(Ros2::start(options, parameters, into(points)).expect("node"));
+    let computing = Arc::downgrade(&ros);
+    thread::spawn(move || {
+        for point in heard {
+            let Some(ros) = computing.upgrade() else { return };
+            ros.publish_prediction(&answer(&point.message)).expect("published");
+        }
+    });
+    ros
+}
+
+#[test]
+fn ros2_carries_both_ways() {
+    let options = ros_options(0);
+    let ros = echoing_node(&options, Parameters::none());
+    let (predictions, heard) = unbounded();
+    let source = Ros2Source::start(&options, into(predictions)).expect("source");
+    wait_until("discovery", || {
+        source.readers() == 1
+            && source.prediction_writers() == 1
+            && ros.prediction_readers() == 1
+            && ros.operating_point_writers() == 1
+    });
+    for seq in 0..500 {
+        source.publish(&point(seq)).expect("published");
+        let prediction = next(&heard);
+        assert_eq!((prediction.bus, prediction.message), (Bus::Ros2, answer(&point(seq))));
+    }
+    for counts in [source.counts(), ros.counts()] {
+        assert_eq!((counts.heard, counts.missed, counts.malformed, counts.failures), (500, 0, 0, 0));
+    }
+    let stopping = Instant::now();
+    source.stop();
+    drop(ros);
+    assert!(stopping.elapsed() < Duration::from_secs(2), "nodes leave at once: {:?}", stopping.elapsed());
+}
+
+#[test]
+fn ros2_names_are_remapped() {
+    let args = "--ros-args -r __node:=left -r __ns:=/cells -r /rig/operating_point:=/cells/point";
+    let (args, _) = RosArgs::split(args.split(' ').map(str::to_owned)).expect("well formed");
+    let node_options = Ros2Options { args: args.clone(), ..ros_options(1) };
+    let (points, heard) = unbounded();
+    let ros = Ros2::start(&node_options, Parameters::none(), into(points)).expect("node");
+    assert_eq!(ros.full_name(), "/cells/left");
+    let args = "--ros-args -r /rig/operating_point:=/cells/point";
+    let (args, _) = RosArgs::split(args.split(' ').map(str::to_owned)).expect("well formed");
+    let source = Ros2Source::start(&Ros2Options { args, ..ros_options(1) }, |_| ()).expect("source");
+    wait_until("discovery", || source.readers() == 1 && ros.operating_point_writers() == 1);
+    source.publish(&point(3)).expect("published");
+    assert_eq!(next(&heard).message, point(3));
+}
+
+#[test]
+fn bad_ros2_names_are_errors() {
+    for bad in ["__node:=a-b", "__node:=a__b", "__ns:=/a//b", "__ns:=/1", "/rig/operating_point:=/a//b"] {
+        let (args, _) = RosArgs::split(["--ros-args", "-r", bad].map(str::to_owned)).expect("well formed");
+        let options = Ros2Options { args, ..ros_options(2) };
+        assert!(Ros2::start(&options, Parameters::none(), |_| ()).is_err(), "{bad}");
+    }
+    assert!(Ros2Options::new(Some(233), true, RosArgs::default()).is_err());
+}
+
+#[test]
+fn a_late_ros2_reader_gets_the_rig() {
+    use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, qos};
+    let options = ros_options(3);
+    let ros = Ros2::start(&options, Parameters::none(), |_| ()).expect("node");
+    let rig = RigInfo { name: "nine-dof".to_owned(), mode_count: 9, ..RigInfo::default() };
+    ros.publish_rig(&rig).expect("published");
+
+    let participant = rustdds::DomainParticipantBuilder::new(options.domain_id)
+        .with_only_networks([std::net::Ipv4Addr::LOCALHOST])
+        .build()
+        .expect("participant");
+    let context = Context::from_domain_participant(participant).expect("context");
+    let mut node = context.new_node(NodeName::new("/", "late").expect("name"), NodeOptions::new()).expect("node");
+    let profile = QosProfile::publisher_default().durability(qos::Durability::TransientLocal);
+    let topic = node
+        .create_topic(
+            &Name::new("/squealcast", "rig").expect("name"),
+            MessageTypeName::new("squealcast_msgs", "RigInfo"),
+            &profile,
+        )
+        .expect("topic");
+    let subscription = node.create_subscription::<RigInfo>(&topic, None).expect("subscription");
+    let started = Instant::now();
+    let heard = loop {
+        if let Some((message, _)) = subscription.take().expect("taken") {
+            break message;
+        }
+        assert!(started.elapsed() < PATIENCE, "no rig heard");
+        thread::sleep(Duration::from_millis(10));
+    };
+    assert_eq!(heard, rig);
+}
+
+#[test]
+fn ros2_parameters_are_judged() {
+    use ros2_client::rcl_interfaces::{
+        GetParametersRequest, GetParametersResponse, ListParametersRequest, ListParametersResponse,
+        SetParametersRequest, SetParametersResponse,
+    };
+    use ros2_client::{
+        Context, Name, NodeName, NodeOptions, Parameter, ParameterValue, QosProfile, ServiceMapping, ServiceTypeName,
+    };
+    let options = ros_options(4);
+    let accepted = Arc::new(Mutex::new(Vec::new()));
+    let collecting = Arc::clone(&accepted);
+    let parameters = Parameters {
+        values: vec![("warn_margin".to_owned(), 0.05), ("dead_band".to_owned(), 0.0)],
+        validate: Box::new(|name, value| if value < 0.0 { Err(format!("{name}: {value} is below 0")) } else { Ok(()) }),
+        accepted: Box::new(move |name, value| collecting.lock().expect("whole").push((name.to_owned(), value))),
+    };
+    let _ros = Ros2::start(&options, parameters, |_| ()).expect("node");
+
+    let participant = rustdds::DomainParticipantBuilder::new(options.domain_id)
+        .with_only_networks([std::net::Ipv4Addr::LOCALHOST])
+        .build()
+        .expect("participant");
+    let context = Context::from_domain_participant(participant).expect("context");
+    let mut node = context.new_node(NodeName::new("/", "asking").expect("name"), NodeOptions::new()).expect("node");
+    let profile = QosProfile::publisher_default();
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().expect("runtime");
+    runtime.spawn(node.spinner().expect("spinner").spin());
+    macro_rules! call {
+        ($kind:literal, $name:literal, $request:expr, $response:ty) => {{
+            let client = node
+                .create_client::<_, $response>(
+                    ServiceMapping::Enhanced,
+                    &Name::new("/squealcast", $name).expect("name"),
+                    &ServiceTypeName::new("rcl_interfaces", $kind),
+                    profile.clone(),
+                    profile.clone(),
+                )
+                .expect("client");
+            // Asked right after discovery, on a busy machine, the node sometimes never sees the request: the client
+            // then knows the service, but not yet the other way round.
+            let started = Instant::now();
+            loop {
+                let answered = runtime.block_on(async {
+                    tokio::time::timeout(Duration::from_secs(1), async {
+                        client.wait_for_service(&node).await;
+                        client.async_call_service($request).await.expect("answered")
+                    })
+                    .await
+                });
+                match answered {
+                    Ok(answer) => break answer,
+                    Err(_) => assert!(started.elapsed() < PATIENCE, "no answer: {}", $name),
+                }
+            }
+        }};
+    }
+    let list: ListParametersResponse = call!(
+        "ListParameters",
+        "list_parameters",
+        ListParametersRequest { prefixes: vec![], depth: 0 },
+        ListParametersResponse
+    );
+    for name in ["warn_margin", "dead_band"] {
+        assert!(list.result.names.iter().any(|known| known == name), "{:?}", list.result.names);
+    }
+    let set = |value: ParameterValue| Parameter { name: "warn_margin".to_owned(), value }.into();
+    let answers: SetParametersResponse = call!(
+        "SetParameters",
+        "set_parameters",
+        SetParametersRequest {
+            parameter: vec![
+                set(ParameterValue::Double(0.1)),
+                set(ParameterValue::Double(-1.0)),
+                set(ParameterValue::Double(f64::NAN)),
+                set(ParameterValue::String("wide".to_owned())),
+                set(ParameterValue::NotSet),
+            ]
+        },
+        SetParametersResponse
+    );
+    let successes: Vec<bool> = answers.results.iter().map(|result| result.successful).collect();
+    assert_eq!(successes, [true, false, false, false, false], "{:?}", answers.results);
+    assert_eq!(answers.results[1].reason, "warn_margin: -1 is below 0");
+    let got: GetParametersResponse = call!(
+        "GetParameters",
+        "get_parameters",
+        GetParametersRequest { names: vec!["warn_margin".to_owned()] },
+        GetParametersResponse
+    );
+    assert_eq!(got.values[0].double_value, 0.1);
+    let mut accepted = accepted.lock().expect("whole");
+    accepted.dedup();
+    assert_eq!(*accepted, [("warn_margin".to_owned(), 0.1)], "initial and refused values are not told");
+}
+
+#[test]
+fn a_refused_initial_value_is_an_error() {
+    let parameters = Parameters {
+        values: vec![("warn_margin".to_owned(), -1.0)],
+        validate: Box::new(|_, _| Err("below 0".to_owned())),
+        accepted: Box::new(|_, _| ()),
+    };
+    let error = Ros2::start(&ros_options(5), parameters, |_| ()).err().expect("refused").to_string();
+    assert!(error.contains("below 0"), "{error}");
+}
+
+#[test]
+fn malformed_ros2_samples_are_counted() {
+    use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, qos};
+    let options = ros_options(6);
+    let (points, heard) = unbounded();
+    let ros = Ros2::start(&options, Parameters::none(), into(points)).expect("node");
+    let participant = rustdds::DomainParticipantBuilder::new(options.domain_id)
+        .with_only_networks([std::net::Ipv4Addr::LOCALHOST])
+        .build()
+        .expect("participant");
+    let context = Context::from_domain_participant(participant).expect("context");
+    let mut node = context.new_node(NodeName::new("/", "broken").expect("name"), NodeOptions::new()).expect("node");
+    // The right topic and type name, but two bytes where a header belongs.
+    let topic = node
+        .create_topic(
+            &Name::new("/rig", "operating_point").expect("name"),
+            MessageTypeName::new("squealcast_msgs", "OperatingPoint"),
+            &QosProfile::publisher_default().history(qos::History::KeepLast { depth: 64 }),
+        )
+        .expect("topic");
+    let publisher = node.create_publisher::<u16>(&topic, None).expect("publisher");
+    let source = Ros2Source::start(&options, |_| ()).expect("source");
+    wait_until("discovery", || source.readers() == 1 && ros.operating_point_writers() == 2);
+    wait_until("malformed samples", || {
+        publisher.publish(0xffff).expect("published");
+        ros.counts().malformed > 0
+    });
+    source.publish(&point(1)).expect("published");
+    assert_eq!(next(&heard).message, point(1));
+}
+
+#[test]
+fn ros2_outlives_killed_peers() {
+    let options = ros_options(7);
+    let ros = echoing_node(&options, Parameters::none());
+    for seq in 0..2 {
+        let peer = spawn_peer("peer_on_ros2", "SQUEALCAST_TEST_DOMAIN", &options.domain_id.to_string());
+        let before = ros.counts().heard;
+        wait_until("the peer", || ros.counts().heard > before + 10);
+        drop(peer);
+        // The dead reader still counts and answers nothing; more than RustDDS itself would hold for it.
+        for _ in 0..10_000 {
+            ros.publish_prediction(&Prediction::default()).expect("published for a killed reader");
+        }
+        let (predictions, heard) = unbounded();
+        let source = Ros2Source::start(&options, into(predictions)).expect("source");
+        wait_until("discovery", || source.readers() == 1 && source.prediction_writers() == 1);
+        let started = Instant::now();
+        loop {
+            source.publish(&point(seq)).expect("published");
+            match heard.recv_timeout(Duration::from_millis(100)) {
+                Ok(prediction) if prediction.message == answer(&point(seq)) => break,
+                _ => assert!(started.elapsed() < PATIENCE, "no answer after a peer was killed"),
+            }
+        }
+    }
+}
+
+#[test]
+#[ignore = "the other process of a test above"]
+fn peer_on_ros2() {
+    let Ok(domain) = std::env::var("SQUEALCAST_TEST_DOMAIN") else { return };
+    let options = Ros2Options::new(Some(domain.parse().expect("a domain")), true, RosArgs::default()).expect("valid");
+    let source = Ros2Source::start(&options, |_| ()).expect("source");
+    for seq in 0..20_000 {
+        source.publish(&point(seq)).expect("published");
+        thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// The node's side of `tests/peers/shm_peer.py`, run by hand:
+/// `SQUEALCAST_TEST_SHM=x/ cargo test --release --test buses -- --exact answers_on_shared_memory --ignored`, then
+/// `python tests/peers/shm_peer.py --prefix x/`.
+#[test]
+#[ignore = "needs a peer in another process"]
+fn answers_on_shared_memory() {
+    let Ok(service_prefix) = std::env::var("SQUEALCAST_TEST_SHM") else { return };
+    let options = ShmOptions { service_prefix, file_prefix: None };
+    let output = ShmOutput::new(&options).expect("output");
+    let input = ShmInput::spawn(&options, move |heard: Heard<OperatingPoint>| {
+        output.publish(&answer(&heard.message)).expect("published");
+    })
+    .expect("input");
+    wait_until("the peer", || input.counts().heard > 0);
+    let mut heard = 0;
+    while input.counts().heard > heard {
+        heard = input.counts().heard;
+        thread::sleep(Duration::from_secs(1));
+    }
+    println!("{:?}", input.counts());
+}
+
+/// Round trips at 500 Hz in one process, 64 modes in every answer:
+/// `cargo test --release --test buses -- --exact round_trip_times --ignored --nocapture`.
+#[test]
+#[ignore = "a measurement"]
+fn round_trip_times() {
+    const COUNT: u64 = 5_000;
+    let percentiles = |mut times_us: Vec<u64>| {
+        times_us.sort_unstable();
+        [50, 90, 99, 100].map(|share| times_us[(times_us.len() * share / 100).min(times_us.len() - 1)])
+    };
+    let pace = |publish: &dyn Fn(&OperatingPoint), heard: &Receiver<Heard<Prediction>>| {
+        let mut times_us = Vec::new();
+        for seq in 0..COUNT {
+            let sent = Instant::now();
+            publish(&point(seq));
+            assert_eq!(next(heard).message, answer(&point(seq)));
+            times_us.push(sent.elapsed().as_micros() as u64);
+            thread::sleep(Duration::from_millis(2).saturating_sub(sent.elapsed()));
+        }
+        percentiles(times_us)
+    };
+
+    let options = shm("times");
+    let output = ShmOutput::new(&options).expect("output");
+    let _input = ShmInput::spawn(&options, move |heard: Heard<OperatingPoint>| {
+        output.publish(&answer(&heard.message)).expect("published");
+    })
+    .expect("input");
+    let (predictions, heard) = unbounded();
+    let _sink = ShmSink::spawn(&options, into(predictions)).expect("sink");
+    let source = ShmSource::new(&options).expect("source");
+    let shm = pace(&|point| assert_eq!(source.publish(point).expect("published"), 1), &heard);
+
+    let options = ros_options(8);
+    let node = echoing_node(&options, Parameters::none());
+    let (predictions, heard) = unbounded();
+    let source = Ros2Source::start(&options, into(predictions)).expect("source");
+    wait_until("discovery", || {
+        source.readers() == 1
+            && source.prediction_writers() == 1
+            && node.prediction_readers() == 1
+            && node.operating_point_writers() == 1
+    });
+    let ros = pace(&|point| source.publish(point).expect("published"), &heard);
+    println!("round trip p50, p90, p99, max in us: shared memory {shm:?}, ROS 2 {ros:?}");
+}

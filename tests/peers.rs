@@ -1,0 +1,597 @@
+//! The program against peers that share no code with it: rclpy, CycloneDDS, iceoryx2's Python binding, the readers of
+//! recordings. `tests/peers/setup.sh` installs them; without them a test says on standard error that it was skipped.
+//!
+//! `SQUEALCAST_PEERS` names another folder than `target/peers`; with it set, missing peers are a failure.
+//! `SQUEALCAST_SHARED` names another folder with the real brake's matrices than `../shared`.
+#![cfg(feature = "node")]
+
+use std::collections::HashMap;
+use std::fs::{self, File};
+use std::io::Write;
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use crossbeam_channel::{Receiver, unbounded};
+use serde_json::Value;
+use squealcast::io::heard::Heard;
+use squealcast::io::message::Payload;
+use squealcast::io::recording::{Recorded, Recording};
+use squealcast::io::ros_args::RosArgs;
+use squealcast::io::ros2::{Ros2Options, Ros2Source};
+use squealcast::io::shm::{ShmOptions, ShmSink, ShmSource};
+use squealcast::wire::{Header, OperatingPoint, Prediction, RigInfo, Time};
+use tempfile::TempDir;
+
+const RIG: &str = "nine-dof-case-2";
+/// The critical friction coefficient of [`RIG`] (`squealcast critical`; proven in the tests of the physics).
+const CRITICAL: &str = "0.355928058261";
+const PATIENCE: Duration = Duration::from_secs(30);
+/// SIGINT ends the node within this.
+const END_WITHIN: Duration = Duration::from_secs(2);
+
+/// Two nodes at a time would take each other's processor.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+fn alone() -> MutexGuard<'static, ()> {
+    ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Says something that the test harness does not hold back.
+fn say(text: &str) {
+    let _ = writeln!(std::io::stderr(), "peers: {text}");
+}
+
+fn manifest_dir() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// A program that `setup.sh` leaves: `python` or `ros-python`. `None`, said aloud, where it is not there.
+fn peer_program(name: &str) -> Option<PathBuf> {
+    let given = std::env::var_os("SQUEALCAST_PEERS").map(PathBuf::from);
+    let folder = given.clone().unwrap_or_else(|| manifest_dir().join("target/peers"));
+    let program = [folder.join("bin").join(name), folder.join(name)].into_iter().find(|path| path.is_file());
+    match (&program, given) {
+        (None, Some(folder)) => panic!("SQUEALCAST_PEERS={}: no {name}", folder.display()),
+        (None, None) => say(&format!("skipped: no {name} in {}; run tests/peers/setup.sh", folder.display())),
+        _ => {}
+    }
+    program
+}
+
+/// Says which versions of some Python packages a peer has.
+fn say_versions(python: &Path, packages: &[&str]) {
+    let script = "import importlib.metadata as m, platform, sys; \
+                  print(', '.join(f'{p} {m.version(p)}' for p in sys.argv[1:]), 'on Python', platform.python_version())";
+    let output = Command::new(python).args(["-c", script]).args(packages).output().expect("started");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let test = thread::current().name().unwrap_or_default().to_owned();
+    let versions = String::from_utf8_lossy(&output.stdout);
+    say(&format!("{test}: squealcast {} against {}", env!("CARGO_PKG_VERSION"), versions.trim()));
+}
+
+/// Runs a script of `tests/peers` to its end and gives back its one line of JSON.
+fn peer(python: &Path, script: &str, arguments: &[&str]) -> Value {
+    let path = manifest_dir().join("tests/peers").join(script);
+    let mut child = Command::new(python)
+        .arg(path)
+        .args(arguments)
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .map(Killed)
+        .expect("started");
+    // They bound their own run time; no pipe of theirs fills up.
+    let output = child.output();
+    let text = String::from_utf8_lossy(&output.stdout);
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{script} {arguments:?}: {}\n{text}\n{errors}", output.status);
+    serde_json::from_str(text.trim()).unwrap_or_else(|error| panic!("{script}: {error}\n{text}\n{errors}"))
+}
+
+/// A process that does not outlive its test.
+struct Killed(Child);
+
+impl Killed {
+    fn output(&mut self) -> Output {
+        use std::io::Read;
+        let (mut stdout, mut stderr) = (self.0.stdout.take().expect("piped"), self.0.stderr.take().expect("piped"));
+        let errors = thread::spawn(move || {
+            let mut bytes = Vec::new();
+            stderr.read_to_end(&mut bytes).map(|_| bytes).unwrap_or_default()
+        });
+        let mut bytes = Vec::new();
+        stdout.read_to_end(&mut bytes).expect("read");
+        Output { status: self.0.wait().expect("waited"), stdout: bytes, stderr: errors.join().expect("read") }
+    }
+}
+
+impl Drop for Killed {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A running node with a domain and a prefix of its own.
+struct Node {
+    process: Killed,
+    domain: u16,
+    prefix: String,
+    folder: TempDir,
+}
+
+impl Node {
+    /// Starts `squealcast run RIG`; `number` tells the nodes of this file apart.
+    fn start(rig: &str, number: u16, record: bool) -> Self {
+        let folder = TempDir::new().expect("a folder");
+        let (domain, prefix) = names(number);
+        let mut arguments = vec!["run", rig, "--loopback"].into_iter().map(str::to_owned).collect::<Vec<_>>();
+        arguments.extend(["--domain".to_owned(), domain.to_string(), "--shm-prefix".to_owned(), prefix.clone()]);
+        if record {
+            arguments.extend(["--record".to_owned(), folder.path().join("recordings").display().to_string()]);
+        }
+        let program = Path::new(env!("CARGO_BIN_EXE_squealcast"));
+        Self { process: start(program, &arguments, folder.path()), domain, prefix, folder }
+    }
+
+    fn domain(&self) -> String {
+        self.domain.to_string()
+    }
+
+    /// What it said so far.
+    fn said(&self) -> String {
+        ["stdout", "stderr"].map(|name| fs::read_to_string(self.folder.path().join(name)).unwrap_or_default()).concat()
+    }
+
+    /// SIGINT; it must end well, and soon. Gives back how long it took.
+    fn interrupt(&mut self) -> Duration {
+        let asked = Instant::now();
+        signal(&self.process.0, "-INT");
+        let status = wait(&mut self.process.0, PATIENCE).unwrap_or_else(|| panic!("does not end: {}", self.said()));
+        let took = asked.elapsed();
+        assert!(status.success(), "{status}: {}", self.said());
+        assert!(took < END_WITHIN, "ended after {took:?}: {}", self.said());
+        took
+    }
+
+    /// The one recording it made.
+    fn recording(&self) -> PathBuf {
+        only_entry(&self.folder.path().join("recordings"))
+    }
+}
+
+/// A domain, not 0 and below 102, and a prefix that no other test run on this machine uses now.
+fn names(number: u16) -> (u16, String) {
+    let process = std::process::id();
+    (10 + (process % 9) as u16 * 10 + number, format!("peers-{process}-{number}/"))
+}
+
+fn start(program: &Path, arguments: &[String], folder: &Path) -> Killed {
+    let file = |name| File::create(folder.join(name)).expect("created");
+    let child = Command::new(program)
+        .args(arguments)
+        .current_dir(folder)
+        .env_remove("ROS_DOMAIN_ID")
+        .stdin(Stdio::null())
+        .stdout(file("stdout"))
+        .stderr(file("stderr"))
+        .spawn();
+    Killed(child.expect("started"))
+}
+
+fn signal(process: &Child, signal: &str) {
+    let status = Command::new("kill").args([signal, &process.id().to_string()]).status().expect("started");
+    assert!(status.success());
+}
+
+fn wait(process: &mut Child, limit: Duration) -> Option<ExitStatus> {
+    let until = Instant::now() + limit;
+    while Instant::now() < until {
+        if let Some(status) = process.try_wait().expect("waited") {
+            return Some(status);
+        }
+        thread::sleep(Duration::from_millis(5));
+    }
+    None
+}
+
+fn only_entry(folder: &Path) -> PathBuf {
+    let entries: Vec<PathBuf> =
+        fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("one").path()).collect();
+    let [entry] = entries.as_slice() else { panic!("not one but {entries:?}") };
+    entry.clone()
+}
+
+fn squealcast(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_squealcast")).args(arguments).stdin(Stdio::null()).output().expect("started")
+}
+
+/// `replay --verify`: the same bytes again.
+fn verify(recording: &Path) {
+    let output = squealcast(&["replay", &recording.display().to_string(), "--verify"]);
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{}: {text}{}", output.status, String::from_utf8_lossy(&output.stderr));
+    assert!(text.contains(" 0 different, 0 missing, 0 extra"), "{text}");
+    say(&format!("replay --verify: {}", text.trim()));
+}
+
+/// What PyPI mcap, mcap-ros2-support and rosbags find in a recording: the same.
+fn read_by_others(python: &Path, recording: &Path) -> Value {
+    let found = peer(python, "read_recording.py", &["--summary", &recording.display().to_string()]);
+    assert_eq!(found["same"], true, "{found}");
+    say(&format!("read by {}: {}", found["versions"], found["topics"]));
+    found
+}
+
+fn say_exchange(report: &Value) {
+    let of = |name| &report[name];
+    say(&format!(
+        "{} of {} answered at {} Hz, latency {} ms, levels {}",
+        of("answered"),
+        of("sent"),
+        of("rate_hz"),
+        of("latency_ms"),
+        of("levels")
+    ));
+}
+
+/// Everything in a recording, by kind.
+#[derive(Default)]
+struct Content {
+    inputs: Vec<OperatingPoint>,
+    predictions: Vec<Prediction>,
+    rigs: Vec<RigInfo>,
+    /// The values of the last diagnostics.
+    diagnostics: HashMap<String, String>,
+    last_log_time_ns: u64,
+}
+
+impl Content {
+    fn read(path: &Path) -> Self {
+        let recording = Recording::open(path).expect("a recording");
+        assert!(recording.is_complete(), "{:?}", recording.damage());
+        let mut content = Self::default();
+        for entry in recording.messages() {
+            content.last_log_time_ns = entry.log_time_ns;
+            match entry.message {
+                Recorded::Known(Payload::OperatingPoint(input)) => content.inputs.push(input),
+                Recorded::Known(Payload::Prediction(prediction)) => content.predictions.push(prediction),
+                Recorded::Known(Payload::RigInfo(rig)) => content.rigs.push(rig),
+                Recorded::Known(Payload::Diagnostics(array)) => {
+                    let values = array.status.into_iter().flat_map(|status| status.values);
+                    content.diagnostics = values.map(|pair| (pair.key, pair.value)).collect();
+                }
+                Recorded::Known(Payload::SessionEvent(_)) => {}
+                other => panic!("{other:?}"),
+            }
+        }
+        content
+    }
+
+    fn count(&self, key: &str) -> u64 {
+        self.diagnostics[key].parse().unwrap_or_else(|_| panic!("{key}: {}", self.diagnostics[key]))
+    }
+
+    /// How many predictions answer the input with a sequence number.
+    fn answers(&self, seq: u64) -> usize {
+        let silence = |prediction: &&Prediction| !prediction.reason.starts_with("stale");
+        self.predictions.iter().filter(|prediction| prediction.input_seq == seq).filter(silence).count()
+    }
+}
+
+fn now_ns() -> i64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).expect("after 1970").as_nanos() as i64
+}
+
+fn point(seq: u64) -> OperatingPoint {
+    OperatingPoint {
+        header: Header { stamp: Time::from_ns(now_ns()), frame_id: String::new() },
+        seq,
+        normal_load_n: 500.0,
+        disc_speed_rad_s: 13.0,
+        friction_coefficient: 0.3 + 1e-4 * (seq % 1000) as f64,
+    }
+}
+
+fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
+    let started = Instant::now();
+    while !condition() {
+        assert!(started.elapsed() < PATIENCE, "waited too long: {what}");
+        thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn rclpy_is_answered_at_500_hz_for_30_s_and_the_recording_serves_others() {
+    let (Some(ros_python), Some(python)) = (peer_program("ros-python"), peer_program("python")) else { return };
+    let _alone = alone();
+    say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
+    let mut node = Node::start(RIG, 0, true);
+    let report = peer(
+        &ros_python,
+        "rclpy_peer.py",
+        &[
+            "--domain",
+            &node.domain(),
+            "--expect-rig",
+            RIG,
+            "--expect-modes",
+            "9",
+            "--expect-unstable-above",
+            CRITICAL,
+            "--rate",
+            "500",
+            "--seconds",
+            "30",
+        ],
+    );
+    say_exchange(&report);
+    assert_eq!((&report["sent"], &report["answered"]), (&Value::from(15_000), &Value::from(15_000)), "{report}");
+    assert_eq!(report["rig"]["version"], env!("CARGO_PKG_VERSION"));
+    let took = node.interrupt();
+    say(&format!("SIGINT ended the node within {took:.0?}"));
+
+    let recording = node.recording();
+    let names = fs::read_dir(&recording).expect("a folder").map(|entry| entry.expect("one").file_name());
+    let names: Vec<String> = names.map(|name| name.to_string_lossy().into_owned()).collect();
+    assert!(names.iter().any(|name| name.ends_with(".mcap")), "{names:?}");
+    assert!(!names.iter().any(|name| name.ends_with(".active")), "{names:?}");
+    let found = read_by_others(&python, &recording);
+    assert_eq!(found["topics"]["/rig/operating_point"], 15_000, "{found}");
+    assert_eq!(found["predictions_of_an_input"], serde_json::json!({"1": 15_000}), "{found}");
+    assert_eq!(found["attachments"], serde_json::json!([format!("{RIG}.toml")]));
+    assert_eq!(Content::read(&recording).count("messages_dropped"), 0);
+    verify(&recording);
+}
+
+#[test]
+fn cyclone_dds_is_answered() {
+    let Some(python) = peer_program("python") else { return };
+    let _alone = alone();
+    say_versions(&python, &["cyclonedds"]);
+    let mut node = Node::start(RIG, 1, false);
+    let domain = node.domain();
+    let expected = ["--expect-modes", "9", "--expect-unstable-above", CRITICAL];
+    let pace = ["--domain", &domain, "--rate", "500", "--seconds", "10"];
+    let report = peer(&python, "cyclone_peer.py", &[&pace[..], &expected[..]].concat());
+    say_exchange(&report);
+    assert_eq!((&report["sent"], &report["answered"]), (&Value::from(5000), &Value::from(5000)), "{report}");
+    node.interrupt();
+}
+
+#[test]
+fn iceoryx2_in_python_is_answered() {
+    let Some(python) = peer_program("python") else { return };
+    let _alone = alone();
+    say_versions(&python, &["iceoryx2"]);
+    let mut node = Node::start(RIG, 2, false);
+    let report = peer(
+        &python,
+        "shm_peer.py",
+        &["--prefix", &node.prefix, "--rate", "500", "--count", "5000", "--first-seq", "1", "--patience", "15"],
+    );
+    say(&format!("{} of {} answered, latency {} us", report["answered"], report["sent"], report["latency_us"]));
+    assert_eq!((&report["sent"], &report["answered"]), (&Value::from(5000), &Value::from(5000)), "{report}");
+    node.interrupt();
+}
+
+/// Ours on both buses at once: the node must not care over which of them it hears first.
+#[test]
+fn what_comes_over_both_buses_is_answered_once() {
+    const COUNT: u64 = 1000;
+    let _alone = alone();
+    say(&format!("both buses: squealcast {} against its own mirror", env!("CARGO_PKG_VERSION")));
+    let mut node = Node::start(RIG, 3, true);
+    let (on_ros, heard_on_ros) = unbounded();
+    let (on_shm, heard_on_shm) = unbounded();
+    let options = Ros2Options::new(Some(node.domain), true, RosArgs::default()).expect("valid");
+    let ros =
+        Ros2Source::start(&options, move |heard: Heard<Prediction>| drop(on_ros.send(heard.message))).expect("joined");
+    let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
+    let shm = ShmSource::new(&options).expect("joined");
+    let _sink =
+        ShmSink::spawn(&options, move |heard: Heard<Prediction>| drop(on_shm.send(heard.message))).expect("joined");
+    wait_until("discovery", || ros.readers() == 1 && ros.prediction_writers() == 1);
+    // The node's own discovery of us is not to be seen from here: until it is there, inputs of another kind.
+    let mut seq = COUNT;
+    wait_until("an answer over both buses", || {
+        ros.publish(&point(seq)).expect("published");
+        seq += 1;
+        thread::sleep(Duration::from_millis(20));
+        !heard_on_ros.is_empty() && !heard_on_shm.is_empty()
+    });
+    let before = seq - COUNT;
+
+    for seq in 0..COUNT {
+        let point = point(seq);
+        if seq % 2 == 0 {
+            ros.publish(&point).expect("published");
+        }
+        assert!(shm.publish(&point).expect("published") > 0, "the node reads");
+        if seq % 2 == 1 {
+            ros.publish(&point).expect("published");
+        }
+        thread::sleep(Duration::from_millis(2));
+    }
+    for (bus, heard) in [("ROS 2", &heard_on_ros), ("shared memory", &heard_on_shm)] {
+        let answered = collect(heard, COUNT);
+        assert_eq!(answered.len() as u64, COUNT, "answered over {bus}");
+        assert!(answered.values().all(|&count| count == 1), "over {bus}: {answered:?}");
+    }
+    node.interrupt();
+    let content = Content::read(&node.recording());
+    assert_eq!(content.inputs.iter().filter(|input| input.seq < COUNT).count() as u64, COUNT);
+    assert_eq!(content.count("inputs_twice"), COUNT);
+    assert!(content.inputs.len() as u64 <= COUNT + before);
+    verify(&node.recording());
+}
+
+/// How often each of the first `count` sequence numbers is answered.
+fn collect(heard: &Receiver<Prediction>, count: u64) -> HashMap<u64, u32> {
+    let mut answered = HashMap::new();
+    // A second of silence follows; FAULTs for it do not count as answers.
+    while let Ok(prediction) = heard.recv_timeout(Duration::from_millis(700)) {
+        if prediction.input_seq < count && !prediction.reason.starts_with("stale") {
+            *answered.entry(prediction.input_seq).or_insert(0) += 1;
+        }
+    }
+    answered
+}
+
+#[test]
+fn the_launch_file_starts_the_node() {
+    let (Some(ros_python), Some(python)) = (peer_program("ros-python"), peer_program("python")) else { return };
+    let _alone = alone();
+    let folder = TempDir::new().expect("a folder");
+    let (domain, prefix) = names(4);
+    // Another value than the node's own default: it must come from the file.
+    let params = fs::read_to_string(manifest_dir().join("launch/params.yaml")).expect("parameters");
+    assert!(params.contains("warn_margin: 0.05"), "{params}");
+    let params_file = folder.path().join("params.yaml");
+    fs::write(&params_file, params.replace("warn_margin: 0.05", "warn_margin: 0.0625")).expect("written");
+    let loaded = peer(
+        &python,
+        "load_launch.py",
+        &[
+            &manifest_dir().join("launch/squealcast.launch.py").display().to_string(),
+            "rig:=nine-dof",
+            &format!("domain:={domain}"),
+            "loopback:=true",
+            &format!("record:={}", folder.path().join("recordings").display()),
+            &format!("params_file:={}", params_file.display()),
+            &format!("executable:={}", env!("CARGO_BIN_EXE_squealcast")),
+        ],
+    );
+    let command: Vec<String> = serde_json::from_value(loaded["command"].clone()).expect("a command line");
+    say(&format!("launch file, loader {}: squealcast {}", loaded["loader"], command[1..].join(" ")));
+    say_versions(&ros_python, &["ros-rclpy"]);
+    // As launched, but for the name of shared memory, which a node of somebody else may have.
+    let mut arguments = command[1..].to_vec();
+    arguments.splice(2..2, ["--shm-prefix".to_owned(), prefix.clone()]);
+    let process = start(Path::new(&command[0]), &arguments, folder.path());
+    let mut node = Node { process, domain, prefix, folder };
+    let report = peer(
+        &ros_python,
+        "rclpy_peer.py",
+        &["--domain", &node.domain(), "--expect-rig", "nine-dof", "--rate", "100", "--seconds", "2"],
+    );
+    say_exchange(&report);
+    assert_eq!(report["parameters"]["values"][0], 0.0625, "{report}");
+    node.interrupt();
+    verify(&node.recording());
+}
+
+#[test]
+fn a_killed_node_loses_a_second_at_most() {
+    let _alone = alone();
+    let python = peer_program("python");
+    for run_ms in [900, 3300] {
+        let mut node = Node::start(RIG, 5, true);
+        let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
+        let shm = ShmSource::new(&options).expect("joined");
+        wait_until("the node", || shm.publish(&point(0)).expect("published") > 0);
+        let started = Instant::now();
+        let mut seq = 0;
+        while started.elapsed() < Duration::from_millis(run_ms) {
+            seq += 1;
+            shm.publish(&point(seq)).expect("published");
+            thread::sleep(Duration::from_millis(2));
+        }
+        let killed_ns = now_ns() as u64;
+        signal(&node.process.0, "-KILL");
+        wait(&mut node.process.0, PATIENCE).expect("ended");
+
+        let directory = node.recording();
+        let output = squealcast(&["recover", &directory.display().to_string()]);
+        let text = String::from_utf8_lossy(&output.stdout);
+        // 3: the last chunk may be torn.
+        assert!(matches!(output.status.code(), Some(0 | 3)), "{}: {text}", output.status);
+        assert!(text.contains("restored"), "{text}");
+        let content = Content::read(&directory);
+        assert_eq!(content.rigs.len(), 1);
+        // The node got some of 0 from before it was there, too.
+        let seqs: Vec<u64> = content.inputs.iter().map(|input| input.seq).filter(|&seq| seq > 0).collect();
+        assert_eq!(seqs, (1..=seqs.len() as u64).collect::<Vec<_>>(), "inputs are missing in between");
+        let lost = Duration::from_nanos(killed_ns.saturating_sub(content.last_log_time_ns));
+        say(&format!(
+            "killed after {run_ms} ms: {} of {seq} inputs restored, the last {lost:.0?} lost, recover exits with {}",
+            seqs.len(),
+            output.status.code().unwrap_or(-1),
+        ));
+        assert!(lost < Duration::from_secs(1), "{lost:?}");
+        verify(&directory);
+        if let Some(python) = &python {
+            read_by_others(python, &directory);
+        }
+        // A second repair finds nothing to do.
+        assert!(squealcast(&["recover", &directory.display().to_string()]).status.success());
+    }
+}
+
+/// The brake of `shared/data`: too large to predict each of 50 inputs a second.
+#[test]
+fn the_real_brake_runs_live() {
+    let Some(ros_python) = peer_program("ros-python") else { return };
+    let shared = std::env::var_os("SQUEALCAST_SHARED").map_or_else(|| manifest_dir().join("../shared"), PathBuf::from);
+    let matrices = shared.join("data/brake4669");
+    let Ok(files) = fs::read_dir(&matrices) else {
+        say(&format!("skipped: no {}", matrices.display()));
+        return;
+    };
+    let _alone = alone();
+    let folder = TempDir::new().expect("a folder");
+    for file in files.map(|file| file.expect("one").path()).filter(|path| path.extension().is_some_and(|e| e == "mtx"))
+    {
+        symlink(fs::canonicalize(&file).expect("there"), folder.path().join(file.file_name().expect("named")))
+            .expect("linked");
+    }
+    let rig = folder.path().join("brake4669.toml");
+    fs::copy(manifest_dir().join("launch/rigs/brake4669.toml"), &rig).expect("copied");
+
+    say_versions(&ros_python, &["ros-rclpy"]);
+    let mut node = Node::start(&rig.display().to_string(), 6, true);
+    let report = peer(
+        &ros_python,
+        "rclpy_peer.py",
+        &[
+            "--domain",
+            &node.domain(),
+            "--expect-rig",
+            "brake4669",
+            "--wait",
+            "120",
+            // The node comes after the peer: DDS then takes up to three seconds until it hears of it.
+            "--settle",
+            "5",
+            "--speed",
+            "6.283185307179586",
+            "--mu-from",
+            "0.34",
+            "--mu-to",
+            "0.36",
+            "--rate",
+            "50",
+            "--seconds",
+            "15",
+            "--allow-passed-over",
+        ],
+    );
+    say_exchange(&report);
+    // Its reference conditions squeal: the table of the matrices' README.
+    assert_eq!(report["levels"]["SQUEAL"], report["answered"], "{report}");
+    node.interrupt();
+
+    let content = Content::read(&node.recording());
+    let (sent, answered) = (report["sent"].as_u64().expect("a count"), report["answered"].as_u64().expect("a count"));
+    assert_eq!(content.inputs.len() as u64, sent, "those passed over are recorded too");
+    assert_eq!(content.count("inputs_passed_over"), sent - answered, "{:?}", content.diagnostics);
+    assert_eq!(content.answers(sent), 1, "the newest is predicted");
+    assert!(answered >= 30, "{report}");
+    say(&format!("{} inputs passed over, recorded and counted", sent - answered));
+    verify(&node.recording());
+}
