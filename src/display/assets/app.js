@@ -40,13 +40,17 @@ let asking = { map: false, history: false, events: false };
 
 let chosenAt = 0;
 let chosenMu = NaN;
+let choices = 0;
 
 async function choose(id) {
+  const order = ++choices;
   chosenAt = performance.now();
   chosenMu = latest?.mu ?? NaN;
   try {
     const moment = recording && latest ? `&at=${latest.time_s}` : "";
-    await shape.show(await ask(`shape.json?id=${id}${moment}`));
+    const answer = await ask(`shape.json?id=${id}${moment}`);
+    // Of two on their way the later one counts.
+    if (order === choices) await shape.show(answer);
   } catch (error) {
     shape.missing(error.message);
   }

@@ -12,6 +12,27 @@ export function displaced(re, im, phase) {
   return re.map((value, k) => value * c - im[k] * s);
 }
 
+/** Turns a mode's newer shape so that it goes on from where its older one is: shapes have no phase of their own. */
+function keepPhase(newer, older) {
+  let [re, im] = [0, 0];
+  newer.parts.forEach((part, p) => {
+    const before = older.parts[p];
+    part.re.forEach((value, k) => {
+      re += value * before.re[k] + part.im[k] * before.im[k];
+      im += value * before.im[k] - part.im[k] * before.re[k];
+    });
+  });
+  const size = Math.hypot(re, im);
+  if (!(size > 0)) return;
+  const [c, s] = [re / size, im / size];
+  for (const part of newer.parts) {
+    part.re.forEach((value, k) => {
+      part.re[k] = value * c - part.im[k] * s;
+      part.im[k] = value * s + part.im[k] * c;
+    });
+  }
+}
+
 export class ShapeView {
   constructor() {
     this.canvas = at("shape");
@@ -36,21 +57,25 @@ export class ShapeView {
   }
 
   async show(shape) {
-    const growth = shape.growth_rate_per_s;
-    const grown = growth > 0 ? "grows" : growth < 0 ? "decays" : "neither grows nor decays";
-    at("shape-note").textContent = `mode ${shape.id}, ${fixed(shape.frequency_hz, shape.frequency_hz >= 100 ? 1 : 4)} Hz, slowed down; it ${grown}`;
-    this.canvas.setAttribute("aria-label", `Mode ${shape.id} in motion`);
     const spatial = shape.parts.some((part) => part.spatial);
-    const kind = spatial ? Space : Sticks;
-    if (!(this.picture instanceof kind)) {
+    this.wanted = shape;
+    if (spatial) this.three ??= await import("./vendor/three.module.min.js");
+    // Another one was chosen while that loaded.
+    if (this.wanted !== shape) return;
+    if (!(this.picture instanceof (spatial ? Space : Sticks))) {
       this.picture?.dispose();
       // A canvas keeps its first kind of context.
       const fresh = this.canvas.cloneNode();
       this.canvas.replaceWith(fresh);
       this.canvas = fresh;
-      this.picture = spatial ? await Space.create(fresh) : new Sticks(fresh);
+      this.picture = spatial ? new Space(this.three, fresh) : new Sticks(fresh);
     }
+    if (this.shape?.id === shape.id) keepPhase(shape, this.shape);
     this.shape = shape;
+    const growth = shape.growth_rate_per_s;
+    const grown = growth > 0 ? "grows" : growth < 0 ? "decays" : "neither grows nor decays";
+    at("shape-note").textContent = `mode ${shape.id}, ${fixed(shape.frequency_hz, shape.frequency_hz >= 100 ? 1 : 4)} Hz, slowed down; it ${grown}`;
+    this.canvas.setAttribute("aria-label", `Mode ${shape.id} in motion`);
     this.picture.take(shape);
     this.#draw();
     this.#run();
@@ -204,11 +229,6 @@ class Sticks {
 
 /** Interface nodes in space. */
 class Space {
-  static async create(canvas) {
-    const three = await import("./vendor/three.module.min.js");
-    return new Space(three, canvas);
-  }
-
   constructor(three, canvas) {
     this.three = three;
     this.canvas = canvas;
