@@ -11,7 +11,7 @@ use crate::physics::Solver;
 use crate::rig::Rig;
 use crate::session::{Effect, Event, Session};
 use crate::settings::Settings;
-use crate::wire::{Header, OperatingPoint, SessionEvent, Time, event_kind};
+use crate::wire::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
 
 /// Stamp of the first input of an offline session, ns since the epoch: 2024-01-01T00:00:00Z, so that the same command
 /// makes the same messages.
@@ -28,13 +28,13 @@ pub enum OfflineError {
     Dropped { dropped: u64, reason: String },
 }
 
-/// Predicts `inputs` with `rig` and records the session into a new directory in `directory`; that directory.
+/// Predicts conditions with `rig` and records the session, with the vibration measured at the same time, into a new directory in `directory`; that directory.
 ///
 /// # Errors
 /// [`OfflineError`].
 pub fn record(
     rig: &Arc<Rig>,
-    inputs: impl Iterator<Item = OperatingPoint>,
+    measured: impl Iterator<Item = (OperatingPoint, Option<Vibration>)>,
     directory: &Path,
 ) -> Result<PathBuf, OfflineError> {
     let recorder = Recorder::start(RecorderConfig {
@@ -54,7 +54,7 @@ pub fn record(
     let mut session = Session::new(rig.clone(), Settings::for_rig(rig));
     let mut solver = Solver::new(rig.model.dimension());
     let mut begun = false;
-    for input in inputs {
+    for (input, vibration) in measured {
         let stamp = input.header.stamp;
         let header = Header { stamp, ..Default::default() };
         if !begun {
@@ -63,6 +63,9 @@ pub fn record(
             for (name, value) in session.settings().values() {
                 write(stamp, Payload::SessionEvent(parameter_event(header.clone(), name, value)));
             }
+        }
+        if let Some(vibration) = vibration {
+            write(stamp, Payload::Vibration(vibration));
         }
         write(stamp, Payload::OperatingPoint(input.clone()));
         // Settings are the rig's own here, and inputs are no settings: nothing can be refused.

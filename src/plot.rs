@@ -4,15 +4,15 @@ use std::collections::BTreeMap;
 
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
+use plotters::element::DashedPathElement;
 use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use crate::display::curves::Curves;
 use crate::display::history::{Bin, History};
 use crate::physics::Window;
 use crate::wire::level;
 
-/// Width and height of a figure, px.
-const SIZE: (u32, u32) = (1000, 900);
 /// The library places points on whole units; this many to a px keeps curves smooth.
 const FINE: u32 = 8;
 /// Colours of neighbouring curves; told apart by the colour-blind too (Okabe and Ito, 2008).
@@ -25,6 +25,12 @@ const COLOURS: [RGBColor; 7] = [
     RGBColor(230, 159, 0),
     RGBColor(60, 60, 60),
 ];
+
+/// Dashes tell modes of the same colour apart: px drawn and px left out.
+const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
+/// Entries of a legend in a row, and the most it can have; more modes than that are told by nobody.
+const LEGEND_COLUMNS: usize = 9;
+const LEGEND_MOST: usize = 27;
 
 /// One mode at one friction coefficient.
 #[derive(Clone, Copy, Debug)]
@@ -40,138 +46,217 @@ pub struct Point {
 #[error("cannot draw the figure: {0}")]
 pub struct PlotError(String);
 
-/// Frequencies and growth rates of followed modes against the friction coefficient, one above the other, with the
+/// Growth rates and frequencies of followed modes against the friction coefficient, one above the other, with the
 /// windows of instability shaded.
 ///
 /// # Errors
 /// [`PlotError`] where the drawing library refuses.
 pub fn sweep(title: &str, points: &[Point], windows: &[Window]) -> Result<String, PlotError> {
-    let mut svg = String::new();
-    {
-        let area = SVGBackend::with_string(&mut svg, (SIZE.0 * FINE, SIZE.1 * FINE)).into_drawing_area();
-        area.fill(&WHITE).map_err(failed)?;
-        let area = area.margin(8 * FINE, 0, 0, 0).titled(title, ("sans-serif", 22 * FINE)).map_err(failed)?;
-        let (upper, lower) = area.split_vertically(55.percent());
-        panel(&upper, points, windows, "frequency, Hz", |p| p.frequency_hz)?;
-        panel(&lower, points, windows, "growth rate, 1/s", |p| p.growth_rate_per_s)?;
-        area.present().map_err(failed)?;
-    }
-    let fine = format!("width=\"{}\" height=\"{}\"", SIZE.0 * FINE, SIZE.1 * FINE);
-    Ok(svg.replacen(&fine, &format!("width=\"{}\" height=\"{}\"", SIZE.0, SIZE.1), 1))
+    let windows: Vec<_> = windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
+    against_friction(title, points, &windows, range(points.iter().map(|point| point.mu)), None)
 }
 
-/// Growth rates and frequencies of a stability map against the friction coefficient, windows shaded, `mu` marked.
+/// The curves of a stability map up to `mu_to`, as [`sweep`] draws them; a line marks the friction coefficient `marked`.
 ///
 /// # Errors
 /// [`PlotError`] where the drawing library refuses.
-pub fn map(title: &str, curves: &Curves, mu: f64) -> Result<String, PlotError> {
-    let last = curves.mu.last().copied().unwrap_or(1.0);
-    let wanted = [1.6 * curves.critical_friction.unwrap_or(last), 1.15 * mu, 0.05];
-    let end = wanted.into_iter().filter(|mu| mu.is_finite()).fold(0.0, f64::max).min(last);
-    let mut svg = String::new();
-    {
-        let area = SVGBackend::with_string(&mut svg, (SIZE.0, 640)).into_drawing_area();
-        area.fill(&WHITE).map_err(failed)?;
-        let area = if title.is_empty() { area } else { area.titled(title, ("sans-serif", 22)).map_err(failed)? };
-        let (upper, lower) = area.split_vertically(50.percent());
-        for (area, label, growth) in [(&upper, "growth rate, 1/s", true), (&lower, "frequency, Hz", false)] {
-            let lines: Vec<(u32, Vec<(f64, f64)>)> = curves
-                .modes
-                .iter()
-                .map(|mode| {
-                    let values = if growth { &mode.growth_rate_per_s } else { &mode.frequency_hz };
-                    let points = curves.mu.iter().zip(values).filter(|(mu, _)| **mu <= end);
-                    (mode.id, points.filter_map(|(mu, value)| Some((*mu, f64::from((*value)?)))).collect())
-                })
-                .collect();
-            let y = padded(range(lines.iter().flat_map(|(_, points)| points.iter().map(|point| point.1))));
-            let mut chart = axes(area, (0.0, end), y, "friction coefficient", label)?;
-            for window in &curves.windows {
-                let to = window.mu_to.unwrap_or(end).min(end);
-                if window.mu_from < to {
-                    let shade = RGBColor(213, 94, 0).mix(0.14).filled();
-                    let corners = [(window.mu_from, y.0), (to, y.1)];
-                    chart.draw_series([Rectangle::new(corners, shade)]).map_err(failed)?;
-                }
-            }
-            for (id, points) in lines {
-                let colour = COLOURS[id as usize % COLOURS.len()];
-                chart.draw_series(LineSeries::new(points, colour.stroke_width(2))).map_err(failed)?;
-            }
-            if mu.is_finite() {
-                let line = [(mu, y.0), (mu, y.1)];
-                chart.draw_series(LineSeries::new(line, BLACK.stroke_width(2))).map_err(failed)?;
+pub fn map(title: &str, curves: &Curves, mu_to: f64, marked: Option<f64>) -> Result<String, PlotError> {
+    let mut points = vec![];
+    for mode in &curves.modes {
+        for ((&mu, hz), growth) in curves.mu.iter().zip(&mode.frequency_hz).zip(&mode.growth_rate_per_s) {
+            if let (Some(hz), Some(growth), true) = (*hz, *growth, mu <= mu_to) {
+                let (frequency_hz, growth_rate_per_s) = (hz.into(), growth.into());
+                points.push(Point { mu, id: mode.id, frequency_hz, growth_rate_per_s });
             }
         }
-        area.present().map_err(failed)?;
     }
-    Ok(svg)
+    let windows: Vec<_> = curves.windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
+    let from = curves.mu.first().copied().unwrap_or(0.0);
+    against_friction(title, &points, &windows, (from, mu_to.max(from + 1e-6)), marked)
 }
 
-/// A session over time, in seconds after `from_s`: ranges of load, speed, friction, growth and margin, and the unstable
-/// frequencies; shaded where squeal was predicted.
+fn against_friction(
+    title: &str,
+    points: &[Point],
+    windows: &[(f64, Option<f64>)],
+    mu: (f64, f64),
+    marked: Option<f64>,
+) -> Result<String, PlotError> {
+    let mut modes: BTreeMap<u32, Vec<&Point>> = BTreeMap::new();
+    for point in points {
+        modes.entry(point.id).or_default().push(point);
+    }
+    let ids: Vec<u32> = modes.keys().copied().collect();
+    let rows = if ids.len() > LEGEND_MOST { 0 } else { ids.len().div_ceil(LEGEND_COLUMNS) as u32 };
+    figure(title, (1000, 760 + 24 * rows), |area| {
+        let (head, area) = area.split_vertically(24 * rows * FINE);
+        if rows > 0 {
+            legend(&head, &ids)?;
+        }
+        let (upper, lower) = area.split_vertically(50.percent());
+        let growth: fn(&Point) -> f64 = |point| point.growth_rate_per_s;
+        let frequency: fn(&Point) -> f64 = |point| point.frequency_hz;
+        for (area, label, value) in [(&upper, "growth rate, 1/s", growth), (&lower, "frequency, Hz", frequency)] {
+            let y = padded(range(points.iter().map(value)));
+            let mut chart = axes(area, mu, y, "friction coefficient", label)?;
+            for &(from, to) in windows {
+                let (from, to) = (from.max(mu.0), to.unwrap_or(mu.1).min(mu.1));
+                if from < to {
+                    chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
+                }
+            }
+            for (&id, points) in &modes {
+                curve(&mut chart, id, points.iter().map(|point| (point.mu, value(point))).collect())?;
+            }
+            if let Some(at) = marked.filter(|at| (mu.0..=mu.1).contains(at)) {
+                chart
+                    .draw_series(LineSeries::new([(at, y.0), (at, y.1)], BLACK.stroke_width(2 * FINE)))
+                    .map_err(failed)?;
+            }
+        }
+        Ok(())
+    })
+}
+
+/// A session over time, in seconds after `from_s`: ranges of load, speed, friction, growth and margin, of the measured
+/// vibration where there is one, and the unstable frequencies; shaded where squeal was predicted. Circles are
+/// frequencies measured at or above `threshold_db`.
 ///
 /// # Errors
 /// [`PlotError`] where the drawing library refuses.
-pub fn history(title: &str, history: &History, from_s: f64) -> Result<String, PlotError> {
+pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -> Result<String, PlotError> {
     const LABELS: [&str; 5] = ["load, N", "speed, rad/s", "friction", "growth, 1/s", "margin"];
+    type Range = fn(&Bin) -> Option<(f32, f32)>;
+    const RANGES: [Range; 5] =
+        [|bin| bin.ranges[0], |bin| bin.ranges[1], |bin| bin.ranges[2], |bin| bin.ranges[3], |bin| bin.ranges[4]];
+    let mut panels: Vec<(&str, RGBColor, Range)> =
+        LABELS.into_iter().zip(RANGES).map(|(label, range)| (label, COLOURS[0], range)).collect();
+    panels[3].1 = COLOURS[1];
+    if history.bins().iter().any(|bin| bin.vibration.is_some()) {
+        panels.push(("measured, dB", COLOURS[6], |bin| bin.vibration.map(|heard| (heard.low_db, heard.high_db))));
+    }
     let bin_s = history.bin_ns() as f64 * 1e-9;
     let at = |index: i64| index as f64 * bin_s - from_s;
     let ends = history.bins().front().zip(history.bins().back());
     let time = ends.map_or((0.0, 1.0), |(first, last)| (at(first.index).min(0.0), at(last.index + 1)));
-    let mut svg = String::new();
-    {
-        let area = SVGBackend::with_string(&mut svg, (SIZE.0, 1150)).into_drawing_area();
-        area.fill(&WHITE).map_err(failed)?;
-        let area = if title.is_empty() { area } else { area.titled(title, ("sans-serif", 22)).map_err(failed)? };
-        let panels = area.split_evenly((LABELS.len() + 1, 1));
-        for (k, area) in panels.iter().enumerate() {
-            let label = LABELS.get(k).copied().unwrap_or("unstable, Hz");
-            let unstable =
-                || history.bins().iter().flat_map(|bin| bin.unstable.iter().map(move |mode| (bin.index, mode.0)));
-            let y = padded(match LABELS.get(k) {
-                Some(_) => {
-                    let ranges = history.bins().iter().filter_map(|bin| bin.ranges[k]);
-                    range(ranges.flat_map(|(low, high)| [f64::from(low), f64::from(high)]))
+    let squeals = stretches(history, |bin| (bin.level == Some(level::SQUEAL)).then_some(()));
+    let shades = |y: (f64, f64)| {
+        let shaded = move |stretch: &Vec<(i64, ())>| {
+            let (first, last) = (stretch.first()?.0, stretch.last()?.0);
+            Some(Rectangle::new([(at(first), y.0), (at(last + 1), y.1)], shade()))
+        };
+        squeals.iter().filter_map(shaded).collect::<Vec<_>>()
+    };
+    figure(title, (1000, 190 * (panels.len() as u32 + 1)), |area| {
+        let areas = area.split_evenly((panels.len() + 1, 1));
+        for (area, (label, colour, of)) in areas.iter().zip(&panels) {
+            let found = history.bins().iter().filter_map(of);
+            let y = padded(range(found.flat_map(|(low, high)| [f64::from(low), f64::from(high)])));
+            let mut chart = axes(area, time, y, "", label)?;
+            chart.draw_series(shades(y)).map_err(failed)?;
+            for stretch in stretches(history, of) {
+                let side = |of: fn((f32, f32)) -> f32| {
+                    let point =
+                        move |&(index, range): &(i64, (f32, f32))| (at(index) + 0.5 * bin_s, f64::from(of(range)));
+                    stretch.iter().map(point).collect::<Vec<_>>()
+                };
+                let (low, high) = (side(|range| range.0), side(|range| range.1));
+                let outline: Vec<_> = low.iter().chain(high.iter().rev()).copied().collect();
+                chart.draw_series([Polygon::new(outline, colour.mix(0.35))]).map_err(failed)?;
+                for edge in [low, high] {
+                    chart.draw_series(LineSeries::new(edge, colour.stroke_width(FINE))).map_err(failed)?;
                 }
-                None => range(unstable().map(|(_, hz)| f64::from(hz))),
-            });
-            let mut chart = axes(area, time, y, if k == LABELS.len() { "time, s" } else { "" }, label)?;
-            let bar = |index: i64, low: f64, high: f64, style: ShapeStyle| {
-                Rectangle::new([(at(index), low), (at(index + 1), high)], style)
-            };
-            let shade = RGBColor(213, 94, 0).mix(0.12).filled();
-            let squeals = stretches(history, |bin| (bin.level == level::SQUEAL).then_some(()));
-            let shades = squeals.iter().filter_map(|stretch| {
-                let (first, last) = (stretch.first()?.0, stretch.last()?.0);
-                Some(Rectangle::new([(at(first), y.0), (at(last + 1), y.1)], shade))
-            });
-            chart.draw_series(shades).map_err(failed)?;
-            let colour = COLOURS[if k == 3 { 1 } else { 0 }];
-            if k < LABELS.len() {
-                for stretch in stretches(history, |bin| bin.ranges[k]) {
-                    let side = |of: fn((f32, f32)) -> f32| {
-                        let point =
-                            move |&(index, range): &(i64, (f32, f32))| (at(index) + 0.5 * bin_s, f64::from(of(range)));
-                        stretch.iter().map(point).collect::<Vec<_>>()
-                    };
-                    let (low, high) = (side(|range| range.0), side(|range| range.1));
-                    let outline: Vec<_> = low.iter().chain(high.iter().rev()).copied().collect();
-                    chart.draw_series([Polygon::new(outline, colour.mix(0.35))]).map_err(failed)?;
-                    for edge in [low, high] {
-                        chart.draw_series(LineSeries::new(edge, colour.stroke_width(1))).map_err(failed)?;
-                    }
-                }
-            } else {
-                let half = 0.012 * (y.1 - y.0);
-                let bars = unstable()
-                    .map(|(index, hz)| bar(index, f64::from(hz) - half, f64::from(hz) + half, colour.filled()));
-                chart.draw_series(bars).map_err(failed)?;
             }
         }
+        let Some(area) = areas.last() else { return Ok(()) };
+        let unstable = || {
+            let modes = |bin: &Bin| {
+                let index = bin.index;
+                bin.unstable.into_iter().flatten().map(move |mode| (index, f64::from(mode.0)))
+            };
+            history.bins().iter().flat_map(modes).collect::<Vec<_>>()
+        };
+        let measured = || {
+            let loud = |bin: &Bin| {
+                let heard = bin.vibration.filter(|heard| f64::from(heard.high_db) >= threshold_db)?;
+                Some((at(bin.index) + 0.5 * bin_s, f64::from(heard.frequency_hz)))
+            };
+            history.bins().iter().filter_map(loud).collect::<Vec<_>>()
+        };
+        let y =
+            padded(range(unstable().into_iter().map(|mode| mode.1).chain(measured().into_iter().map(|heard| heard.1))));
+        let mut chart = axes(area, time, y, "time, s", "unstable, Hz")?;
+        chart.draw_series(shades(y)).map_err(failed)?;
+        let half = 0.012 * (y.1 - y.0);
+        let bars = unstable().into_iter().map(|(index, hz)| {
+            Rectangle::new([(at(index), hz - half), (at(index + 1), hz + half)], COLOURS[0].filled())
+        });
+        chart.draw_series(bars).map_err(failed)?;
+        let ring = |place| Circle::new(place, 3 * FINE, BLACK.stroke_width(FINE));
+        chart.draw_series(measured().into_iter().map(ring)).map_err(failed)?;
+        Ok(())
+    })
+}
+
+/// A figure of so many px.
+fn figure(
+    title: &str,
+    (width, height): (u32, u32),
+    draw: impl FnOnce(&Area<'_>) -> Result<(), PlotError>,
+) -> Result<String, PlotError> {
+    let mut svg = String::new();
+    {
+        let area = SVGBackend::with_string(&mut svg, (width * FINE, height * FINE)).into_drawing_area();
+        area.fill(&WHITE).map_err(failed)?;
+        let area = area.margin(8 * FINE, 0, 0, 0);
+        let area =
+            if title.is_empty() { area } else { area.titled(title, ("sans-serif", 22 * FINE)).map_err(failed)? };
+        draw(&area)?;
         area.present().map_err(failed)?;
     }
-    Ok(svg)
+    let fine = format!("width=\"{}\" height=\"{}\"", width * FINE, height * FINE);
+    Ok(svg.replacen(&fine, &format!("width=\"{width}\" height=\"{height}\""), 1))
+}
+
+/// Which line is which mode, above the axes: it covers no curve.
+fn legend(area: &Area<'_>, ids: &[u32]) -> Result<(), PlotError> {
+    let size = |px: i32| px * FINE as i32;
+    for (k, &id) in ids.iter().enumerate() {
+        let (x, y) = (size(84 + 99 * (k % LEGEND_COLUMNS) as i32), size(12 + 24 * (k / LEGEND_COLUMNS) as i32));
+        let ends = [(x, y), (x + size(28), y)];
+        match DASHES[id as usize / COLOURS.len() % DASHES.len()] {
+            None => area.draw(&PathElement::new(ends, style(id))).map_err(failed)?,
+            Some((on, off)) => {
+                let line = DashedPathElement::new(ends, on * FINE, off * FINE, style(id));
+                area.draw(&line).map_err(failed)?;
+            }
+        }
+        let place = Pos::new(HPos::Left, VPos::Center);
+        let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(place);
+        area.draw(&Text::new(format!("mode {id}"), (x + size(34), y), text)).map_err(failed)?;
+    }
+    Ok(())
+}
+
+/// The line of a mode.
+fn curve(chart: &mut Chart<'_>, id: u32, points: Vec<(f64, f64)>) -> Result<(), PlotError> {
+    match DASHES[id as usize / COLOURS.len() % DASHES.len()] {
+        None => drop(chart.draw_series(LineSeries::new(points, style(id))).map_err(failed)?),
+        Some((on, off)) => {
+            let line = DashedLineSeries::new(points, on * FINE, off * FINE, style(id));
+            chart.draw_series(line).map_err(failed)?;
+        }
+    }
+    Ok(())
+}
+
+fn style(id: u32) -> ShapeStyle {
+    COLOURS[id as usize % COLOURS.len()].stroke_width(2 * FINE)
+}
+
+/// Behind what is unstable.
+fn shade() -> ShapeStyle {
+    RGBColor(213, 94, 0).mix(0.12).filled()
 }
 
 /// Bins without a gap between them that all have something, with it.
@@ -187,6 +272,7 @@ fn stretches<T>(history: &History, of: impl Fn(&Bin) -> Option<T>) -> Vec<Vec<(i
     stretches
 }
 
+type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Chart<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 /// Axes with units, the same for every figure.
@@ -198,67 +284,26 @@ fn axes<'a>(
     y_label: &str,
 ) -> Result<Chart<'a>, PlotError> {
     let mut chart = ChartBuilder::on(area)
-        .margin(if x_label.is_empty() { 6 } else { 14 })
-        .margin_right(30)
-        .x_label_area_size(if x_label.is_empty() { 24 } else { 44 })
-        .y_label_area_size(84)
+        .margin(FINE * if x_label.is_empty() { 6 } else { 10 })
+        .margin_right(30 * FINE)
+        .x_label_area_size(FINE * if x_label.is_empty() { 24 } else { 44 })
+        .y_label_area_size(84 * FINE)
         .build_cartesian_2d(x.0..x.1, y.0..y.1)
         .map_err(failed)?;
-    chart
-        .configure_mesh()
-        .light_line_style(TRANSPARENT)
-        .bold_line_style(RGBColor(225, 225, 225))
-        .x_desc(x_label)
-        .y_desc(y_label)
-        .y_labels(5)
-        .label_style(("sans-serif", 15))
-        .axis_desc_style(("sans-serif", 17))
-        .draw()
-        .map_err(failed)?;
-    Ok(chart)
-}
-
-type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-
-fn panel(
-    area: &Area<'_>,
-    points: &[Point],
-    windows: &[Window],
-    label: &str,
-    value: impl Fn(&Point) -> f64,
-) -> Result<(), PlotError> {
-    let (mu, y) = (range(points.iter().map(|p| p.mu)), padded(range(points.iter().map(&value))));
-    let mut chart = ChartBuilder::on(area)
-        .margin(14 * FINE)
-        .x_label_area_size(44 * FINE)
-        .y_label_area_size(84 * FINE)
-        .build_cartesian_2d(mu.0..mu.1, y.0..y.1)
-        .map_err(failed)?;
-    for window in windows.iter().filter(|window| window.mu_from < mu.1 && window.mu_to.is_none_or(|to| to > mu.0)) {
-        let corners = [(window.mu_from.max(mu.0), y.0), (window.mu_to.unwrap_or(mu.1).min(mu.1), y.1)];
-        chart.draw_series([Rectangle::new(corners, RGBColor(213, 94, 0).mix(0.08).filled())]).map_err(failed)?;
-    }
     chart
         .configure_mesh()
         .axis_style(BLACK.stroke_width(FINE))
         .set_all_tick_mark_size(5 * FINE)
         .light_line_style(TRANSPARENT)
         .bold_line_style(RGBColor(225, 225, 225).stroke_width(FINE))
-        .x_desc("friction coefficient")
-        .y_desc(label)
+        .x_desc(x_label)
+        .y_desc(y_label)
+        .y_labels(5)
         .label_style(("sans-serif", 15 * FINE))
         .axis_desc_style(("sans-serif", 17 * FINE))
         .draw()
         .map_err(failed)?;
-    let mut curves: BTreeMap<u32, Vec<(f64, f64)>> = BTreeMap::new();
-    for point in points {
-        curves.entry(point.id).or_default().push((point.mu, value(point)));
-    }
-    for (id, curve) in curves {
-        let colour = COLOURS[id as usize % COLOURS.len()];
-        chart.draw_series(LineSeries::new(curve, colour.stroke_width(2 * FINE))).map_err(failed)?;
-    }
-    Ok(())
+    Ok(chart)
 }
 
 /// Smallest and largest of `values`; something to draw on where there is nothing.

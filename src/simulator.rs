@@ -1,4 +1,5 @@
-//! The rig simulator: load, speed and friction coefficient over time, with noise from a seed.
+//! The rig simulator: load, speed and friction coefficient over time, and the vibration that comes of it, with noise from
+//! a seed.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -143,41 +144,83 @@ impl Profile {
     }
 }
 
+/// When the simulated rig squeals: a tone while the friction coefficient, without noise, is above a limit.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Tone {
+    pub above_mu: f64,
+    pub frequency_hz: f64,
+}
+
+/// What is measured of the vibration.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Peak {
+    pub frequency_hz: f64,
+    pub level_db: f64,
+}
+
+/// Level of a tone, and of the rest, dB.
+const TONE_DB: f64 = 95.0;
+const BACKGROUND_DB: f64 = 50.0;
+/// Standard deviation of both.
+const LEVEL_NOISE_DB: f64 = 2.0;
+
 /// A simulated rig: the same seed gives the same measurements.
 #[derive(Clone, Debug)]
 pub struct Simulator {
     profile: Profile,
     noise: ChaCha8Rng,
+    /// Its own, so that the conditions are the same whether the vibration is measured or not.
+    vibration_noise: ChaCha8Rng,
 }
 
 impl Simulator {
     /// A rig that follows `profile` again and again.
     pub fn new(profile: Profile, seed: u64) -> Self {
-        Self { profile, noise: ChaCha8Rng::seed_from_u64(seed) }
+        let noise = ChaCha8Rng::seed_from_u64(seed);
+        let mut vibration_noise = noise.clone();
+        vibration_noise.set_stream(1);
+        Self { profile, noise, vibration_noise }
+    }
+
+    /// The conditions at a time since the start, without noise.
+    fn truth(&self, time_s: f64) -> OperatingPoint {
+        let period = self.profile.duration_s();
+        let phase = if period > 0.0 { time_s.rem_euclid(period) } else { 0.0 };
+        let nothing = OperatingPoint { normal_load_n: 0.0, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
+        self.profile.at(phase).unwrap_or(nothing)
+    }
+
+    /// The highest peak of the vibration's spectrum at a time since the start: the tone, within 0.2 % of its frequency,
+    /// or somewhere in the noise up to twice that.
+    pub fn measure_vibration(&mut self, tone: Tone, time_s: f64) -> Peak {
+        let sounds = self.truth(time_s).friction_coefficient > tone.above_mu;
+        let place: f64 = self.vibration_noise.random();
+        let level_noise_db = LEVEL_NOISE_DB * normal(&mut self.vibration_noise);
+        if sounds {
+            let frequency_hz = tone.frequency_hz * (1.0 + 0.004 * (place - 0.5));
+            Peak { frequency_hz, level_db: TONE_DB + level_noise_db }
+        } else {
+            Peak { frequency_hz: 2.0 * tone.frequency_hz * place, level_db: BACKGROUND_DB + level_noise_db }
+        }
     }
 
     /// What is measured at a time since the start; the next call draws the next noise.
     pub fn measure(&mut self, time_s: f64) -> OperatingPoint {
-        let period = self.profile.duration_s();
-        let phase = if period > 0.0 { time_s.rem_euclid(period) } else { 0.0 };
+        let point = self.truth(time_s);
         let Noise { normal_load_n, disc_speed_rad_s, friction_coefficient } = self.profile.noise;
-        let point = self.profile.at(phase).unwrap_or(OperatingPoint {
-            normal_load_n: 0.0,
-            disc_speed_rad_s: 0.0,
-            friction_coefficient: 0.0,
-        });
         OperatingPoint {
-            normal_load_n: (point.normal_load_n + normal_load_n * self.normal()).max(0.0),
-            disc_speed_rad_s: point.disc_speed_rad_s + disc_speed_rad_s * self.normal(),
-            friction_coefficient: (point.friction_coefficient + friction_coefficient * self.normal()).max(0.0),
+            normal_load_n: (point.normal_load_n + normal_load_n * normal(&mut self.noise)).max(0.0),
+            disc_speed_rad_s: point.disc_speed_rad_s + disc_speed_rad_s * normal(&mut self.noise),
+            friction_coefficient: (point.friction_coefficient + friction_coefficient * normal(&mut self.noise))
+                .max(0.0),
         }
     }
+}
 
-    /// A standard normal number (Box and Muller, 1958).
-    fn normal(&mut self) -> f64 {
-        let (u, v): (f64, f64) = (self.noise.random(), self.noise.random());
-        (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
-    }
+/// A standard normal number (Box and Muller, 1958).
+fn normal(noise: &mut ChaCha8Rng) -> f64 {
+    let (u, v): (f64, f64) = (noise.random(), noise.random());
+    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 #[cfg(test)]
@@ -199,6 +242,23 @@ mod tests {
         assert_ne!(run(7), run(8));
         let mean = run(7).iter().sum::<f64>() / 100.0;
         assert!((mean - 500.0).abs() < 1.0, "2 N of noise, a hundred times: {mean}");
+    }
+
+    #[test]
+    fn it_sounds_above_the_limit_and_the_conditions_do_not_depend_on_whether_that_is_measured() {
+        let tone = Tone { above_mu: 0.5, frequency_hz: 1500.0 };
+        let (mut heard, mut unheard) = (Simulator::new(Profile::paper(), 3), Simulator::new(Profile::paper(), 3));
+        for k in 0..3000 {
+            let time_s = 0.01 * f64::from(k);
+            let peak = heard.measure_vibration(tone, time_s);
+            // The ramp from 0 at 14 s to 1 at 24 s, and back from 27 s to 0.3 at 30 s.
+            let sounds = (19.0..27.0 + 3.0 * 0.5 / 0.7).contains(&time_s);
+            if (time_s - 19.0).abs() > 1e-6 {
+                assert_eq!(peak.level_db > 70.0, sounds, "{peak:?} at {time_s} s");
+            }
+            assert!(!sounds || (peak.frequency_hz / 1500.0 - 1.0).abs() <= 0.002, "{peak:?}");
+            assert_eq!(heard.measure(time_s), unheard.measure(time_s));
+        }
     }
 
     #[test]

@@ -23,6 +23,9 @@ fn alone() -> MutexGuard<'static, ()> {
     BUSY.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// Longer than anything takes on any machine, however busy.
+const PATIENCE: Duration = Duration::from_secs(120);
+
 /// A running command with a display.
 struct Shown {
     child: Child,
@@ -50,14 +53,14 @@ impl Shown {
     }
 
     fn demo(more: &[&str]) -> Self {
-        Self::start(&[&["demo", "--plain", "--no-shm", "--no-ros", "--duration", "300"], more].concat())
+        Self::start(&[&["demo", "--plain", "--no-shm", "--no-ros", "--duration", "1800"], more].concat())
     }
 
     fn stop(mut self) {
         interrupt(&self.child);
         let asked = Instant::now();
         while self.child.try_wait().unwrap().is_none() {
-            assert!(asked.elapsed() < Duration::from_secs(5), "it does not end");
+            assert!(asked.elapsed() < PATIENCE, "it does not end");
             std::thread::sleep(Duration::from_millis(20));
         }
     }
@@ -80,7 +83,7 @@ impl Shown {
     /// A page that listens: the lines of its stream.
     fn listen(&self) -> TcpStream {
         let mut stream = TcpStream::connect(self.address).unwrap();
-        stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+        stream.set_read_timeout(Some(PATIENCE)).unwrap();
         write!(stream, "GET /stream HTTP/1.1\r\nHost: {}\r\n\r\n", self.address).unwrap();
         stream
     }
@@ -130,19 +133,24 @@ fn a_state_comes_at_most_thirty_times_a_second_whatever_the_input_rate() {
     let shown = Shown::demo(&["--rate", "2000"]);
     let mut lines = BufReader::new(shown.listen()).lines();
     let mut states = lines.by_ref().map_while(Result::ok).filter(|line| line.starts_with("data: "));
-    let first = states.next().unwrap();
-    let began = Instant::now();
+    let mut state = || serde_json::from_str::<serde_json::Value>(&states.next().unwrap()[6..]).unwrap();
+    let time_s = |state: &serde_json::Value| state["time_s"].as_f64().unwrap();
+    let first = state();
+    let mut last = first.clone();
     let mut count = 0;
-    let mut last: serde_json::Value = serde_json::from_str(&first[6..]).unwrap();
-    while began.elapsed() < Duration::from_secs(3) {
-        let next: serde_json::Value = serde_json::from_str(&states.next().unwrap()[6..]).unwrap();
+    while time_s(&last) - time_s(&first) < 3.0 {
+        let next = state();
         assert!(next["seq"].as_u64() >= last["seq"].as_u64());
         last = next;
         count += 1;
     }
-    let rate = f64::from(count) / began.elapsed().as_secs_f64();
-    assert!((10.0..31.0).contains(&rate), "{rate} states a second");
-    assert!(last["rate_hz"].as_f64().unwrap() > 1000.0, "{last}");
+    // By the node's own clock, and for as long as another program may have held a single state up.
+    let span_s = time_s(&last) - time_s(&first);
+    assert!(f64::from(count) <= 30.0 * (span_s + 1.0), "{count} states in {span_s} s");
+    if measuring() {
+        assert!((25.0..30.5).contains(&(f64::from(count) / span_s)), "{count} states in {span_s} s");
+        assert!(last["rate_hz"].as_f64().unwrap() > 1900.0, "{last}");
+    }
     shown.stop();
 }
 
@@ -151,7 +159,7 @@ fn a_port_that_is_taken_is_said_and_the_node_goes_on() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap().to_string();
     let output = Command::new(env!("CARGO_BIN_EXE_squealcast"))
-        .args(["demo", "--plain", "--no-shm", "--no-ros", "--duration", "0.5", "--display", &address])
+        .args(["demo", "--plain", "--no-shm", "--no-ros", "--duration", "1", "--display", &address])
         .output()
         .unwrap();
     let told = String::from_utf8_lossy(&output.stderr);
@@ -293,7 +301,10 @@ fn the_page_shows_a_demo_as_it_is() {
     };
     assert!(moments.iter().any(|moment| squealed(&moment)) && !moments.iter().all(|moment| squealed(&moment)));
     println!("first paint {} ms, page work {} of a core", seen["first_paint_ms"], seen["work"]);
-    eprintln!("the page takes {} of a core", seen["work"]);
+    if measuring() {
+        assert!(seen["first_paint_ms"].as_f64().unwrap() < 1000.0, "first paint after {} ms", seen["first_paint_ms"]);
+        assert!(seen["work"].as_f64().unwrap() < 0.2, "the page takes {} of a core", seen["work"]);
+    }
     assert!(seen["csv"].as_str().unwrap().contains(",SQUEAL,"));
 }
 
@@ -351,11 +362,14 @@ fn a_travelling_wave_travels_the_right_way() {
 
 /// Tests that time something are for a quiet machine: with `SQUEALCAST_MEASURE=1`.
 fn measures() -> bool {
-    let asked = std::env::var_os("SQUEALCAST_MEASURE").is_some();
-    if !asked {
+    if !measuring() {
         eprintln!("skipped: it measures times; SQUEALCAST_MEASURE=1 runs it");
     }
-    asked
+    measuring()
+}
+
+fn measuring() -> bool {
+    std::env::var_os("SQUEALCAST_MEASURE").is_some()
 }
 
 /// Ten minutes at 1 kHz.
@@ -408,6 +422,94 @@ fn a_long_recording_opens_at_once_and_is_reported() {
     assert!(html.len() < 5_000_000, "{} bytes", html.len());
     let csv = std::fs::read_to_string(out.join("events.csv")).unwrap();
     assert_eq!(csv.lines().count(), 61);
+}
+
+/// Plateaus of the friction coefficient, 0.1 apart per second between them, no noise: of 0.33, 0.40 and 0.60 at 500 N and
+/// 13 rad/s, each 4 s long and from 0.30 and back, of which `nine-dof-case-2` is unstable in the last two (its critical
+/// value is 0.3559).
+fn plateaus(directory: &Path) -> PathBuf {
+    let mut text = String::new();
+    let mut time_s = 0.0;
+    let mut corner = |after_s: f64, mu: f64| {
+        time_s += after_s;
+        text += &format!(
+            "[[point]]\ntime_s = {time_s:.3}\nnormal_load_n = 500\ndisc_speed_rad_s = 13\nfriction_coefficient = {mu}\n"
+        );
+    };
+    corner(0.0, 0.30);
+    for mu in [0.33, 0.40, 0.60] {
+        corner(4.0, 0.30);
+        corner((mu - 0.30) / 0.1, mu);
+        corner(4.0, mu);
+        corner((mu - 0.30) / 0.1, 0.30);
+    }
+    corner(4.0, 0.30);
+    let path = directory.join("plateaus.toml");
+    std::fs::write(&path, text).unwrap();
+    path
+}
+
+/// The answer is known by construction: the rig squeals above a friction coefficient of our choice.
+#[test]
+fn a_report_tells_hits_misses_and_false_alarms() {
+    let run = |arguments: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_squealcast")).args(arguments).output().unwrap();
+        assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let critical: serde_json::Value = serde_json::from_str(&run(&["critical", "nine-dof-case-2", "--json"])).unwrap();
+    let (mu, hz) =
+        (critical["critical_friction"].as_f64().unwrap(), critical["windows"][0]["frequency_hz"].as_f64().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let profile = plateaus(folder.path());
+    // Above what the rig squeals, at what part of the predicted frequency; hits, misses and false alarms then, and after
+    // how many seconds from the predicted onset: friction rises by 0.1 a second.
+    let cases: [(f64, f64, [usize; 3], Option<f64>); 4] = [
+        (0.45, 1.0, [1, 0, 1], Some((0.45 - mu) / 0.1)),
+        (0.32, 1.0, [2, 1, 0], Some((0.32 - mu) / 0.1)),
+        (0.45, 1.5, [0, 1, 2], None),
+        (0.90, 1.0, [0, 0, 2], None),
+    ];
+    for (case, (above, share, expected, lead_s)) in cases.into_iter().enumerate() {
+        let directory = folder.path().join(case.to_string());
+        let vibration = format!("{above}:{}", share * hz);
+        let recorded = ["--profile", profile.to_str().unwrap(), "--vibration", &vibration];
+        run(&[&["simulate", "--rig", "nine-dof-case-2", "--record", directory.to_str().unwrap()], &recorded[..]]
+            .concat());
+        let session = std::fs::read_dir(&directory).unwrap().next().unwrap().unwrap().path();
+        let session = session.to_str().unwrap();
+        let out = directory.join("report");
+        run(&["report", session, "-o", out.to_str().unwrap()]);
+        let html = std::fs::read_to_string(out.join("report.html")).unwrap();
+        let row = |name: &str| {
+            let (_, rest) = html.split_once(&format!("<th scope=\"row\">{name}</th><td>")).unwrap();
+            rest.split_once("</td>").unwrap().0.to_owned()
+        };
+        let counts =
+            ["hits", "misses", "false alarms"].map(|name| row(name).split_once(':').unwrap().0.parse().unwrap());
+        assert_eq!(counts, expected, "squeals above {above}, {share} of {hz} Hz");
+        assert!(html.contains("of at least 70 dB") && html.contains("widened by 0.5 s") && html.contains("within 5 %"));
+        if let Some(expected_s) = lead_s {
+            // Measured every 0.05 s and predicted every 0.01 s; the prediction waits for a damping ratio of -0.001, which
+            // a friction coefficient 1e-4 above the critical one has passed.
+            let found_s: f64 = row("lead").split_once(' ').unwrap().0.parse().unwrap();
+            assert!((found_s - expected_s).abs() < 0.07, "lead {found_s} s, by construction {expected_s} s");
+        }
+        // With a threshold above the tone nothing was heard.
+        run(&["report", session, "-o", out.to_str().unwrap(), "--vibration-threshold", "120"]);
+        let html = std::fs::read_to_string(out.join("report.html")).unwrap();
+        assert!(
+            html.contains("<td>0: measured squeals that were predicted") && html.contains("<td>2: predicted squeals")
+        );
+        // It is no input of the prediction.
+        assert!(run(&["replay", session, "--verify"]).contains(" 0 different, 0 missing, 0 extra"));
+    }
+    let silent = folder.path().join("silent");
+    run(&["simulate", "--rig", "nine-dof-case-2", "--duration", "1", "--record", silent.to_str().unwrap()]);
+    let session = std::fs::read_dir(&silent).unwrap().next().unwrap().unwrap().path();
+    run(&["report", session.to_str().unwrap(), "-o", silent.to_str().unwrap()]);
+    let html = std::fs::read_to_string(silent.join("report.html")).unwrap();
+    assert!(html.contains("holds no measured vibration"));
 }
 
 /// Nobody, one, twenty pages of which one never reads, and nobody again, in one run.
@@ -506,7 +608,10 @@ fn the_foxglove_layout_names_what_there_is() {
     assert!(paths.len() > 8);
     for path in paths {
         let (topic, field) = path.split_once('.').unwrap();
-        let topic = [Topic::OperatingPoint, Topic::Prediction].into_iter().find(|known| known.name() == topic).unwrap();
+        let topic = [Topic::OperatingPoint, Topic::Prediction, Topic::Vibration]
+            .into_iter()
+            .find(|known| known.name() == topic)
+            .unwrap();
         let declared = |line: &str| line.split_whitespace().nth(1) == Some(field);
         assert!(topic.definition().lines().any(declared), "{path}");
     }

@@ -1,8 +1,12 @@
+use std::path::PathBuf;
+
 use clap::Args;
 use serde::Serialize;
 
-use super::{LoadAndSpeed, Outcome, format, not_negative, print};
+use super::{LoadAndSpeed, Outcome, format, not_negative, print, write_file};
+use crate::display::curves::Curves;
 use crate::physics::{MapOptions, Solver, StabilityMap, Window};
+use crate::plot;
 use crate::rig::Rig;
 use crate::session::map_options;
 
@@ -16,6 +20,9 @@ pub struct Options {
     mu_max: Option<f64>,
     #[command(flatten)]
     load_and_speed: LoadAndSpeed,
+    /// Draw growth rates and frequencies over the friction coefficient into this file, windows shaded
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -60,6 +67,11 @@ impl Options {
         let options = MapOptions { mu_max, ..map_options(&rig) };
         let mut solver = Solver::new(rig.model.dimension());
         let map = StabilityMap::build(&rig.model, &mut solver, &point, &options)?;
+        if let Some(path) = &self.svg {
+            let title = format!("{}, {} N, {} rad/s", rig.name, point.normal_load_n, point.disc_speed_rad_s);
+            let curves = Curves::new(&map, rig.band_max_hz);
+            write_file(path, plot::map(&title, &curves, mu_max, map.critical_friction())?.as_bytes())?;
+        }
         if self.json {
             let report = Report {
                 critical_friction: map.critical_friction(),

@@ -5,7 +5,7 @@ use clap::Args;
 
 use super::buses::BusOptions;
 use super::run::{Listening, NodeOptions, serve};
-use super::simulate::{period, rate_hz};
+use super::simulate::{Measuring, VibrationOption, period, rate_hz};
 use super::{Outcome, not_negative};
 use crate::io::clock;
 use crate::io::heard::{Bus, Heard};
@@ -13,7 +13,6 @@ use crate::io::ros_args::RosArgs;
 use crate::node::{self, Incoming};
 use crate::rig::Rig;
 use crate::simulator::{Profile, Simulator};
-use crate::wire::{Header, OperatingPoint, Time};
 
 /// Run the node with a simulated rig: what to try first. It hears nobody else, and announces itself on this machine only
 #[derive(Debug, Args)]
@@ -31,6 +30,8 @@ pub struct Options {
     #[arg(long, value_name = "S", value_parser = not_negative)]
     duration: Option<f64>,
     #[command(flatten)]
+    vibration: VibrationOption,
+    #[command(flatten)]
     buses: BusOptions,
     #[command(flatten)]
     shown: NodeOptions,
@@ -41,36 +42,28 @@ impl Options {
         let rig = Arc::new(Rig::load(&self.rig)?);
         let (sender, receiver) = node::channel();
         let period = period(self.rate);
-        let mut simulator = Simulator::new(Profile::paper(), self.seed);
+        let mut measuring = Measuring::new(Simulator::new(Profile::paper(), self.seed), self.vibration, period);
         let (measurements, duration) = (sender.clone(), self.duration);
         std::thread::spawn(move || {
             let started = Instant::now();
             for seq in 0u32.. {
-                let time_s = period.as_secs_f64() * f64::from(seq);
+                let time_s = measuring.time_s(seq);
                 if duration.is_some_and(|duration| time_s >= duration) {
                     let _ = measurements.send(Incoming::Stop);
                     return;
                 }
                 let due = started + Duration::from_secs_f64(time_s);
                 std::thread::sleep(due.saturating_duration_since(Instant::now()));
-                let message = measurement(&mut simulator, time_s, u64::from(seq), clock::now_ns());
-                if measurements.send(Incoming::Input(Heard::now(Bus::Simulator, message))).is_err() {
-                    return;
+                let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
+                let conditions = Incoming::Input(Heard::now(Bus::Simulator, conditions));
+                let vibration = vibration.map(|heard| Incoming::Vibration(Heard::now(Bus::Simulator, heard)));
+                for heard in std::iter::once(conditions).chain(vibration) {
+                    if measurements.send(heard).is_err() {
+                        return;
+                    }
                 }
             }
         });
         serve(&rig, &self.buses.for_demo(), &self.shown, ros_args, Listening::ToNobody, (sender, receiver))
-    }
-}
-
-/// What the simulated rig measures, as a message.
-pub fn measurement(simulator: &mut Simulator, time_s: f64, seq: u64, stamp_ns: i64) -> OperatingPoint {
-    let point = simulator.measure(time_s);
-    OperatingPoint {
-        header: Header { stamp: Time::from_ns(stamp_ns), frame_id: "simulated".to_owned() },
-        seq,
-        normal_load_n: point.normal_load_n,
-        disc_speed_rad_s: point.disc_speed_rad_s,
-        friction_coefficient: point.friction_coefficient,
     }
 }

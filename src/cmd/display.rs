@@ -3,6 +3,8 @@ use std::sync::Arc;
 
 use clap::Args;
 
+use super::{finite, not_negative};
+use crate::display::comparison::Criteria;
 use crate::display::live::Live;
 use crate::display::server::{Server, Source};
 use crate::node::Watch;
@@ -25,6 +27,50 @@ pub struct DisplayOptions {
     /// Let --display name an address that other machines can reach; anybody there can look
     #[arg(long, requires = "display")]
     display_anywhere: bool,
+}
+
+/// From which level on a measured vibration counts as squeal.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct ThresholdOption {
+    /// A vibration measured at this level or above is squeal [default: 70]
+    #[arg(long, value_name = "DB", value_parser = finite, allow_negative_numbers = true)]
+    vibration_threshold: Option<f64>,
+}
+
+impl ThresholdOption {
+    /// The threshold, dB.
+    pub fn db(&self) -> f64 {
+        self.vibration_threshold.unwrap_or(Criteria::default().threshold_db)
+    }
+}
+
+/// What counts as a hit, a miss, and a false alarm.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct CriteriaOptions {
+    #[command(flatten)]
+    threshold: ThresholdOption,
+    /// A measured squeal lasts at least this many seconds [default: 0.1]
+    #[arg(long, value_name = "S", value_parser = not_negative)]
+    vibration_duration: Option<f64>,
+    /// A prediction counts this many seconds before its onset and after its end [default: 0.5]
+    #[arg(long, value_name = "S", value_parser = not_negative)]
+    time_tolerance: Option<f64>,
+    /// A measured frequency is a predicted one within this share of it [default: 0.05]
+    #[arg(long, value_name = "SHARE", value_parser = not_negative)]
+    frequency_tolerance: Option<f64>,
+}
+
+impl CriteriaOptions {
+    /// What was asked for, else what is usual.
+    pub fn criteria(&self) -> Criteria {
+        let usual = Criteria::default();
+        Criteria {
+            threshold_db: self.threshold.db(),
+            least_duration_s: self.vibration_duration.unwrap_or(usual.least_duration_s),
+            time_tolerance_s: self.time_tolerance.unwrap_or(usual.time_tolerance_s),
+            frequency_tolerance: self.frequency_tolerance.unwrap_or(usual.frequency_tolerance),
+        }
+    }
 }
 
 impl DisplayOptions {
@@ -60,9 +106,9 @@ pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> Option<Server
 }
 
 /// The page of a node.
-pub fn of_node(addresses: &[SocketAddr], rig: &Arc<Rig>, watch: &Watch) -> Option<Server> {
+pub fn of_node(addresses: &[SocketAddr], rig: &Arc<Rig>, watch: &Watch, threshold: ThresholdOption) -> Option<Server> {
     if addresses.is_empty() {
         return None;
     }
-    serve(addresses, Arc::new(Live::new(rig.clone(), watch.clone())))
+    serve(addresses, Arc::new(Live::new(rig.clone(), watch.clone(), threshold.db())))
 }

@@ -1,4 +1,4 @@
-//! What `run` and `demo` show: a live table on a terminal, log lines when piped.
+//! What `run`, `demo` and `replay` show: a live table on a terminal, log lines when piped.
 
 use std::io::IsTerminal;
 use std::sync::Arc;
@@ -6,8 +6,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use crossbeam_channel::Sender;
-use ratatui::Frame;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyModifiers};
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Color, Modifier, Style, Stylize};
@@ -15,14 +13,24 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
 use super::format::significant;
-use crate::node::{Incoming, Snapshot, Watch};
-use crate::rig::Rig;
+use crate::node::{Snapshot, Watch};
 use crate::wire::{Prediction, level};
 
 /// Time between two looks.
 const EVERY: Duration = Duration::from_millis(100);
 /// Time between log lines while the level stays.
 const LOG_EVERY: Duration = Duration::from_secs(5);
+
+/// What of the view is not in its [`Watch`].
+pub struct Frame {
+    pub title: String,
+    /// A mode whose damping ratio is below the negative of this grows.
+    pub instability_threshold: f64,
+    /// The last line.
+    pub foot: Box<dyn Fn(&Snapshot) -> String + Send>,
+    /// A key asks for the end.
+    pub quit: Box<dyn Fn() + Send>,
+}
 
 /// A view that runs beside the node.
 pub struct Shown {
@@ -42,20 +50,20 @@ impl Shown {
     }
 }
 
-/// Shows what `watch` sees until stopped; the keys q, Esc and Ctrl-C stop the node. Where the terminal refuses, log lines.
-pub fn show(rig: &Arc<Rig>, watch: Watch, plain: bool, node: Sender<Incoming>) -> Shown {
+/// Shows what `watch` sees until stopped; the keys q, Esc and Ctrl-C quit. Where the terminal refuses, log lines.
+pub fn show(around: Frame, watch: Watch, plain: bool) -> Shown {
     let stop = Arc::new(AtomicBool::new(false));
-    let (stopped, rig) = (stop.clone(), rig.clone());
+    let stopped = stop.clone();
     let terminal = if plain || !std::io::stdout().is_terminal() { None } else { ratatui::try_init().ok() };
     let thread = std::thread::spawn(move || {
         let Some(mut terminal) = terminal else { return log(&watch, &stopped) };
         while !stopped.load(Ordering::Relaxed) {
             let snapshot = watch.snapshot();
-            let drawn = terminal.draw(|frame| draw(frame, &rig, &snapshot)).is_ok();
+            let drawn = terminal.draw(|frame| draw(frame, &around, &snapshot)).is_ok();
             match asked_to_stop() {
                 Ok(false) if drawn => {}
                 Ok(true) => {
-                    let _ = node.send(Incoming::Stop);
+                    (around.quit)();
                     break;
                 }
                 // The terminal is gone or no terminal: the node is not.
@@ -83,8 +91,12 @@ fn asked_to_stop() -> std::io::Result<bool> {
 /// A line whenever the level changes, and now and then.
 fn log(watch: &Watch, stopped: &AtomicBool) {
     let mut last: Option<(u8, Instant)> = None;
-    while !stopped.load(Ordering::Relaxed) {
-        std::thread::sleep(EVERY);
+    let mut stopping = false;
+    // A last look after the end: a short session says something too.
+    while !std::mem::replace(&mut stopping, stopped.load(Ordering::Relaxed)) {
+        if !stopping {
+            std::thread::sleep(EVERY);
+        }
         let Some(prediction) = watch.snapshot().prediction else { continue };
         let due = last.is_none_or(|(level, at)| level != prediction.level || at.elapsed() >= LOG_EVERY);
         if due {
@@ -121,17 +133,13 @@ fn colour(level: u8) -> Color {
     }
 }
 
-fn draw(frame: &mut Frame<'_>, rig: &Rig, snapshot: &Snapshot) {
+fn draw(frame: &mut ratatui::Frame<'_>, around: &Frame, snapshot: &Snapshot) {
     let [head, body, foot] =
         Layout::vertical([Constraint::Length(6), Constraint::Min(4), Constraint::Length(1)]).areas(frame.area());
-    let title = format!(" squealcast: {} ", rig.name);
+    let title = format!(" squealcast: {} ", around.title);
     frame.render_widget(Paragraph::new(head_lines(snapshot)).block(Block::bordered().title(title)), head);
-    frame.render_widget(table(rig, snapshot.prediction.as_ref()), body);
-    let counters = snapshot.counters;
-    let foot_line = format!(
-        " q quits   solved {}  from the chart {}  reused {}  faults {}  passed over {}",
-        counters.solved, counters.charted, counters.reused, counters.faults, snapshot.passed_over
-    );
+    frame.render_widget(table(around.instability_threshold, snapshot.prediction.as_ref()), body);
+    let foot_line = format!(" q quits   {}", (around.foot)(snapshot));
     frame.render_widget(Paragraph::new(foot_line).dim(), foot);
 }
 
@@ -157,10 +165,10 @@ fn head_lines(snapshot: &Snapshot) -> Vec<Line<'static>> {
     vec![first, Line::from(conditions), Line::from(margin)]
 }
 
-fn table(rig: &Rig, prediction: Option<&Prediction>) -> Table<'static> {
+fn table(instability_threshold: f64, prediction: Option<&Prediction>) -> Table<'static> {
     let modes = prediction.map_or(&[][..], |prediction| &prediction.modes);
     let rows = modes.iter().map(|mode| {
-        let grows = mode.damping_ratio < -rig.instability_threshold;
+        let grows = mode.damping_ratio < -instability_threshold;
         let row = Row::new([
             format!("{:>4}", mode.id),
             format!("{:>12}", significant(mode.frequency_hz, 7)),

@@ -1,19 +1,20 @@
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
 
 use super::buses::BusOptions;
-use super::{Outcome, not_negative, positive, print, signals};
+use super::{Outcome, live, not_negative, positive, print, signals};
 use crate::io::message::Payload;
 use crate::io::pace::{Due, Pacer, Pacing};
 use crate::io::recording::{Recorded, Recording};
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
-use crate::io::shm::{ShmOptions, ShmOutput, ShmSource};
+use crate::io::shm::{ShmOptions, ShmOutput, ShmSource, ShmVibrationSource};
+use crate::node::Watch;
 use crate::rig::{Rig, RigFile};
 use crate::verify::{Verification, verify};
 use crate::wire::topic;
@@ -44,12 +45,15 @@ pub struct Options {
     /// Topics to play [default: all of the node's]
     #[arg(long, value_name = "TOPIC", num_args = 1.., value_parser = KNOWN_TOPICS)]
     topics: Vec<String>,
+    /// Print log lines instead of a live table, on a terminal too
+    #[arg(long)]
+    plain: bool,
     #[command(flatten)]
     buses: BusOptions,
 }
 
-const KNOWN_TOPICS: [&str; 5] =
-    [topic::OPERATING_POINT, topic::PREDICTION, topic::RIG, topic::SESSION_EVENT, topic::DIAGNOSTICS];
+const KNOWN_TOPICS: [&str; 6] =
+    [topic::OPERATING_POINT, topic::PREDICTION, topic::RIG, topic::SESSION_EVENT, topic::DIAGNOSTICS, topic::VIBRATION];
 
 impl Options {
     pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
@@ -73,26 +77,59 @@ impl Options {
     }
 
     fn play(&self, recording: &Recording, ros_args: RosArgs) -> anyhow::Result<Outcome> {
-        let mut player = Player::join(self.buses.shm(), self.buses.ros2(ros_args)?)?;
+        let player = Player::join(self.buses.shm(), self.buses.ros2(ros_args)?)?;
+        let first = recording.messages().next().context("the recording is empty")?;
         let stopped = Arc::new(AtomicBool::new(false));
         let stop = stopped.clone();
         signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;
+        let watch = Watch::default();
+        let played = Arc::new(AtomicU64::new(0));
+        let shown = live::show(self.frame(recording, &played, &stopped), watch.clone(), self.plain);
+        let done = self.play_rounds(recording, first.log_time_ns, &player, &watch, &played, &stopped);
+        shown.stop();
+        done?;
+        eprintln!("played {} messages", played.load(Ordering::Relaxed));
+        Ok(Outcome::Done)
+    }
+
+    /// What is around the table of what is played.
+    fn frame(&self, recording: &Recording, played: &Arc<AtomicU64>, stopped: &Arc<AtomicBool>) -> live::Frame {
+        let file = self.file.file_name().unwrap_or(self.file.as_os_str()).to_string_lossy().into_owned();
+        // A recording that was imported carries no rig: then every damping below zero grows.
+        let rig = recorded_rig(recording).ok();
+        let title = rig.as_ref().map_or_else(|| file.clone(), |rig| format!("{}, {file}", rig.name));
+        let (played, stopped) = (played.clone(), stopped.clone());
+        live::Frame {
+            title,
+            instability_threshold: rig.map_or(0.0, |rig| rig.instability_threshold),
+            foot: Box::new(move |_| format!("played {} messages", played.load(Ordering::Relaxed))),
+            quit: Box::new(move || stopped.store(true, Ordering::Relaxed)),
+        }
+    }
+
+    fn play_rounds(
+        &self,
+        recording: &Recording,
+        first_ns: u64,
+        player: &Player,
+        watch: &Watch,
+        played: &AtomicU64,
+        stopped: &AtomicBool,
+    ) -> anyhow::Result<()> {
         let wanted = |payload: &Payload| {
             self.topics.is_empty() || self.topics.iter().any(|topic| topic == payload.topic().name())
         };
-        let first = recording.messages().next().context("the recording is empty")?;
         let pacing = Pacing {
             rate: self.rate,
             start_offset_s: self.start_offset,
             playback_duration_s: self.playback_duration,
             repeat: self.repeat,
         };
-        let pacer = Pacer::new(pacing, first.log_time_ns)?;
+        let pacer = Pacer::new(pacing, first_ns)?;
         let started = Instant::now();
         let mut round_start_ns = Some(0);
-        let mut played = 0u64;
         while let Some(start_ns) = round_start_ns {
-            let mut last_ns = first.log_time_ns;
+            let mut last_ns = first_ns;
             for entry in recording.messages() {
                 let Recorded::Known(payload) = entry.message else { continue };
                 if !wanted(&payload) {
@@ -102,21 +139,26 @@ impl Options {
                     Due::Skip => continue,
                     Due::End => break,
                     Due::After(ns) => {
-                        signals::wait_until(started + Duration::from_nanos(ns), &stopped);
+                        signals::wait_until(started + Duration::from_nanos(ns), stopped);
                     }
                 }
                 if stopped.load(Ordering::Relaxed) {
-                    return Ok(Outcome::Done);
+                    return Ok(());
                 }
                 last_ns = entry.log_time_ns;
                 player.publish(&payload)?;
-                played += 1;
+                played.fetch_add(1, Ordering::Relaxed);
+                match payload {
+                    Payload::OperatingPoint(input) => watch.input(&input),
+                    Payload::Prediction(prediction) => watch.prediction(prediction),
+                    _ => {}
+                }
             }
-            ensure!(played > 0, "nothing to play: no such messages in that part of the recording");
+            let nothing = played.load(Ordering::Relaxed) == 0;
+            ensure!(!nothing, "nothing to play: no such messages in that part of the recording");
             round_start_ns = pacer.next_round(start_ns, last_ns, 10_000_000);
         }
-        eprintln!("played {played} messages");
-        Ok(Outcome::Done)
+        Ok(())
     }
 }
 
@@ -165,19 +207,20 @@ fn report(found: &Verification, took: Duration) -> String {
 
 /// Publishes what was recorded.
 struct Player {
-    shm: Option<(ShmSource, ShmOutput)>,
+    shm: Option<(ShmSource, ShmOutput, ShmVibrationSource)>,
     ros2: Option<(Ros2Source, Ros2)>,
 }
 
 impl Player {
     fn join(shm: Option<ShmOptions>, ros2: Option<Ros2Options>) -> anyhow::Result<Self> {
         ensure!(shm.is_some() || ros2.is_some(), "nothing to play to: both --no-shm and --no-ros are given");
-        let shm = shm.map(|shm| anyhow::Ok((ShmSource::new(&shm)?, ShmOutput::new(&shm)?))).transpose();
+        let ports = |shm| anyhow::Ok((ShmSource::new(shm)?, ShmOutput::new(shm)?, ShmVibrationSource::new(shm)?));
+        let shm = shm.as_ref().map(ports).transpose();
         let ros2 = ros2.map(|mut ros2| {
             let source = Ros2Source::start(&ros2, |_| {})?;
             // The node's own name stays free for a node that listens.
             ros2.args = ros2.args.renamed("squealcast_replay");
-            anyhow::Ok((source, Ros2::start(&ros2, Parameters::none(), |_| {})?))
+            anyhow::Ok((source, Ros2::start(&ros2, Parameters::none(), |_| {}, |_| {})?))
         });
         Ok(Self {
             shm: shm.context("shared memory; --no-shm stays off it")?,
@@ -185,11 +228,12 @@ impl Player {
         })
     }
 
-    fn publish(&mut self, payload: &Payload) -> anyhow::Result<()> {
-        if let Some((inputs, predictions)) = &self.shm {
+    fn publish(&self, payload: &Payload) -> anyhow::Result<()> {
+        if let Some((inputs, predictions, vibrations)) = &self.shm {
             match payload {
                 Payload::OperatingPoint(message) => drop(inputs.publish(message)?),
                 Payload::Prediction(message) => drop(predictions.publish(message)?),
+                Payload::Vibration(message) => drop(vibrations.publish(message)?),
                 _ => {}
             }
         }
@@ -200,6 +244,7 @@ impl Player {
                 Payload::SessionEvent(message) => others.publish_session_event(message)?,
                 Payload::RigInfo(message) => others.publish_rig(message)?,
                 Payload::Diagnostics(message) => others.publish_diagnostics(message)?,
+                Payload::Vibration(message) => inputs.publish_vibration(message)?,
             }
         }
         Ok(())

@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
+use super::display::CriteriaOptions;
 use super::{Outcome, print, view, write_file};
 use crate::display::report::{Origin, report};
 
@@ -17,11 +18,13 @@ pub struct Options {
     /// Maps of this rig instead of the recorded one
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
+    #[command(flatten)]
+    criteria: CriteriaOptions,
 }
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let (recording, recorded) = view::read(&self.file, self.rig.as_deref())?;
+        let (recording, recorded) = view::read(&self.file, self.rig.as_deref(), self.criteria.criteria())?;
         let origin = Origin {
             file: self.file.file_name().unwrap_or(self.file.as_os_str()).to_string_lossy().into_owned(),
             version: recording.session_metadata("squealcast_version").map(str::to_owned),

@@ -8,17 +8,17 @@ use clap::Args;
 use crossbeam_channel::{Receiver, Sender};
 
 use super::buses::BusOptions;
-use super::display::{self, DisplayOptions};
+use super::display::{self, DisplayOptions, ThresholdOption};
 use super::{Outcome, live, signals};
 use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig};
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::{Parameters, Ros2};
-use crate::io::shm::{ShmInput, ShmOutput};
+use crate::io::shm::{ShmInput, ShmOutput, ShmVibrationInput};
 use crate::node::{self, Incoming, Node, Outputs, Watch};
 use crate::rig::Rig;
+use crate::session::Counters;
 use crate::settings::{self, Settings};
-use crate::wire;
 
 /// Run the node on live buses
 #[derive(Debug, Args)]
@@ -45,6 +45,8 @@ pub struct NodeOptions {
     plain: bool,
     #[command(flatten)]
     display: DisplayOptions,
+    #[command(flatten)]
+    threshold: ThresholdOption,
 }
 
 /// The longest the recorder may take to finish its files, so that a signal ends the program within 2 s.
@@ -82,8 +84,10 @@ pub fn serve(
     if let Some(shm) = buses.shm() {
         outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
         if listening == Listening::ToTheBuses {
-            let (sender, lost) = (sender.clone(), outputs.lost_inputs.clone());
-            outputs.shm_input = Some(ShmInput::spawn(&shm, move |heard| hear(&sender, &lost, heard))?);
+            let lost = &outputs.lost_inputs;
+            outputs.shm_input = Some(ShmInput::spawn(&shm, hear(listening, &sender, lost, Incoming::Input))?);
+            let vibration = hear(listening, &sender, lost, Incoming::Vibration);
+            outputs.shm_vibration = Some(ShmVibrationInput::spawn(&shm, vibration)?);
         }
     }
     if let Some(ros2) = buses.ros2(ros_args)? {
@@ -104,20 +108,18 @@ pub fn serve(
                 }
             }),
         };
-        let (sender, lost) = (sender.clone(), outputs.lost_inputs.clone());
-        let started = Ros2::start(&ros2, parameters, move |heard| {
-            if listening == Listening::ToTheBuses {
-                hear(&sender, &lost, heard);
-            }
-        });
+        let lost = &outputs.lost_inputs;
+        let input = hear(listening, &sender, lost, Incoming::Input);
+        let vibration = hear(listening, &sender, lost, Incoming::Vibration);
+        let started = Ros2::start(&ros2, parameters, input, vibration);
         outputs.ros2 = Some(started.context("ROS 2; --no-ros stays off it")?);
     }
 
     let stop = sender.clone();
     signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let watch = Watch::default();
-    let display = display::of_node(&addresses, rig, &watch);
-    let shown = live::show(rig, watch.clone(), options.plain, sender.clone());
+    let display = display::of_node(&addresses, rig, &watch, options.threshold);
+    let shown = live::show(frame(rig, sender.clone()), watch.clone(), options.plain);
     let node = Node::new(rig.clone(), initial, outputs, sender.clone(), watch);
     let node = if options.no_chart { node } else { node.with_chart(sender) };
     let outputs = node.run(&receiver);
@@ -129,10 +131,34 @@ pub fn serve(
     outcome
 }
 
-/// Hands an input to the node without waiting for it; what does not fit is lost, and counted.
-fn hear(sender: &Sender<Incoming>, lost: &AtomicU64, heard: Heard<wire::OperatingPoint>) {
-    if sender.try_send(Incoming::Input(heard)).is_err() {
-        lost.fetch_add(1, Ordering::Relaxed);
+/// What is around the table of a node for `rig`.
+fn frame(rig: &Rig, node: Sender<Incoming>) -> live::Frame {
+    live::Frame {
+        title: rig.name.clone(),
+        instability_threshold: rig.instability_threshold,
+        foot: Box::new(|snapshot| {
+            let Counters { solved, charted, reused, faults } = snapshot.counters;
+            let passed_over = snapshot.passed_over;
+            format!(
+                "solved {solved}  from the chart {charted}  reused {reused}  faults {faults}  passed over {passed_over}"
+            )
+        }),
+        quit: Box::new(move || drop(node.send(Incoming::Stop))),
+    }
+}
+
+/// Hands what is heard to the node without waiting for it; what does not fit is lost, and counted.
+fn hear<M>(
+    listening: Listening,
+    sender: &Sender<Incoming>,
+    lost: &Arc<AtomicU64>,
+    incoming: fn(Heard<M>) -> Incoming,
+) -> impl FnMut(Heard<M>) + Send + use<M> {
+    let (sender, lost) = (sender.clone(), lost.clone());
+    move |heard| {
+        if listening == Listening::ToTheBuses && sender.try_send(incoming(heard)).is_err() {
+            lost.fetch_add(1, Ordering::Relaxed);
+        }
     }
 }
 

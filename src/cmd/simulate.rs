@@ -7,15 +7,15 @@ use anyhow::{Context, ensure};
 use clap::Args;
 
 use super::buses::BusOptions;
-use super::demo::measurement;
-use super::{Outcome, finite, not_negative, signals};
+use super::{Outcome, finite, not_negative, positive, signals};
 use crate::io::clock;
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::Ros2Source;
-use crate::io::shm::ShmSource;
+use crate::io::shm::{ShmSource, ShmVibrationSource};
 use crate::offline;
 use crate::rig::Rig;
-use crate::simulator::{Profile, Simulator};
+use crate::simulator::{Peak, Profile, Simulator, Tone};
+use crate::wire::{Header, OperatingPoint, Time, Vibration};
 
 /// Publish simulated conditions, or record a simulated session
 #[derive(Debug, Args)]
@@ -39,7 +39,65 @@ pub struct Options {
     #[arg(long, value_name = "RIG", requires = "record")]
     rig: Option<String>,
     #[command(flatten)]
+    vibration: VibrationOption,
+    #[command(flatten)]
     buses: BusOptions,
+}
+
+/// Whether the simulated rig measures its vibration.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct VibrationOption {
+    /// Measure the vibration too, 20 times a second: 95 dB at HZ while friction is above MU, else noise of 50 dB
+    #[arg(long = "vibration", value_name = "MU:HZ", value_parser = tone)]
+    pub tone: Option<Tone>,
+}
+
+fn tone(text: &str) -> Result<Tone, String> {
+    let (mu, hz) = text.split_once(':').ok_or("not a friction coefficient and a frequency, such as 0.36:1500")?;
+    Ok(Tone { above_mu: finite(mu)?, frequency_hz: positive(hz)? })
+}
+
+/// Time between two measurements of the vibration, s.
+const VIBRATION_EVERY_S: f64 = 0.05;
+
+/// A simulated rig that measures.
+pub struct Measuring {
+    simulator: Simulator,
+    tone: Option<Tone>,
+    period_s: f64,
+}
+
+impl Measuring {
+    /// The conditions every `period`, and the vibration now and then where that is wanted.
+    pub fn new(simulator: Simulator, vibration: VibrationOption, period: Duration) -> Self {
+        Self { simulator, tone: vibration.tone, period_s: period.as_secs_f64() }
+    }
+
+    /// When a measurement is due, s since the start.
+    pub fn time_s(&self, seq: u32) -> f64 {
+        self.period_s * f64::from(seq)
+    }
+
+    /// What is measured then, as messages.
+    pub fn measure(&mut self, seq: u32, stamp_ns: i64) -> (OperatingPoint, Option<Vibration>) {
+        let time_s = self.time_s(seq);
+        let header = Header { stamp: Time::from_ns(stamp_ns), frame_id: "simulated".to_owned() };
+        let every = (VIBRATION_EVERY_S / self.period_s).round().max(1.0) as u32;
+        let tone = self.tone.filter(|_| seq.is_multiple_of(every));
+        let vibration = tone.map(|tone| {
+            let Peak { frequency_hz, level_db } = self.simulator.measure_vibration(tone, time_s);
+            Vibration { header: header.clone(), frequency_hz, level_db }
+        });
+        let point = self.simulator.measure(time_s);
+        let point = OperatingPoint {
+            header,
+            seq: seq.into(),
+            normal_load_n: point.normal_load_n,
+            disc_speed_rad_s: point.disc_speed_rad_s,
+            friction_coefficient: point.friction_coefficient,
+        };
+        (point, vibration)
+    }
 }
 
 /// The highest rate of measurements, 1/s.
@@ -67,13 +125,13 @@ impl Options {
         if let (Some(directory), Some(rig)) = (&self.record, &self.rig) {
             let rig = Arc::new(Rig::load(rig)?);
             let duration_s = self.duration.unwrap_or(profile.duration_s());
-            let mut simulator = Simulator::new(profile, self.seed);
-            let measurements = (0u32..).map(|seq| (seq, period.as_secs_f64() * f64::from(seq)));
-            let inputs = measurements.take_while(|&(_, time_s)| time_s < duration_s).map(|(seq, time_s)| {
+            let mut measuring = Measuring::new(Simulator::new(profile, self.seed), self.vibration, period);
+            let measured = (0u32..).map_while(|seq| {
+                let time_s = measuring.time_s(seq);
                 let stamp_ns = offline::START_NS + (time_s * 1e9).round() as i64;
-                measurement(&mut simulator, time_s, u64::from(seq), stamp_ns)
+                (time_s < duration_s).then(|| measuring.measure(seq, stamp_ns))
             });
-            let written = offline::record(&rig, inputs, directory)?;
+            let written = offline::record(&rig, measured, directory)?;
             eprintln!("{}", written.display());
             return Ok(Outcome::Done);
         }
@@ -81,7 +139,12 @@ impl Options {
     }
 
     fn publish(&self, profile: Profile, period: Duration, ros_args: RosArgs) -> anyhow::Result<Outcome> {
-        let shm = self.buses.shm().map(|shm| ShmSource::new(&shm)).transpose();
+        let measures = self.vibration.tone.is_some();
+        let shm = self.buses.shm().map(|shm| {
+            let vibration = measures.then(|| ShmVibrationSource::new(&shm)).transpose()?;
+            anyhow::Ok((ShmSource::new(&shm)?, vibration))
+        });
+        let shm = shm.transpose();
         let shm = shm.context("shared memory; --no-shm stays off it")?;
         let ros2 = self.buses.ros2(ros_args)?.map(|ros2| Ros2Source::start(&ros2, |_| {})).transpose();
         let ros2 = ros2.context("ROS 2; --no-ros stays off it")?;
@@ -89,10 +152,10 @@ impl Options {
         let stopped = Arc::new(AtomicBool::new(false));
         let stop = stopped.clone();
         signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;
-        let mut simulator = Simulator::new(profile, self.seed);
+        let mut measuring = Measuring::new(Simulator::new(profile, self.seed), self.vibration, period);
         let started = Instant::now();
         for seq in 0u32.. {
-            let time_s = period.as_secs_f64() * f64::from(seq);
+            let time_s = measuring.time_s(seq);
             if self.duration.is_some_and(|duration| time_s >= duration) {
                 break;
             }
@@ -100,12 +163,18 @@ impl Options {
             if stopped.load(Ordering::Relaxed) {
                 break;
             }
-            let message = measurement(&mut simulator, time_s, u64::from(seq), clock::now_ns());
-            if let Some(shm) = &shm {
-                shm.publish(&message)?;
+            let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
+            if let Some((shm, shm_vibration)) = &shm {
+                shm.publish(&conditions)?;
+                if let (Some(shm), Some(vibration)) = (shm_vibration, &vibration) {
+                    shm.publish(vibration)?;
+                }
             }
             if let Some(ros2) = &ros2 {
-                ros2.publish(&message)?;
+                ros2.publish(&conditions)?;
+                if let Some(vibration) = &vibration {
+                    ros2.publish_vibration(vibration)?;
+                }
             }
         }
         Ok(Outcome::Done)

@@ -26,11 +26,21 @@ pub struct Event {
     pub mode_id: Option<u32>,
     pub frequency_hz: Option<f64>,
     pub growth_rate_per_s: Option<f64>,
+    /// The frequencies over which its unstable modes went, of the fastest at every moment.
+    pub modes: Vec<ModeRange>,
     /// Conditions at the onset.
     pub normal_load_n: f64,
     pub disc_speed_rad_s: f64,
     pub friction_coefficient: f64,
     pub critical_friction: f64,
+}
+
+/// Smallest and largest frequency of a mode.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ModeRange {
+    pub id: u32,
+    pub low_hz: f64,
+    pub high_hz: f64,
 }
 
 /// The events so far, the oldest forgotten beyond a bound.
@@ -43,7 +53,7 @@ pub struct Events {
 }
 
 /// An interruption shorter than this does not end an event, s.
-const BRIDGED_S: f64 = 0.25;
+pub(super) const BRIDGED_S: f64 = 0.25;
 /// Events kept; older ones are forgotten.
 const MOST_EVENTS: usize = 10_000;
 
@@ -63,7 +73,7 @@ impl Events {
         if self.open {
             if let Some(last) = self.events.back_mut() {
                 if kind == Some(last.kind) {
-                    last.grew(sample.unstable[0]);
+                    last.grew(&sample.unstable);
                     return false;
                 }
                 last.end_s = Some(time_s);
@@ -78,7 +88,7 @@ impl Events {
         if let Some(last) = self.events.back_mut().filter(resumed) {
             last.end_s = None;
             last.interruptions += 1;
-            last.grew(sample.unstable[0]);
+            last.grew(&sample.unstable);
             self.open = true;
             return true;
         }
@@ -94,12 +104,13 @@ impl Events {
             mode_id: None,
             frequency_hz: None,
             growth_rate_per_s: None,
+            modes: vec![],
             normal_load_n: sample.normal_load_n,
             disc_speed_rad_s: sample.disc_speed_rad_s,
             friction_coefficient: sample.friction_coefficient,
             critical_friction: sample.critical_friction,
         };
-        event.grew(sample.unstable[0]);
+        event.grew(&sample.unstable);
         if self.events.len() == MOST_EVENTS {
             self.events.pop_front();
         }
@@ -147,8 +158,16 @@ impl Events {
 }
 
 impl Event {
-    fn grew(&mut self, mode: Option<UnstableMode>) {
-        let Some(mode) = mode else { return };
+    /// Takes the unstable modes of a moment in, fastest first.
+    fn grew(&mut self, unstable: &[Option<UnstableMode>]) {
+        for mode in unstable.iter().flatten() {
+            let hz = mode.frequency_hz;
+            match self.modes.iter_mut().find(|range| range.id == mode.id) {
+                Some(range) => (range.low_hz, range.high_hz) = (range.low_hz.min(hz), range.high_hz.max(hz)),
+                None => self.modes.push(ModeRange { id: mode.id, low_hz: hz, high_hz: hz }),
+            }
+        }
+        let Some(mode) = unstable.first().copied().flatten() else { return };
         if self.growth_rate_per_s.is_none_or(|before| mode.growth_rate_per_s > before) {
             self.mode_id = Some(mode.id);
             self.frequency_hz = Some(mode.frequency_hz);

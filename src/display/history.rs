@@ -2,9 +2,9 @@
 
 use std::collections::VecDeque;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
-use crate::node::Sample;
+use crate::node::{SAMPLE_MODES, Sample, UnstableMode, VibrationSample};
 
 /// Quantities with a range in every bin, in the order of [`Bin::ranges`].
 pub const QUANTITIES: [&str; 5] = ["load", "speed", "mu", "growth", "margin"];
@@ -18,15 +18,46 @@ pub struct Bin {
     /// Smallest and largest of each quantity; `null` where there was none.
     #[serde(rename = "r")]
     pub ranges: [Option<(f32, f32)>; QUANTITIES.len()],
-    /// The gravest level.
+    /// The gravest level; `null` where nothing was predicted.
     #[serde(rename = "l")]
-    pub level: u8,
+    pub level: Option<u8>,
     /// Frequency and growth rate of the unstable modes at the moment of the fastest growth.
-    #[serde(rename = "u")]
-    pub unstable: Vec<(f32, f32)>,
+    #[serde(rename = "u", serialize_with = "present")]
+    pub unstable: [Option<(f32, f32)>; SAMPLE_MODES],
+    /// What was measured of the vibration.
+    #[serde(rename = "v", skip_serializing_if = "Option::is_none")]
+    pub vibration: Option<Vibration>,
+}
+
+/// Smallest and largest level of a measured vibration, and the frequency of the largest.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Vibration {
+    #[serde(rename = "lo")]
+    pub low_db: f32,
+    #[serde(rename = "hi")]
+    pub high_db: f32,
+    #[serde(rename = "hz")]
+    pub frequency_hz: f32,
+}
+
+impl Vibration {
+    fn merge(self, other: Self) -> Self {
+        let louder = if other.high_db > self.high_db { other } else { self };
+        Self { low_db: self.low_db.min(other.low_db), ..louder }
+    }
+}
+
+/// Only those that are there.
+fn present<S: Serializer>(unstable: &[Option<(f32, f32)>; SAMPLE_MODES], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(unstable.iter().flatten())
 }
 
 impl Bin {
+    fn empty(index: i64) -> Self {
+        let ranges = [None; QUANTITIES.len()];
+        Self { index, ranges, level: None, unstable: [None; SAMPLE_MODES], vibration: None }
+    }
+
     fn merge(&mut self, other: Self) {
         let growth = |bin: &Self| bin.ranges[3].map_or(f32::NEG_INFINITY, |(_, high)| high);
         if growth(&other) > growth(self) {
@@ -39,6 +70,10 @@ impl Bin {
             };
         }
         self.level = self.level.max(other.level);
+        self.vibration = match (self.vibration, other.vibration) {
+            (Some(a), Some(b)) => Some(a.merge(b)),
+            (a, b) => a.or(b),
+        };
     }
 }
 
@@ -55,7 +90,10 @@ impl History {
     /// At most `capacity` bins of `bin_ns`.
     pub fn new(bin_ns: i64, capacity: usize) -> Self {
         assert!(bin_ns > 0 && capacity > 0, "bins of {bin_ns} ns, {capacity} of them");
-        Self { bin_ns, capacity, coarsens: false, bins: VecDeque::new() }
+        // Written to once, so that the memory is there from the beginning and does not grow as it fills.
+        let mut bins: VecDeque<Bin> = (0..capacity).map(|_| Bin::empty(0)).collect();
+        bins.clear();
+        Self { bin_ns, capacity, coarsens: false, bins }
     }
 
     /// At most `capacity` bins of `bin_ns` or longer, so that nothing has to be forgotten.
@@ -68,7 +106,7 @@ impl History {
     fn coarsen(&mut self) {
         while self.bins.len() >= self.capacity {
             self.bin_ns *= 2;
-            let mut coarse: VecDeque<Bin> = VecDeque::new();
+            let mut coarse: VecDeque<Bin> = VecDeque::with_capacity(self.capacity);
             for mut bin in self.bins.drain(..) {
                 bin.index = bin.index.div_euclid(2);
                 match coarse.back_mut().filter(|last| last.index == bin.index) {
@@ -95,20 +133,35 @@ impl History {
         self.bins.range(self.bins.partition_point(|bin| bin.index < index)..)
     }
 
-    /// Takes a sample in. Time that runs backward stays in the latest bin.
-    pub fn push(&mut self, sample: &Sample) {
-        let mut index = sample.time_ns.div_euclid(self.bin_ns);
+    /// The bin of a time. Time that runs backward stays in the latest bin.
+    fn bin(&mut self, time_ns: i64) -> Option<&mut Bin> {
+        let mut index = time_ns.div_euclid(self.bin_ns);
         if self.coarsens && self.bins.len() == self.capacity && self.bins.back().is_none_or(|last| last.index < index) {
             self.coarsen();
-            index = sample.time_ns.div_euclid(self.bin_ns);
+            index = time_ns.div_euclid(self.bin_ns);
         }
         if self.bins.back().is_none_or(|last| last.index < index) {
             if self.bins.len() == self.capacity {
                 self.bins.pop_front();
             }
-            self.bins.push_back(Bin { index, ranges: [None; QUANTITIES.len()], level: sample.level, unstable: vec![] });
+            self.bins.push_back(Bin::empty(index));
         }
-        let Some(bin) = self.bins.back_mut() else { return };
+        self.bins.back_mut()
+    }
+
+    /// Takes a measured vibration in.
+    pub fn push_vibration(&mut self, sample: &VibrationSample) {
+        let (level_db, frequency_hz) = (sample.level_db as f32, sample.frequency_hz as f32);
+        let Some(bin) = self.bin(sample.time_ns).filter(|_| level_db.is_finite() && frequency_hz.is_finite()) else {
+            return;
+        };
+        let new = Vibration { low_db: level_db, high_db: level_db, frequency_hz };
+        bin.vibration = Some(bin.vibration.map_or(new, |before| before.merge(new)));
+    }
+
+    /// Takes a sample in.
+    pub fn push(&mut self, sample: &Sample) {
+        let Some(bin) = self.bin(sample.time_ns) else { return };
         let values = [
             sample.normal_load_n,
             sample.disc_speed_rad_s,
@@ -124,11 +177,10 @@ impl History {
                 *range = Some((low.min(value), high.max(value)));
             }
         }
-        bin.level = bin.level.max(sample.level);
+        bin.level = bin.level.max(Some(sample.level));
         if sample.max_growth_rate_per_s as f32 >= fastest && sample.unstable_modes > 0 {
-            bin.unstable.clear();
-            let modes = sample.unstable.iter().flatten();
-            bin.unstable.extend(modes.map(|mode| (mode.frequency_hz as f32, mode.growth_rate_per_s as f32)));
+            let shown = |mode: UnstableMode| (mode.frequency_hz as f32, mode.growth_rate_per_s as f32);
+            bin.unstable = sample.unstable.map(|mode| mode.map(shown));
         }
     }
 }
@@ -147,7 +199,7 @@ mod tests {
         }
         assert_eq!(history.bins().len(), 1);
         let bin = &history.bins()[0];
-        assert_eq!((bin.index, bin.level), (0, level::SQUEAL));
+        assert_eq!((bin.index, bin.level), (0, Some(level::SQUEAL)));
         assert_eq!(bin.ranges[2], Some((0.1, 0.3)));
         history.push(&sample(100, f64::NAN, level::FAULT));
         assert_eq!(history.bins()[1].ranges[2], None, "a quantity that is not known has no range");
@@ -173,7 +225,7 @@ mod tests {
             let inside: Vec<f64> = (0..1000).filter(of_bin).map(|k| values[k]).collect();
             let extreme = |f: fn(f64, f64) -> f64| inside.iter().copied().reduce(f).unwrap() as f32;
             assert_eq!(bin.ranges[2], Some((extreme(f64::min), extreme(f64::max))));
-            assert_eq!(bin.level == level::FAULT, bin.index == 500 / 160);
+            assert_eq!(bin.level == Some(level::FAULT), bin.index == 500 / 160);
         }
     }
 
@@ -188,6 +240,25 @@ mod tests {
         for sample in [slow, fast, slow] {
             history.push(&sample);
         }
-        assert_eq!(history.bins()[0].unstable, [(77.0, 1.0)]);
+        assert_eq!(history.bins()[0].unstable, [Some((77.0, 1.0)), None, None, None]);
+        let json = serde_json::to_value(&history.bins()[0]).unwrap();
+        assert_eq!(json["u"], serde_json::json!([[77.0, 1.0]]));
+        assert!(json.get("v").is_none(), "nothing was measured");
+    }
+
+    #[test]
+    fn a_bin_holds_the_range_of_the_measured_level_and_where_it_was_loudest() {
+        let heard = |time_ns, frequency_hz, level_db| VibrationSample { time_ns, frequency_hz, level_db };
+        let mut history = History::coarsening(100, 4);
+        for (time_ns, hz, db) in [(0, 10.0, 50.0), (50, 20.0, 90.0), (99, 30.0, 40.0), (100, 40.0, f64::NAN)] {
+            history.push_vibration(&heard(time_ns, hz, db));
+        }
+        let known = Vibration { low_db: 40.0, high_db: 90.0, frequency_hz: 20.0 };
+        assert_eq!((history.bins()[0].vibration, history.bins()[0].level), (Some(known), None));
+        assert_eq!(history.bins()[1].vibration, None);
+        for time_ns in [200, 300, 400] {
+            history.push_vibration(&heard(time_ns, 50.0, 30.0));
+        }
+        assert_eq!((history.bin_ns(), history.bins()[0].vibration), (200, Some(known)));
     }
 }

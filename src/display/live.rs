@@ -11,7 +11,7 @@ use super::server::{About, Source};
 use super::shape::shape;
 use super::state::{CountersShown, Shown, State, spread, trend_per_s};
 use crate::io::clock;
-use crate::node::{Sample, Watch};
+use crate::node::{Sample, VibrationSample, Watch};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
 
@@ -26,12 +26,15 @@ const SIGN_OF_LIFE: Duration = Duration::from_millis(500);
 pub struct Live {
     rig: Arc<Rig>,
     watch: Watch,
+    /// From which level on a measured vibration counts as squeal.
+    threshold_db: f64,
     followed: Mutex<Followed>,
     solver: Mutex<Solver>,
 }
 
 struct Followed {
     samples: Vec<Sample>,
+    vibrations: Vec<VibrationSample>,
     history: History,
     events: Events,
     event_changes: u64,
@@ -47,10 +50,11 @@ struct Followed {
 
 impl Live {
     /// Begins to follow.
-    pub fn new(rig: Arc<Rig>, watch: Watch) -> Self {
+    pub fn new(rig: Arc<Rig>, watch: Watch, threshold_db: f64) -> Self {
         let solver = Mutex::new(Solver::new(rig.model.dimension()));
         let followed = Followed {
             samples: vec![],
+            vibrations: vec![],
             history: History::new(BIN_NS, BINS),
             events: Events::default(),
             event_changes: 0,
@@ -61,7 +65,7 @@ impl Live {
             map_number: 0,
             curves: None,
         };
-        let live = Self { rig, watch, followed: Mutex::new(followed), solver };
+        let live = Self { rig, watch, threshold_db, followed: Mutex::new(followed), solver };
         live.watch.take_samples(&mut vec![]);
         live
     }
@@ -79,12 +83,16 @@ impl Followed {
             self.history.push(sample);
             self.event_changes += u64::from(self.events.push(sample));
         }
+        watch.take_vibrations(&mut self.vibrations);
+        for sample in &self.vibrations {
+            self.history.push_vibration(sample);
+        }
         let now = Instant::now();
         self.ticks.push_back((now, self.samples.len()));
         while self.ticks.front().is_some_and(|tick| now - tick.0 > Duration::from_secs(1)) {
             self.ticks.pop_front();
         }
-        !self.samples.is_empty()
+        !self.samples.is_empty() || !self.vibrations.is_empty()
     }
 
     fn state(&mut self, watch: &Watch, with_bins: bool) -> String {
@@ -119,7 +127,7 @@ impl Followed {
 
 impl Source for Live {
     fn about(&self) -> About {
-        About::new(&self.rig, "live")
+        About::new(&self.rig, "live", self.threshold_db)
     }
 
     fn tick(&self, listened_to: bool) -> Option<String> {

@@ -3,15 +3,16 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use super::comparison::{Comparison, Criteria, Measurements};
 use super::curves::Curves;
 use super::events::{Events, seconds};
 use super::history::History;
-use super::server::{About, Source};
+use super::server::{About, Note, Source};
 use super::shape::shape;
 use super::state::{Shown, State, spread, trend_per_s};
 use crate::io::message::Payload;
 use crate::io::recording::{FileDamage, Recorded as Content, Recording};
-use crate::node::{Sample, session_map};
+use crate::node::{Sample, VibrationSample, session_map};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
 use crate::wire::{OperatingPoint, Prediction, SessionEvent, event_kind};
@@ -45,6 +46,8 @@ pub struct Recorded {
     pub rig: Arc<Rig>,
     pub history: History,
     pub events: Events,
+    /// The vibration that was measured meanwhile.
+    pub vibration: Measurements,
     /// In order; see [`Recorded::stride`].
     pub moments: Vec<Moment>,
     /// Of how many predictions one is kept.
@@ -63,13 +66,14 @@ pub struct Recorded {
 }
 
 impl Recorded {
-    /// Reads `recording`, made with `rig`.
-    pub fn read(recording: &Recording, rig: Arc<Rig>) -> Self {
+    /// Reads `recording`, made with `rig`; `criteria` say what squeal is in a measured vibration.
+    pub fn read(recording: &Recording, rig: Arc<Rig>, criteria: Criteria) -> Self {
         let mut recorded = Self {
             solver: Mutex::new(Solver::new(rig.model.dimension())),
             rig,
             history: History::coarsening(FIRST_BIN_NS, BINS),
             events: Events::default(),
+            vibration: Measurements::new(criteria),
             moments: vec![],
             stride: 1,
             levels: [0; 4],
@@ -95,6 +99,11 @@ impl Recorded {
                 Content::Known(Payload::Prediction(prediction)) => {
                     let input = inputs.iter().rev().find(|input| input.seq == prediction.input_seq);
                     recorded.take(time_ns, input, prediction);
+                }
+                Content::Known(Payload::Vibration(vibration)) => {
+                    let sample = VibrationSample::new(time_ns, &vibration);
+                    recorded.history.push_vibration(&sample);
+                    recorded.vibration.push(&sample);
                 }
                 Content::Known(Payload::SessionEvent(event)) => recorded.session_events.push((time_ns, event)),
                 _ => {}
@@ -145,6 +154,11 @@ impl Recorded {
         self.moments.get(after.saturating_sub(1))
     }
 
+    /// The measured vibration against the predictions; `None` where none was recorded.
+    pub fn comparison(&self) -> Option<Comparison> {
+        self.vibration.compare(&self.events, self.span_s()?.1)
+    }
+
     fn map_events(&self) -> impl Iterator<Item = &(i64, SessionEvent)> {
         self.session_events.iter().filter(|(_, event)| event.kind == event_kind::STABILITY_MAP)
     }
@@ -185,7 +199,24 @@ impl Recorded {
 
 impl Source for Recorded {
     fn about(&self) -> About {
-        About { span_s: self.span_s(), ..About::new(&self.rig, "recording") }
+        let notes = self.session_events.iter().filter_map(|(time_ns, event)| {
+            let onset_s = seconds(*time_ns);
+            let note = Note { onset_s, what: "chart ready", normal_load_n: None, disc_speed_rad_s: None };
+            match event.kind {
+                event_kind::CHART => Some(note),
+                event_kind::STABILITY_MAP => {
+                    let (load, speed) = (event.normal_load_n, event.disc_speed_rad_s);
+                    let what = "stability map ready";
+                    Some(Note { what, normal_load_n: Some(load), disc_speed_rad_s: Some(speed), ..note })
+                }
+                _ => None,
+            }
+        });
+        About {
+            span_s: self.span_s(),
+            notes: notes.collect(),
+            ..About::new(&self.rig, "recording", self.vibration.criteria().threshold_db)
+        }
     }
 
     fn tick(&self, _listened_to: bool) -> Option<String> {
@@ -217,6 +248,10 @@ impl Source for Recorded {
 
     fn events(&self) -> Events {
         self.events.clone()
+    }
+
+    fn comparison(&self) -> Option<Comparison> {
+        self.comparison()
     }
 
     fn map(&self, number: u64) -> Option<Arc<str>> {

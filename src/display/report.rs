@@ -2,16 +2,20 @@
 
 use std::fmt::Write;
 
+use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
 use super::events::{Event, Events, iso, seconds};
 use super::recorded::Recorded;
 use crate::plot;
-use crate::wire::{event_kind, level};
+use crate::wire::{SessionEvent, event_kind, level};
 
 /// Moments whose stability map is drawn.
 const WORST: usize = 3;
 /// Events listed; the rest is in the CSV file.
 const LISTED: usize = 500;
+
+/// Settings of the first moment are those the session starts with, s.
+const STARTING_S: f64 = 0.5;
 
 const STYLE: &str = include_str!("assets/report.css");
 
@@ -44,11 +48,21 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     html += &section(
         "Conditions and predictions",
         &figure(
-            &inline(&plot::history("", &recorded.history, from_s)?),
-            "Smallest and largest value in each stretch of time; shaded where squeal was predicted.",
+            &inline(&plot::history("", &recorded.history, from_s, recorded.vibration.criteria().threshold_db)?),
+            "Smallest and largest value in each stretch of time; shaded where squeal was predicted. Circles are \
+             frequencies at which squeal was measured.",
         ),
     );
     html += &section("Events", &events(&recorded.events, from_s));
+    let measured = recorded.comparison().map_or_else(
+        || {
+            "<p>The recording holds no measured vibration (topic /rig/vibration): nothing to compare with.</p>\n"
+                .to_owned()
+        },
+        |found| comparison(&found, recorded.vibration.count(), from_s),
+    );
+    html += &section("Prediction against measurement", &measured);
+    html += &section("Maps, charts and settings during the session", &session_events(recorded, from_s));
     let mut maps = String::new();
     for event in worst(&recorded.events) {
         let at_s = event.onset_s;
@@ -64,7 +78,11 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
             map.point.disc_speed_rad_s,
             map.critical_friction().map_or_else(|| "none".to_owned(), |mu| format!("{mu:.6}")),
         );
-        maps += &figure(&inline(&plot::map("", &curves, at_its_worst(recorded, event))?), &escaped(&caption));
+        let mu = at_its_worst(recorded, event);
+        let last = curves.mu.last().copied().unwrap_or(1.0);
+        let wanted = [1.6 * curves.critical_friction.unwrap_or(last), 1.15 * mu, 0.05];
+        let to = wanted.into_iter().filter(|mu| mu.is_finite()).fold(0.0, f64::max).min(last);
+        maps += &figure(&inline(&plot::map("", &curves, to, Some(mu))?), &escaped(&caption));
     }
     if maps.is_empty() {
         maps = "<p>No squeal was predicted.</p>\n".to_owned();
@@ -121,7 +139,7 @@ fn session(recorded: &Recorded, origin: &Origin, from_s: f64, to_s: f64) -> Stri
     let settings = recorded.session_events.iter().filter(|(_, event)| event.kind == event_kind::PARAMETER);
     let told: Vec<String> = settings
         .map(|(time_ns, event)| match seconds(*time_ns) - from_s {
-            late if late > 0.5 => format!("{} = {} after {late:.2} s", event.name, event.value),
+            late if late > STARTING_S => format!("{} = {} after {late:.2} s", event.name, event.value),
             _ => format!("{} = {}", event.name, event.value),
         })
         .collect();
@@ -161,6 +179,127 @@ fn events(events: &Events, from_s: f64) -> String {
     html += "</tbody></table>\n";
     if count > LISTED {
         let _ = writeln!(html, "<p>{} more in events.csv.</p>", count - LISTED);
+    }
+    html
+}
+
+/// Hits, misses and false alarms, and what these words mean.
+fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
+    let criteria = &found.criteria;
+    let (hits, misses, false_alarms) = (found.hits(), found.misses(), found.false_alarms.len());
+    let share = |part: usize, rest: usize| match part + rest {
+        0 => "–".to_owned(),
+        all => format!("{part} of {all} ({:.1} %)", 100.0 * part as f64 / all as f64),
+    };
+    let leads = found.leads_s();
+    let lead = match leads.as_slice() {
+        [] => "–".to_owned(),
+        [first, .., last] => format!("{:.3} s median, {first:.3} s to {last:.3} s", leads[leads.len() / 2]),
+        [only] => format!("{only:.3} s"),
+    };
+    let rows = [
+        ("measurements", measurements.to_string()),
+        ("hits", format!("{hits}: measured squeals that were predicted, {}", share(hits, misses))),
+        ("misses", format!("{misses}: measured squeals that were not")),
+        (
+            "false alarms",
+            format!(
+                "{false_alarms}: predicted squeals that were not measured, {}",
+                share(false_alarms, found.confirmed.len())
+            ),
+        ),
+        ("not judged", format!("{}: predicted squeals during which nothing was measured", found.unjudged.len())),
+        ("lead", format!("{lead}, from the predicted to the measured onset")),
+    ];
+    let cells: String =
+        rows.iter().map(|(name, value)| format!("<tr><th scope=\"row\">{name}</th><td>{value}</td></tr>\n")).collect();
+    let mut html = format!("<table class=\"facts\"><tbody>\n{cells}</tbody></table>\n");
+    let _ = writeln!(
+        html,
+        "<p>A <em>measured squeal</em> is a stretch of measurements of at least {} dB, with interruptions shorter than \
+         0.25 s, that lasts at least {} s; its frequency is that of its loudest measurement. A <em>predicted squeal</em> \
+         is a SQUEAL event of this report; its frequencies are those over which its unstable modes went. They match where \
+         they overlap in time, the prediction widened by {} s at both ends, and where the measured frequency is within \
+         {} % of one of those frequencies. A measured squeal with a match is a <em>hit</em>, one without a \
+         <em>miss</em>; a predicted squeal without a match is a <em>false alarm</em>. The lead is negative where the \
+         measured onset came first.</p>",
+        criteria.threshold_db,
+        criteria.least_duration_s,
+        criteria.time_tolerance_s,
+        100.0 * criteria.frequency_tolerance,
+    );
+    if !found.measured.is_empty() {
+        html += "<table><thead><tr><th>no.</th><th>measured squeal</th><th>after, s</th><th>duration, s</th>\
+                 <th>level, dB</th><th>frequency, Hz</th><th>predicted as</th><th>lead, s</th><th>frequency off, %</th>\
+                 </tr></thead><tbody>\n";
+    }
+    for (k, Judged { squeal, verdict }) in (1..).zip(found.measured.iter().take(LISTED)) {
+        let (kind, told) = match *verdict {
+            Verdict::Hit { event, mode_id, lead_s, frequency_difference } => (
+                "hit",
+                [
+                    format!("event {event}, mode {mode_id}"),
+                    format!("{lead_s:.3}"),
+                    format!("{:+.2}", 100.0 * frequency_difference),
+                ],
+            ),
+            Verdict::OtherFrequency => ("miss", ["other frequencies".to_owned(), String::new(), String::new()]),
+            Verdict::NotPredicted => ("miss", ["nothing".to_owned(), String::new(), String::new()]),
+        };
+        let measured = [
+            k.to_string(),
+            kind.to_owned(),
+            format!("{:.3}", squeal.onset_s - from_s),
+            format!("{:.3}", squeal.end_s - squeal.onset_s),
+            format!("{:.1}", squeal.peak_db),
+            number(squeal.frequency_hz),
+        ];
+        let cells: String = measured.iter().chain(&told).map(|cell| format!("<td>{cell}</td>")).collect();
+        let _ = writeln!(html, "<tr class=\"{kind}\">{cells}</tr>");
+    }
+    if !found.measured.is_empty() {
+        html += "</tbody></table>\n";
+    }
+    if found.measured.len() > LISTED {
+        let _ = writeln!(html, "<p>{} more are not listed.</p>", found.measured.len() - LISTED);
+    }
+    if false_alarms > 0 {
+        let numbers: Vec<String> = found.false_alarms.iter().take(LISTED).map(u64::to_string).collect();
+        let _ = writeln!(html, "<p>False alarms: events {}.</p>", numbers.join(", "));
+    }
+    html
+}
+
+/// When maps and charts became ready, and settings were changed.
+fn session_events(recorded: &Recorded, from_s: f64) -> String {
+    let told = |(time_ns, event): &(i64, SessionEvent)| {
+        let after_s = seconds(*time_ns) - from_s;
+        let (what, of) = match event.kind {
+            event_kind::STABILITY_MAP => {
+                ("stability map ready", format!("{:.1} N, {:.3} rad/s", event.normal_load_n, event.disc_speed_rad_s))
+            }
+            event_kind::CHART => ("chart ready", "predictions are read off it from here on".to_owned()),
+            event_kind::SILENCE => ("silence", "no input came for too long".to_owned()),
+            // Those a session starts with are in the table at the top.
+            event_kind::PARAMETER if after_s > STARTING_S => ("setting", format!("{} = {}", event.name, event.value)),
+            _ => return None,
+        };
+        let hash = event.hash.get(..12).unwrap_or_default();
+        let cells = [format!("{after_s:.3}"), what.to_owned(), escaped(&of), escaped(hash)];
+        Some(cells.iter().map(|cell| format!("<td>{cell}</td>")).collect::<String>())
+    };
+    let rows: Vec<String> = recorded.session_events.iter().filter_map(told).collect();
+    if rows.is_empty() {
+        return "<p>None.</p>\n".to_owned();
+    }
+    let mut html =
+        "<table><thead><tr><th>after, s</th><th>what</th><th>of</th><th>hash</th></tr></thead><tbody>\n".to_owned();
+    for row in rows.iter().take(LISTED) {
+        let _ = writeln!(html, "<tr>{row}</tr>");
+    }
+    html += "</tbody></table>\n";
+    if rows.len() > LISTED {
+        let _ = writeln!(html, "<p>{} more are not listed.</p>", rows.len() - LISTED);
     }
     html
 }

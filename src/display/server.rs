@@ -29,6 +29,7 @@ use tokio_stream::StreamExt;
 use tokio_stream::wrappers::WatchStream;
 
 use super::assets;
+use super::comparison::Comparison;
 use super::events::Events;
 use crate::rig::Rig;
 
@@ -52,6 +53,10 @@ pub trait Source: Send + Sync + 'static {
     fn state(&self, at_s: Option<f64>) -> String;
     fn history(&self) -> String;
     fn events(&self) -> Events;
+    /// The measured vibration against the predictions; `None` where there is none, or a session still goes on.
+    fn comparison(&self) -> Option<Comparison> {
+        None
+    }
     /// The curves of a stability map.
     fn map(&self, number: u64) -> Option<Arc<str>>;
     /// The shape of a mode.
@@ -73,12 +78,26 @@ pub struct About {
     pub mu_max: f64,
     pub warn_margin: f64,
     pub instability_threshold: f64,
+    /// From which level on a measured vibration counts as squeal.
+    pub vibration_threshold_db: f64,
     /// First and last moment of a recording, s since the epoch.
     pub span_s: Option<(f64, f64)>,
+    /// When maps and charts of a recording became ready.
+    pub notes: Vec<Note>,
+}
+
+/// Something that happened in a recording.
+#[derive(Clone, Debug, Serialize)]
+pub struct Note {
+    pub onset_s: f64,
+    pub what: &'static str,
+    /// Of a map.
+    pub normal_load_n: Option<f64>,
+    pub disc_speed_rad_s: Option<f64>,
 }
 
 impl About {
-    pub fn new(rig: &Rig, kind: &'static str) -> Self {
+    pub fn new(rig: &Rig, kind: &'static str, vibration_threshold_db: f64) -> Self {
         Self {
             kind,
             rig: rig.name.clone(),
@@ -88,7 +107,9 @@ impl About {
             mu_max: rig.mu_max,
             warn_margin: rig.warning.margin,
             instability_threshold: rig.instability_threshold,
+            vibration_threshold_db,
             span_s: None,
+            notes: vec![],
         }
     }
 }
@@ -154,6 +175,7 @@ async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Sourc
         .route("/history.json", get(history))
         .route("/events.json", get(events_json))
         .route("/events.csv", get(events_csv))
+        .route("/comparison.json", get(comparison))
         .route("/map.json", get(map))
         .route("/shape.json", get(shape))
         .fallback(get(asset))
@@ -260,6 +282,10 @@ async fn state(Shared(app): Shared<App>, Query(moment): Query<Moment>) -> Respon
 
 async fn history(Shared(app): Shared<App>) -> Response {
     aside(move || json(app.source.history())).await
+}
+
+async fn comparison(Shared(app): Shared<App>) -> Response {
+    aside(move || json(serde_json::to_string(&app.source.comparison()).unwrap_or_default())).await
 }
 
 async fn events_json(Shared(app): Shared<App>) -> Response {

@@ -1,6 +1,6 @@
 //! A recorded message of any of the node's topics.
 
-use crate::wire::{self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, SessionEvent, schema::Topic};
+use crate::wire::{self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, SessionEvent, Vibration, schema::Topic};
 
 /// The content of a recorded message; which it is decides its topic.
 #[derive(Clone, Debug, PartialEq)]
@@ -10,6 +10,7 @@ pub enum Payload {
     SessionEvent(SessionEvent),
     RigInfo(RigInfo),
     Diagnostics(DiagnosticArray),
+    Vibration(Vibration),
 }
 
 impl Payload {
@@ -21,6 +22,7 @@ impl Payload {
             Self::SessionEvent(_) => Topic::SessionEvent,
             Self::RigInfo(_) => Topic::RigInfo,
             Self::Diagnostics(_) => Topic::Diagnostics,
+            Self::Vibration(_) => Topic::Vibration,
         }
     }
 
@@ -36,6 +38,7 @@ impl Payload {
             Self::SessionEvent(message) => wire::to_cdr(message),
             Self::RigInfo(message) => wire::to_cdr(message),
             Self::Diagnostics(message) => wire::to_cdr(message),
+            Self::Vibration(message) => wire::to_cdr(message),
         }
     }
 
@@ -51,6 +54,7 @@ impl Payload {
             Topic::SessionEvent => Self::SessionEvent(wire::from_cdr(cdr)?),
             Topic::RigInfo => Self::RigInfo(wire::from_cdr(cdr)?),
             Topic::Diagnostics => Self::Diagnostics(wire::from_cdr(cdr)?),
+            Topic::Vibration => Self::Vibration(wire::from_cdr(cdr)?),
         })
     }
 }

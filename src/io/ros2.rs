@@ -16,7 +16,7 @@ use thiserror::Error;
 use self::link::{Durability, Link};
 use super::heard::{Bus, Counts, Heard};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
-use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, SessionEvent, topic};
+use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, SessionEvent, Vibration, topic};
 
 /// The name of the node, before remapping.
 pub const NODE_NAME: &str = "squealcast";
@@ -121,7 +121,7 @@ impl Parameters {
     }
 }
 
-/// The node's side: hears operating points, publishes everything else.
+/// The node's side: hears operating points and the measured vibration, publishes everything else.
 pub struct Ros2 {
     // First: publishers go before the node.
     prediction: Publisher<Prediction>,
@@ -132,7 +132,8 @@ pub struct Ros2 {
 }
 
 impl Ros2 {
-    /// Joins the network and starts the node's thread; every operating point goes to `sink`, on that thread.
+    /// Joins the network and starts the node's thread; every operating point goes to `sink`, every measured vibration to
+    /// `vibration`, on that thread.
     ///
     /// # Errors
     /// Names that are none, a value that `validate` refuses, or whatever DDS refuses.
@@ -140,6 +141,7 @@ impl Ros2 {
         options: &Ros2Options,
         parameters: Parameters,
         sink: impl FnMut(Heard<OperatingPoint>) + Send + 'static,
+        vibration: impl FnMut(Heard<Vibration>) + Send + 'static,
     ) -> Result<Self, Ros2Error> {
         let started = Arc::new(AtomicBool::new(false));
         let mut link = Link::join(options, NODE_NAME, parameters.declare(Arc::clone(&started)))?;
@@ -148,6 +150,7 @@ impl Ros2 {
         let session_event = link.publisher(topic::SESSION_EVENT, ours("SessionEvent"), Durability::Volatile)?;
         let diagnostics_type = MessageTypeName::new("diagnostic_msgs", "DiagnosticArray");
         let diagnostics = link.publisher(topic::DIAGNOSTICS, diagnostics_type, Durability::Volatile)?;
+        link.listen_aside(topic::VIBRATION, ours("Vibration"), vibration)?;
         link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink)?;
         started.store(true, Ordering::Release);
         Ok(Self { prediction, rig, session_event, diagnostics, link })
@@ -210,9 +213,10 @@ impl Ros2 {
     pub fn stop(self) {}
 }
 
-/// The rig's side: publishes operating points, hears predictions.
+/// The rig's side: publishes operating points and its measured vibration, hears predictions.
 pub struct Ros2Source {
     operating_point: Publisher<OperatingPoint>,
+    vibration: Publisher<Vibration>,
     link: Link<Prediction>,
 }
 
@@ -228,8 +232,9 @@ impl Ros2Source {
         let node_options = Parameters::none().declare(Arc::new(AtomicBool::new(true)));
         let mut link = Link::join(options, SOURCE_NODE_NAME, node_options)?;
         let operating_point = link.publisher(topic::OPERATING_POINT, ours("OperatingPoint"), Durability::Volatile)?;
+        let vibration = link.publisher(topic::VIBRATION, ours("Vibration"), Durability::Volatile)?;
         link.listen(topic::PREDICTION, ours("Prediction"), |prediction| prediction.input_seq, sink)?;
-        Ok(Self { operating_point, link })
+        Ok(Self { operating_point, vibration, link })
     }
 
     /// Publishes an operating point, without waiting.
@@ -240,9 +245,22 @@ impl Ros2Source {
         publish(&self.operating_point, topic::OPERATING_POINT, point)
     }
 
+    /// Publishes a measured vibration, without waiting.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn publish_vibration(&self, vibration: &Vibration) -> Result<(), Ros2Error> {
+        publish(&self.vibration, topic::VIBRATION, vibration)
+    }
+
     /// How many readers the operating points have, those included that were killed less than their lease ago.
     pub fn readers(&self) -> usize {
         self.operating_point.get_subscription_count(self.link.node())
+    }
+
+    /// How many readers the vibration has, those included that were killed less than their lease ago.
+    pub fn vibration_readers(&self) -> usize {
+        self.vibration.get_subscription_count(self.link.node())
     }
 
     /// How many publishers of predictions are known, those included that were killed less than their lease ago.

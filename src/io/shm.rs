@@ -25,7 +25,7 @@ use iceoryx2::waitset::{WaitSetAttachmentError, WaitSetCreateError};
 use thiserror::Error;
 
 use super::heard::{Bus, Counters, Counts, Gaps, Heard};
-use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm};
+use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm, VibrationForm};
 
 /// The ports may be used from any thread; peers with single-threaded ports connect to them all the same.
 type Ipc = ipc_threadsafe::Service;
@@ -36,6 +36,10 @@ pub type ShmInput = ShmReader<OperatingPointForm>;
 pub type ShmOutput = ShmWriter<PredictionForm>;
 /// Publishes operating points: a rig, or its simulator.
 pub type ShmSource = ShmWriter<OperatingPointForm>;
+/// Hears the measured vibration.
+pub type ShmVibrationInput = ShmReader<VibrationForm>;
+/// Publishes the measured vibration.
+pub type ShmVibrationSource = ShmWriter<VibrationForm>;
 /// Hears predictions.
 pub type ShmSink = ShmReader<PredictionForm>;
 

@@ -17,7 +17,7 @@ use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 
 pub use mapper::{chart_hash, map_hash, session_chart, session_map};
 pub use outputs::Outputs;
-pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, Watch};
+pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
 use crate::io::clock;
 use crate::io::heard::{Bus, Heard};
@@ -44,6 +44,8 @@ const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
 pub enum Incoming {
     /// Conditions came over a bus.
     Input(Heard<wire::OperatingPoint>),
+    /// A measured vibration came over a bus: it is recorded and shown, and shapes nothing.
+    Vibration(Heard<wire::Vibration>),
     /// A setting was changed, its value validated.
     Parameter { name: String, value: f64 },
     /// The stability map that was asked for, or why there is none.
@@ -68,6 +70,7 @@ pub struct Node {
     statistics: Statistics,
     watch: Watch,
     heard_before: Remembered,
+    vibration_heard_before: Remembered,
     last_heard: Instant,
     silent: bool,
     /// What a prediction takes, solved or read off the chart, smoothed.
@@ -90,6 +93,7 @@ impl Node {
             statistics: Statistics::default(),
             watch,
             heard_before: Remembered::default(),
+            vibration_heard_before: Remembered::default(),
             last_heard: Instant::now(),
             silent: false,
             prediction_time: Duration::ZERO,
@@ -128,6 +132,7 @@ impl Node {
                 match next {
                     Incoming::Stop => break 'run,
                     Incoming::Input(heard) => self.input(heard, &backlog),
+                    Incoming::Vibration(heard) => self.vibration(heard),
                     Incoming::Parameter { name, value } => self.parameter(name, value),
                     Incoming::Map { point, map } => self.map(point, map),
                     Incoming::Chart(chart) => self.chart(chart),
@@ -196,6 +201,16 @@ impl Node {
         if self.session.counters().worked() > worked_before {
             let known = if self.prediction_time.is_zero() { took } else { self.prediction_time };
             self.prediction_time = (known * 7 + took) / 8;
+        }
+    }
+
+    /// Hands a vibration on. The session does not get it, so that a session is the same with and without.
+    fn vibration(&mut self, heard: Heard<wire::Vibration>) {
+        // It has no number: what comes over both buses has the same stamp and bits.
+        let vibration = heard.message;
+        if self.vibration_heard_before.is_new(heard.bus, vibration.header.stamp, vibration.frequency_hz.to_bits()) {
+            self.watch.vibration(heard.at.wall_ns, &vibration);
+            self.outputs.record(heard.at.wall_ns, Payload::Vibration(vibration));
         }
     }
 

@@ -8,7 +8,7 @@ use crate::io::heard::Counts;
 use crate::io::message::{Message, Payload};
 use crate::io::recorder::RecorderHandle;
 use crate::io::ros2::Ros2;
-use crate::io::shm::{ShmInput, ShmOutput};
+use crate::io::shm::{ShmInput, ShmOutput, ShmVibrationInput};
 use crate::wire::{DiagnosticArray, Prediction, RigInfo, SessionEvent};
 
 /// The buses and the recorder of a node; any of them may be missing.
@@ -16,6 +16,7 @@ use crate::wire::{DiagnosticArray, Prediction, RigInfo, SessionEvent};
 pub struct Outputs {
     pub shm: Option<ShmOutput>,
     pub shm_input: Option<ShmInput>,
+    pub shm_vibration: Option<ShmVibrationInput>,
     pub ros2: Option<Ros2>,
     pub recorder: Option<RecorderHandle>,
     /// Inputs that came into a full queue.

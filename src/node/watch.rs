@@ -6,7 +6,7 @@ use std::time::Instant;
 use crate::io::clock;
 use crate::physics::StabilityMap;
 use crate::session::Counters;
-use crate::wire::{OperatingPoint, Prediction};
+use crate::wire::{OperatingPoint, Prediction, Vibration};
 
 /// What there is to see.
 #[derive(Clone, Debug, Default)]
@@ -92,6 +92,22 @@ impl Sample {
     }
 }
 
+/// A measured vibration, small enough to keep many of.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VibrationSample {
+    /// When it was heard, ns since the epoch.
+    pub time_ns: i64,
+    pub frequency_hz: f64,
+    pub level_db: f64,
+}
+
+impl VibrationSample {
+    /// The sample of a vibration heard at `time_ns`.
+    pub fn new(time_ns: i64, vibration: &Vibration) -> Self {
+        Self { time_ns, frequency_hz: vibration.frequency_hz, level_db: vibration.level_db }
+    }
+}
+
 /// A shared view of the latest state, and of the samples since somebody began to follow them.
 #[derive(Clone, Default)]
 pub struct Watch(Arc<Mutex<Watched>>);
@@ -103,6 +119,8 @@ struct Watched {
     input: Option<OperatingPoint>,
     /// `None` while nobody follows.
     samples: Option<Vec<Sample>>,
+    /// Of the same follower.
+    vibrations: Vec<VibrationSample>,
     lost: u64,
 }
 
@@ -122,20 +140,28 @@ impl Watch {
         })
     }
 
+    /// As [`Watch::take_samples`], of the measured vibration. It begins to follow with the samples.
+    pub fn take_vibrations(&self, vibrations: &mut Vec<VibrationSample>) {
+        vibrations.clear();
+        self.with(|watched| std::mem::swap(&mut watched.vibrations, vibrations));
+    }
+
     fn with<T>(&self, action: impl FnOnce(&mut Watched) -> T) -> T {
         action(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    pub(super) fn input(&self, input: &OperatingPoint) {
+    /// An input came.
+    pub fn input(&self, input: &OperatingPoint) {
         self.with(|watched| {
             watched.snapshot.heard = Some(Instant::now());
             watched.input = Some(input.clone());
         });
     }
 
-    pub(super) fn prediction(&self, prediction: Prediction) {
+    /// It was predicted.
+    pub fn prediction(&self, prediction: Prediction) {
         self.with(|watched| {
-            let Watched { snapshot, input, samples, lost } = watched;
+            let Watched { snapshot, input, samples, lost, .. } = watched;
             if let Some(samples) = samples {
                 if samples.len() < MOST_SAMPLES {
                     samples.push(Sample::new(clock::now_ns(), input.as_ref(), &prediction));
@@ -145,6 +171,14 @@ impl Watch {
             }
             snapshot.input.clone_from(input);
             snapshot.prediction = Some(prediction);
+        });
+    }
+
+    pub(super) fn vibration(&self, time_ns: i64, vibration: &Vibration) {
+        self.with(|watched| {
+            if watched.samples.is_some() && watched.vibrations.len() < MOST_SAMPLES {
+                watched.vibrations.push(VibrationSample::new(time_ns, vibration));
+            }
         });
     }
 

@@ -13,6 +13,8 @@ use crate::physics;
 pub mod topic {
     /// Conditions in.
     pub const OPERATING_POINT: &str = "/rig/operating_point";
+    /// Measured vibration in; it shapes no prediction.
+    pub const VIBRATION: &str = "/rig/vibration";
     /// Predictions out.
     pub const PREDICTION: &str = "/squealcast/prediction";
     /// What the node predicts for; transient local.
@@ -48,6 +50,14 @@ pub struct OperatingPoint {
     pub normal_load_n: f64,
     pub disc_speed_rad_s: f64,
     pub friction_coefficient: f64,
+}
+
+/// `squealcast_msgs/Vibration`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Vibration {
+    pub header: Header,
+    pub frequency_hz: f64,
+    pub level_db: f64,
 }
 
 /// `squealcast_msgs/Mode`.

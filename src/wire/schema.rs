@@ -18,6 +18,8 @@ pub enum Topic {
     RigInfo,
     /// [`topic::DIAGNOSTICS`]
     Diagnostics,
+    /// [`topic::VIBRATION`]
+    Vibration,
 }
 
 const HEADER: (&str, &str) = (
@@ -36,8 +38,8 @@ const DIAGNOSTIC_ARRAY: &str = "std_msgs/Header header\nDiagnosticStatus[] statu
 
 impl Topic {
     /// All of them, in the order recordings list them.
-    pub const ALL: [Self; 5] =
-        [Self::OperatingPoint, Self::Prediction, Self::SessionEvent, Self::RigInfo, Self::Diagnostics];
+    pub const ALL: [Self; 6] =
+        [Self::OperatingPoint, Self::Prediction, Self::SessionEvent, Self::RigInfo, Self::Diagnostics, Self::Vibration];
 
     /// The topic's name on ROS 2 and in recordings.
     pub fn name(self) -> &'static str {
@@ -47,6 +49,7 @@ impl Topic {
             Self::SessionEvent => topic::SESSION_EVENT,
             Self::RigInfo => topic::RIG,
             Self::Diagnostics => topic::DIAGNOSTICS,
+            Self::Vibration => topic::VIBRATION,
         }
     }
 
@@ -58,6 +61,7 @@ impl Topic {
             Self::SessionEvent => "squealcast_msgs/msg/SessionEvent",
             Self::RigInfo => "squealcast_msgs/msg/RigInfo",
             Self::Diagnostics => "diagnostic_msgs/msg/DiagnosticArray",
+            Self::Vibration => "squealcast_msgs/msg/Vibration",
         }
     }
 
@@ -79,13 +83,14 @@ impl Topic {
             Self::SessionEvent => include_str!("../../msgs/msg/SessionEvent.msg"),
             Self::RigInfo => include_str!("../../msgs/msg/RigInfo.msg"),
             Self::Diagnostics => DIAGNOSTIC_ARRAY,
+            Self::Vibration => include_str!("../../msgs/msg/Vibration.msg"),
         }
     }
 
     /// The messages it refers to: `package/Type` and text.
     fn dependencies(self) -> &'static [(&'static str, &'static str)] {
         match self {
-            Self::OperatingPoint | Self::SessionEvent => &[HEADER, TIME],
+            Self::OperatingPoint | Self::SessionEvent | Self::Vibration => &[HEADER, TIME],
             Self::Prediction => &[HEADER, TIME, MODE],
             Self::RigInfo => &[],
             Self::Diagnostics => &[HEADER, TIME, DIAGNOSTIC_STATUS, KEY_VALUE],

@@ -30,6 +30,13 @@
 //! | `modes` (zero-filled) | 192 | mode × 64 |
 //! | *size 4288, alignment 8* | | |
 //!
+//! | `squealcast/Vibration/1` | offset | type |
+//! |---|---|---|
+//! | `stamp_ns` (since the epoch) | 0 | i64 |
+//! | `frequency_hz` | 8 | f64 |
+//! | `level_db` | 16 | f64 |
+//! | *size 24, alignment 8* | | |
+//!
 //! | mode | offset | type |
 //! |---|---|---|
 //! | `id` | 0 | u32 |
@@ -46,7 +53,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 use thiserror::Error;
 
-use super::{Header, MAX_MODES, Mode, OperatingPoint, Prediction, Time, level};
+use super::{Header, MAX_MODES, Mode, OperatingPoint, Prediction, Time, Vibration, level};
 
 /// At most this many bytes of [`Prediction::reason`] are carried.
 pub const REASON_BYTES: usize = 128;
@@ -87,7 +94,7 @@ pub trait Form: ZeroCopySend + Copy + std::fmt::Debug + Send + 'static {
     /// Whatever in it is not a value of the message.
     fn to_message(&self) -> Result<Self::Message, FormError>;
 
-    /// The sequence number that readers look for gaps in.
+    /// The sequence number that readers look for gaps in; always the same where a message has none.
     fn seq(&self) -> u64;
 }
 
@@ -101,6 +108,16 @@ pub struct OperatingPointForm {
     pub normal_load_n: f64,
     pub disc_speed_rad_s: f64,
     pub friction_coefficient: f64,
+}
+
+/// `squealcast/Vibration/1`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/Vibration/1")]
+pub struct VibrationForm {
+    pub stamp_ns: i64,
+    pub frequency_hz: f64,
+    pub level_db: f64,
 }
 
 /// One mode of a [`PredictionForm`].
@@ -166,6 +183,25 @@ impl Form for OperatingPointForm {
 
     fn seq(&self) -> u64 {
         self.seq
+    }
+}
+
+impl Form for VibrationForm {
+    type Message = Vibration;
+    const SERVICE: &'static str = "rig/vibration";
+
+    fn from_message(message: &Vibration) -> Result<Self, FormError> {
+        let Vibration { header, frequency_hz, level_db } = message;
+        Ok(Self { stamp_ns: header.stamp.as_ns(), frequency_hz: *frequency_hz, level_db: *level_db })
+    }
+
+    fn to_message(&self) -> Result<Vibration, FormError> {
+        let Self { stamp_ns, frequency_hz, level_db } = *self;
+        Ok(Vibration { header: header(stamp_ns)?, frequency_hz, level_db })
+    }
+
+    fn seq(&self) -> u64 {
+        0
     }
 }
 
@@ -324,6 +360,15 @@ mod tests {
             ],
             [0, 8, 16, 24, 32]
         );
+        assert_eq!((size_of::<VibrationForm>(), align_of::<VibrationForm>()), (24, 8));
+        assert_eq!(
+            [
+                offset_of!(VibrationForm, stamp_ns),
+                offset_of!(VibrationForm, frequency_hz),
+                offset_of!(VibrationForm, level_db),
+            ],
+            [0, 8, 16]
+        );
         assert_eq!((size_of::<ModeForm>(), align_of::<ModeForm>()), (64, 8));
         assert_eq!(
             [
@@ -368,9 +413,12 @@ mod tests {
                 <OperatingPointForm as ZeroCopySend>::type_name(),
                 <PredictionForm as ZeroCopySend>::type_name(),
                 <ModeForm as ZeroCopySend>::type_name(),
+                <VibrationForm as ZeroCopySend>::type_name(),
             ]
         };
-        assert_eq!(names, ["squealcast/OperatingPoint/1", "squealcast/Prediction/1", "squealcast/Mode/1"]);
+        let expected =
+            ["squealcast/OperatingPoint/1", "squealcast/Prediction/1", "squealcast/Mode/1", "squealcast/Vibration/1"];
+        assert_eq!(names, expected);
     }
 
     #[test]

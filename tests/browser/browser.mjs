@@ -16,6 +16,8 @@ export const launch = () => chromium.launch({ executablePath: process.env.CHROMI
 /** A page whose console errors and requests to other origins are collected in `faults`. */
 export async function open(browser, url, options, faults) {
   const context = await browser.newContext({ viewport: { width: 1280, height: 900 }, ...options });
+  // Long enough for any machine, however busy.
+  context.setDefaultTimeout(180000);
   const page = await context.newPage();
   const { origin } = new URL(url);
   page.on("console", (message) => {
@@ -33,6 +35,14 @@ export async function open(browser, url, options, faults) {
   });
   await page.goto(url);
   return page;
+}
+
+/** Asks again until `holds` says so; how long that takes is not judged. */
+export async function until(what, holds) {
+  for (const began = Date.now(); !(await holds()); ) {
+    check(Date.now() - began < 180000, `waited for 180 s: ${what}`);
+    await new Promise((next) => setTimeout(next, 100));
+  }
 }
 
 export async function picture(page, folder, name) {

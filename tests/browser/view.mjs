@@ -34,7 +34,7 @@ for (const share of [0.1, 0.9, 0.35, 0.6, 0.2]) {
 check(Math.max(...waits) < 500, `scrubbing took ${waits} ms`);
 
 // Jump: the event's onset is SQUEAL.
-await page.locator("#events .jump").last().click();
+await page.locator("#events tr.squeal .jump").last().click();
 await page.waitForSelector('#status[data-level="squeal"]', { timeout: 3000 });
 const first = await clock();
 await page.locator("#next").click();

@@ -87,7 +87,8 @@ function take(state) {
       mapShown = number;
     });
   }
-  if (state.events !== eventsShown) {
+  // Those of a recording are all there from the beginning.
+  if (!recording && state.events !== eventsShown) {
     once("events", async () => {
       const change = state.events;
       events.show(await ask("events.json"));
@@ -157,11 +158,12 @@ if (recording) {
   });
   const whole = await ask("history.json");
   history.load(whole);
-  timeline.paint(whole);
-  const all = await ask("events.json");
-  events.show(all);
-  timeline.events = all;
-  new ResizeObserver(() => timeline.paint(whole)).observe(at("track-levels"));
+  const [all, comparison] = [await ask("events.json"), await ask("comparison.json")];
+  const measured = comparison?.measured ?? [];
+  timeline.paint(whole, measured);
+  events.show(all, comparison);
+  timeline.events = [...all, ...measured.filter((squeal) => squeal.verdict !== "hit")].sort((a, b) => a.onset_s - b.onset_s);
+  new ResizeObserver(() => timeline.paint(whole, measured)).observe(at("track-levels"));
   timeline.go(about.span_s[0]);
 } else {
   const stream = new EventSource("stream");

@@ -1,8 +1,11 @@
-// The table of onsets and ends.
+// The table of onsets and ends; in a recording with what else happened and what was measured.
 
 import { NONE, fixed, known, time } from "./format.js";
 
 const MOST = 200;
+/** More notes than this would hide the events. */
+const MOST_NOTES = 50;
+const VERDICTS = { hit: "measured: hit", not_predicted: "measured: miss", other_frequency: "measured: miss" };
 
 export class Events {
   constructor(about, jump) {
@@ -10,24 +13,29 @@ export class Events {
     this.note = document.getElementById("events-note");
     this.jump = jump;
     this.start = about.span_s?.[0];
-    this.events = [];
+    this.notes = (about.notes ?? []).slice(0, MOST_NOTES).map((note) => ({ ...note, kind: note.what, class: "aside" }));
   }
 
-  show(events) {
-    this.events = events;
-    const shown = events.slice(-MOST).reverse();
+  /** `comparison` is `null` where nothing was measured. */
+  show(events, comparison = null) {
+    const measured = (comparison?.measured ?? []).map((squeal) => ({ ...squeal, kind: VERDICTS[squeal.verdict], class: squeal.verdict === "hit" ? "aside" : "missed" }));
+    const alarms = new Set(comparison?.false_alarms);
+    const told = events.map((event) => (alarms.has(event.number) ? { ...event, note: "false alarm" } : event));
+    const shown = [...told, ...this.notes, ...measured].sort((a, b) => a.onset_s - b.onset_s).slice(-MOST).reverse();
     const squeals = events.filter((event) => event.kind === "SQUEAL").length;
-    this.note.textContent = events.length ? `${squeals} × squeal, ${events.length - squeals} × fault${events.length > MOST ? `, the last ${MOST} shown` : ""}` : "none so far";
+    const summary = events.length ? `${squeals} × squeal, ${events.length - squeals} × fault${events.length > MOST ? `, the last ${MOST} shown` : ""}` : "none so far";
+    const verdict = comparison && `; measured: ${measured.filter((squeal) => squeal.verdict === "hit").length} hits, ${measured.filter((squeal) => squeal.verdict !== "hit").length} misses, ${alarms.size} false alarms`;
+    this.note.textContent = summary + (verdict ?? "");
     this.body.replaceChildren(...shown.map((event) => this.#row(event)));
   }
 
   #row(event) {
     const row = document.createElement("tr");
-    row.className = event.kind.toLowerCase();
-    const lasts = event.end_s === null;
+    row.className = event.class ?? event.kind.toLowerCase();
+    const duration = event.end_s === null ? "lasts" : fixed(event.end_s - event.onset_s, 2);
     const values = [
-      event.number, event.kind, this.start === undefined ? time(event.onset_s) : `${fixed(event.onset_s - this.start, 2)} s`,
-      lasts ? "lasts" : fixed(event.end_s - event.onset_s, 2), event.mode_id ?? NONE, this.#frequency(event.frequency_hz),
+      event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, this.start === undefined ? time(event.onset_s) : `${fixed(event.onset_s - this.start, 2)} s`,
+      duration, event.mode_id ?? NONE, this.#frequency(event.frequency_hz),
       fixed(event.friction_coefficient, 4), fixed(event.normal_load_n, 1), fixed(event.disc_speed_rad_s, 2),
     ];
     values.forEach((value, k) => {
@@ -37,7 +45,7 @@ export class Events {
         button.type = "button";
         button.className = "jump";
         button.textContent = value;
-        button.setAttribute("aria-label", `Go to event ${event.number} at ${value}`);
+        button.setAttribute("aria-label", `Go to ${event.number ? `event ${event.number}` : event.kind} at ${value}`);
         button.addEventListener("click", () => this.jump(event.onset_s));
         cell.append(button);
       } else {

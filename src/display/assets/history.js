@@ -1,17 +1,18 @@
-// The last minutes: ranges of load, speed, friction, growth and margin, and a waterfall of the unstable frequencies.
+// The last minutes: ranges of load, speed, friction, growth and margin, of the measured vibration where there is one, and
+// a waterfall of the unstable frequencies with the measured ones.
 
 import { Decimals, colour, fixed, known, put, time } from "./format.js";
 
 const at = (id) => document.getElementById(id);
+/** `least` is the least range shown of a quantity, so that noise does not fill the plot. */
 const ROWS = [
-  { key: "load", label: "load", unit: "N", paint: "--mode-6" },
-  { key: "speed", label: "speed", unit: "rad/s", paint: "--mode-6" },
-  { key: "mu", label: "μ", unit: "", paint: "--mode-0" },
-  { key: "growth", label: "growth", unit: "1/s", paint: "--squeal-line" },
-  { key: "margin", label: "margin", unit: "", paint: "--mode-2" },
+  { key: "load", label: "load", unit: "N", paint: "--mode-6", least: 20, range: (bin) => bin.r[0] },
+  { key: "speed", label: "speed", unit: "rad/s", paint: "--mode-6", least: 0.5, range: (bin) => bin.r[1] },
+  { key: "mu", label: "μ", unit: "", paint: "--mode-0", least: 0.05, range: (bin) => bin.r[2] },
+  { key: "growth", label: "growth", unit: "1/s", paint: "--squeal-line", least: 1e-3, range: (bin) => bin.r[3] },
+  { key: "margin", label: "margin", unit: "", paint: "--mode-2", least: 0.05, range: (bin) => bin.r[4] },
 ];
-/** Least range shown of each quantity, so that noise does not fill the plot. */
-const LEAST = [20, 0.5, 0.05, 1e-3, 0.05];
+const MEASURED = { key: "measured", label: "measured", unit: "dB", paint: "--mode-3", least: 20, range: (bin) => bin.v && [bin.v.lo, bin.v.hi] };
 
 export class History {
   constructor(about) {
@@ -21,6 +22,8 @@ export class History {
     this.length = 300;
     this.plots = [];
     this.moment = null;
+    this.threshold = about.vibration_threshold_db;
+    this.measured = false;
     if (this.live) {
       at("history-range").addEventListener("change", (event) => {
         this.length = Number(event.target.value);
@@ -58,7 +61,8 @@ export class History {
     for (const plot of this.plots) plot.u.destroy();
     const holder = at("history-plots");
     holder.replaceChildren();
-    this.plots = ROWS.map((row, k) => this.#row(holder, row, k));
+    const rows = this.measured ? [...ROWS, MEASURED] : ROWS;
+    this.plots = rows.map((row) => this.#row(holder, row));
     this.plots.push(this.#waterfall(holder));
     this.refresh();
   }
@@ -115,21 +119,22 @@ export class History {
     return [Math.min(start, end - this.binS), end];
   }
 
-  #row(holder, row, k) {
+  #row(holder, row) {
     const element = this.#element(holder, row, "range");
     const paint = colour(row.paint);
     const y = {
       range: (_, low, high) => {
         if (!known(low) || !known(high)) return [0, 1];
-        const span = Math.max(high - low, LEAST[k]);
+        const span = Math.max(high - low, row.least);
         const middle = (high + low) / 2;
         return [middle - 0.56 * span, middle + 0.56 * span];
       },
     };
     const zero = (u) => {
-      if (row.key !== "margin" && row.key !== "growth") return;
+      const level = { margin: 0, growth: 0, measured: this.threshold }[row.key];
+      if (level === undefined) return;
       const { ctx, bbox } = u;
-      const y = u.valToPos(0, "y", true);
+      const y = u.valToPos(level, "y", true);
       if (y < bbox.top || y > bbox.top + bbox.height) return;
       ctx.fillStyle = colour("--muted");
       ctx.fillRect(bbox.left, y, bbox.width, devicePixelRatio);
@@ -141,7 +146,7 @@ export class History {
       hooks: { drawClear: [zero] },
     }, [[], [], []], element);
     return { u, element, marker: this.#marker(u), data: (bins) => {
-      const range = bins.map((bin) => bin.r[k]);
+      const range = bins.map(row.range);
       return [bins.map((bin) => (bin.k + 0.5) * this.binS), range.map((r) => r?.[0] ?? null), range.map((r) => r?.[1] ?? null)];
     } };
   }
@@ -149,6 +154,7 @@ export class History {
   #waterfall(holder) {
     const element = this.#element(holder, { label: "unstable", unit: "Hz" }, "waterfall");
     let shown = [];
+    let heard = [];
     let range = [0, 1];
     const paint = (u) => {
       const { ctx, bbox } = u;
@@ -163,6 +169,14 @@ export class History {
           ctx.fillRect(x, u.valToPos(hz, "y", true) - height / 2, width, height);
         }
       }
+      // What was heard, as rings.
+      ctx.strokeStyle = colour("--ink");
+      ctx.lineWidth = devicePixelRatio;
+      for (const bin of heard) {
+        ctx.beginPath();
+        ctx.arc(u.valToPos((bin.k + 0.5) * this.binS, "x", true), u.valToPos(bin.v.hz, "y", true), 3 * devicePixelRatio, 0, 2 * Math.PI);
+        ctx.stroke();
+      }
     };
     const u = new uPlot({
       ...this.#options(element, true, { range: () => range }),
@@ -171,7 +185,8 @@ export class History {
     }, [[], []], element);
     return { u, element, marker: this.#marker(u), data: (bins) => {
       shown = bins.filter((bin) => bin.u.length > 0);
-      const all = shown.flatMap((bin) => bin.u.map(([hz]) => hz));
+      heard = bins.filter((bin) => bin.v && bin.v.hi >= this.threshold);
+      const all = [...shown.flatMap((bin) => bin.u.map(([hz]) => hz)), ...heard.map((bin) => bin.v.hz)];
       if (all.length) {
         const low = Math.min(...all);
         const high = Math.max(...all);
@@ -192,6 +207,10 @@ export class History {
 
   /** Draws anew; a few times a second is enough. */
   refresh() {
+    if (!this.measured && this.bins.some((bin) => bin.v)) {
+      this.measured = true;
+      return this.draw();
+    }
     const from = this.#span()[0];
     let first = this.bins.findIndex((bin) => (bin.k + 1) * this.binS >= from);
     if (first < 0) first = 0;

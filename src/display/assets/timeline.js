@@ -84,16 +84,22 @@ export class Timeline {
     at("scrub").setAttribute("aria-valuetext", text);
   }
 
-  /** The gravest level along the whole recording, behind the slider. */
-  paint({ bin_s: binS, bins }) {
+  /** The gravest level along the whole recording, behind the slider; below it what was measured, a miss in full height. */
+  paint({ bin_s: binS, bins }, measured) {
     const canvas = at("track-levels");
     const width = canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
     const height = canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
     const ctx = canvas.getContext("2d");
     const scale = width / Math.max(1e-9, this.end - this.start);
     for (const bin of bins) {
+      if (bin.l === null) continue;
       ctx.fillStyle = colour(`--${LEVELS[bin.l]}`);
       ctx.fillRect((bin.k * binS - this.start) * scale, 0, Math.max(1, binS * scale + 0.5), height);
+    }
+    ctx.fillStyle = colour("--ink");
+    for (const squeal of measured) {
+      const share = squeal.verdict === "hit" ? 0.4 : 1;
+      ctx.fillRect((squeal.onset_s - this.start) * scale, (1 - share) * height, Math.max(1, (squeal.end_s - squeal.onset_s) * scale), share * height);
     }
   }
 }

@@ -1,6 +1,7 @@
-//! One ROS 2 node with one subscription, on a thread of its own.
+//! One ROS 2 node with its subscriptions, on a thread of its own.
 
 use std::net::Ipv4Addr;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
@@ -22,7 +23,10 @@ const KEEP_LAST: i32 = 64;
 /// after its lease, under a minute as a rule; RustDDS's 8192 would be full after 16 s at 500 Hz, for all readers.
 const MAX_UNANSWERED: i32 = 1 << 15;
 
-/// A node, and the thread that serves its parameters and hears its one topic of messages `M`.
+/// What the thread of a node does for one subscription.
+type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
+
+/// A node, and the thread that serves its parameters and hears its topic of messages `M`, and others aside.
 pub(super) struct Link<M> {
     options: Ros2Options,
     name: NodeName,
@@ -30,6 +34,7 @@ pub(super) struct Link<M> {
     node: Node,
     context: Context,
     counters: Arc<Counters>,
+    aside: Vec<Hearing>,
     running: Option<(oneshot::Sender<()>, JoinHandle<()>)>,
 }
 
@@ -63,6 +68,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
             node,
             subscription: None,
             counters: Arc::new(Counters::default()),
+            aside: vec![],
             running: None,
         })
     }
@@ -91,19 +97,20 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         seq: fn(&M) -> u64,
         sink: impl FnMut(Heard<M>) + Send + 'static,
     ) -> Result<(), Ros2Error> {
-        let (topic, name) = self.topic(topic, &kind, &qos(Durability::Volatile, KEEP_LAST).build())?;
-        let failed = |reason: String| Ros2Error::Topic { name: name.clone(), reason };
-        let subscription: Subscription<M> =
-            self.node.create_subscription(&topic, None).map_err(|e| failed(e.to_string()))?;
+        let subscription = Arc::new(self.subscribe::<M>(topic, &kind)?);
+        let failed = |reason: String| Ros2Error::Topic { name: topic.to_owned(), reason };
         let spinner = self.node.spinner().map_err(|e| failed(e.to_string()))?;
 
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (stop, stopped) = oneshot::channel();
-        let subscription = Arc::new(subscription);
         self.subscription = Some(Arc::clone(&subscription));
+        let aside = std::mem::take(&mut self.aside);
         let counters = Arc::clone(&self.counters);
         let thread = thread::Builder::new().name(format!("ros2 {}", self.name.base_name())).spawn(move || {
             runtime.block_on(async {
+                for hearing in aside {
+                    tokio::spawn(hearing);
+                }
                 let spin = async {
                     if spinner.spin().await.is_err() {
                         counters.failure();
@@ -120,6 +127,30 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         })?;
         self.running = Some((stop, thread));
         Ok(())
+    }
+
+    /// Subscribes to a topic of messages without numbers, which the thread of [`Link::listen`] will hear too. They are
+    /// not in its counts.
+    pub(super) fn listen_aside<N: DeserializeOwned + Send + Sync + 'static>(
+        &mut self,
+        topic: &'static str,
+        kind: MessageTypeName,
+        sink: impl FnMut(Heard<N>) + Send + 'static,
+    ) -> Result<(), Ros2Error> {
+        let subscription = self.subscribe::<N>(topic, &kind)?;
+        self.aside.push(Box::pin(async move {
+            hear(&subscription, |_| 0, sink, &Counters::default()).await;
+        }));
+        Ok(())
+    }
+
+    fn subscribe<N: 'static>(
+        &mut self,
+        topic: &'static str,
+        kind: &MessageTypeName,
+    ) -> Result<Subscription<N>, Ros2Error> {
+        let (topic, name) = self.topic(topic, kind, &qos(Durability::Volatile, KEEP_LAST).build())?;
+        self.node.create_subscription(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
     }
 
     /// A topic, remapped, and its name.
