@@ -119,7 +119,7 @@ fn against_friction(
 }
 
 /// A session over time, in seconds after `from_s`: ranges of load, speed, friction, growth and margin, of the measured
-/// vibration where there is one, and the unstable frequencies; shaded where squeal was predicted. Circles are
+/// vibration where there is one, and the unstable frequencies; shaded where squeal was predicted. Dots are
 /// frequencies measured at or above `threshold_db`.
 ///
 /// # Errors
@@ -183,17 +183,20 @@ pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -
             };
             history.bins().iter().filter_map(loud).collect::<Vec<_>>()
         };
-        let y =
-            padded(range(unstable().into_iter().map(|mode| mode.1).chain(measured().into_iter().map(|heard| heard.1))));
+        let heights = unstable().into_iter().map(|mode| mode.1).chain(measured().into_iter().map(|heard| heard.1));
+        let (low, high) = padded(range(heights));
+        // Not closer than that: a frequency that hardly changes is a line, not noise.
+        let room = (0.05 * (low + high) - 0.5 * (high - low)).max(0.0);
+        let y = (low - room, high + room);
         let mut chart = axes(area, time, y, "time, s", "unstable, Hz")?;
         chart.draw_series(shades(y)).map_err(failed)?;
-        let half = 0.012 * (y.1 - y.0);
+        let half = 0.02 * (y.1 - y.0);
         let bars = unstable().into_iter().map(|(index, hz)| {
             Rectangle::new([(at(index), hz - half), (at(index + 1), hz + half)], COLOURS[0].filled())
         });
         chart.draw_series(bars).map_err(failed)?;
-        let ring = |place| Circle::new(place, 3 * FINE, BLACK.stroke_width(FINE));
-        chart.draw_series(measured().into_iter().map(ring)).map_err(failed)?;
+        let dot = |place| Circle::new(place, 3 * FINE / 2, BLACK.filled());
+        chart.draw_series(measured().into_iter().map(dot)).map_err(failed)?;
         Ok(())
     })
 }

@@ -485,7 +485,7 @@ fn a_report_tells_hits_misses_and_false_alarms() {
             let (_, rest) = html.split_once(&format!("<th scope=\"row\">{name}</th><td>")).unwrap();
             rest.split_once("</td>").unwrap().0.to_owned()
         };
-        let counts =
+        let counts: [usize; 3] =
             ["hits", "misses", "false alarms"].map(|name| row(name).split_once(':').unwrap().0.parse().unwrap());
         assert_eq!(counts, expected, "squeals above {above}, {share} of {hz} Hz");
         assert!(html.contains("of at least 70 dB") && html.contains("widened by 0.5 s") && html.contains("within 5 %"));

@@ -49,7 +49,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         "Conditions and predictions",
         &figure(
             &inline(&plot::history("", &recorded.history, from_s, recorded.vibration.criteria().threshold_db)?),
-            "Smallest and largest value in each stretch of time; shaded where squeal was predicted. Circles are \
+            "Smallest and largest value in each stretch of time; shaded where squeal was predicted. Dots are \
              frequencies at which squeal was measured.",
         ),
     );
@@ -194,7 +194,10 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
     let leads = found.leads_s();
     let lead = match leads.as_slice() {
         [] => "–".to_owned(),
-        [first, .., last] => format!("{:.3} s median, {first:.3} s to {last:.3} s", leads[leads.len() / 2]),
+        [first, .., last] => {
+            let median_s = 0.5 * (leads[(leads.len() - 1) / 2] + leads[leads.len() / 2]);
+            format!("{median_s:.3} s median, {first:.3} s to {last:.3} s")
+        }
         [only] => format!("{only:.3} s"),
     };
     let rows = [

@@ -169,13 +169,11 @@ export class History {
           ctx.fillRect(x, u.valToPos(hz, "y", true) - height / 2, width, height);
         }
       }
-      // What was heard, as rings.
-      ctx.strokeStyle = colour("--ink");
-      ctx.lineWidth = devicePixelRatio;
+      // What was heard, as dots: small, so that they do not hide what was predicted.
+      ctx.fillStyle = colour("--ink");
+      const dot = 2 * devicePixelRatio;
       for (const bin of heard) {
-        ctx.beginPath();
-        ctx.arc(u.valToPos((bin.k + 0.5) * this.binS, "x", true), u.valToPos(bin.v.hz, "y", true), 3 * devicePixelRatio, 0, 2 * Math.PI);
-        ctx.stroke();
+        ctx.fillRect(u.valToPos((bin.k + 0.5) * this.binS, "x", true) - dot / 2, u.valToPos(bin.v.hz, "y", true) - dot / 2, dot, dot);
       }
     };
     const u = new uPlot({
