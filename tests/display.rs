@@ -591,6 +591,42 @@ fn pages_do_not_slow_the_node() {
     }
 }
 
+/// Resident memory of a node at 1 kHz with three pages that read and one that does not, every minute for ten.
+#[test]
+fn memory_is_flat_with_pages_attached() {
+    if !measures() {
+        return;
+    }
+    let _alone = alone();
+    let shown = Shown::demo(&["--rate", "1000", "--vibration", "0.36:0.33"]);
+    let _stalled = shown.listen();
+    for _ in 0..3 {
+        let mut page = shown.listen();
+        // Until the node ends.
+        std::thread::spawn(move || {
+            let mut buffer = vec![0; 1 << 16];
+            while page.read(&mut buffer).is_ok_and(|count| count > 0) {}
+        });
+    }
+    let resident_kb = || -> f64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", shown.child.id())).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
+        line.trim().trim_end_matches(" kB").parse().unwrap()
+    };
+    let mut minutes = vec![];
+    for minute in 1..=10 {
+        std::thread::sleep(Duration::from_secs(60));
+        for path in ["/history.json", "/events.json", "/map.json?number=1"] {
+            assert_eq!(shown.get(path).0, 200);
+        }
+        minutes.push(resident_kb());
+        println!("{minute:>2} min: {:.1} MB resident", minutes[minutes.len() - 1] / 1024.0);
+    }
+    shown.stop();
+    let (first, last) = (minutes[4], minutes[9]);
+    assert!(last - first < 0.02 * first, "{first} kB after 5 minutes, {last} kB after 10");
+}
+
 /// Every path of the Foxglove layout names a topic and a field that there is.
 #[test]
 fn the_foxglove_layout_names_what_there_is() {
