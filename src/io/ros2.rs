@@ -150,8 +150,8 @@ impl Ros2 {
         let session_event = link.publisher(topic::SESSION_EVENT, ours("SessionEvent"), Durability::Volatile)?;
         let diagnostics_type = MessageTypeName::new("diagnostic_msgs", "DiagnosticArray");
         let diagnostics = link.publisher(topic::DIAGNOSTICS, diagnostics_type, Durability::Volatile)?;
-        link.listen_aside(topic::VIBRATION, ours("Vibration"), vibration)?;
-        link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink)?;
+        let aside = link.aside(topic::VIBRATION, ours("Vibration"), vibration)?;
+        link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink, Some(aside))?;
         started.store(true, Ordering::Release);
         Ok(Self { prediction, rig, session_event, diagnostics, link })
     }
@@ -233,7 +233,7 @@ impl Ros2Source {
         let mut link = Link::join(options, SOURCE_NODE_NAME, node_options)?;
         let operating_point = link.publisher(topic::OPERATING_POINT, ours("OperatingPoint"), Durability::Volatile)?;
         let vibration = link.publisher(topic::VIBRATION, ours("Vibration"), Durability::Volatile)?;
-        link.listen(topic::PREDICTION, ours("Prediction"), |prediction| prediction.input_seq, sink)?;
+        link.listen(topic::PREDICTION, ours("Prediction"), |prediction| prediction.input_seq, sink, None)?;
         Ok(Self { operating_point, vibration, link })
     }
 

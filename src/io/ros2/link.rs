@@ -24,7 +24,7 @@ const KEEP_LAST: i32 = 64;
 const MAX_UNANSWERED: i32 = 1 << 15;
 
 /// What the thread of a node does for one subscription.
-type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
+pub(super) type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// A node, and the thread that serves its parameters and hears its topic of messages `M`, and others aside.
 pub(super) struct Link<M> {
@@ -34,7 +34,6 @@ pub(super) struct Link<M> {
     node: Node,
     context: Context,
     counters: Arc<Counters>,
-    aside: Vec<Hearing>,
     running: Option<(oneshot::Sender<()>, JoinHandle<()>)>,
 }
 
@@ -68,7 +67,6 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
             node,
             subscription: None,
             counters: Arc::new(Counters::default()),
-            aside: vec![],
             running: None,
         })
     }
@@ -89,13 +87,14 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         self.node.create_publisher(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
     }
 
-    /// Subscribes and starts the thread.
+    /// Subscribes and starts the thread, which hears what is in `aside` too.
     pub(super) fn listen(
         &mut self,
         topic: &'static str,
         kind: MessageTypeName,
         seq: fn(&M) -> u64,
         sink: impl FnMut(Heard<M>) + Send + 'static,
+        aside: Option<Hearing>,
     ) -> Result<(), Ros2Error> {
         let subscription = Arc::new(self.subscribe::<M>(topic, &kind)?);
         let failed = |reason: String| Ros2Error::Topic { name: topic.to_owned(), reason };
@@ -104,11 +103,10 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (stop, stopped) = oneshot::channel();
         self.subscription = Some(Arc::clone(&subscription));
-        let aside = std::mem::take(&mut self.aside);
         let counters = Arc::clone(&self.counters);
         let thread = thread::Builder::new().name(format!("ros2 {}", self.name.base_name())).spawn(move || {
             runtime.block_on(async {
-                for hearing in aside {
+                if let Some(hearing) = aside {
                     tokio::spawn(hearing);
                 }
                 let spin = async {
@@ -129,19 +127,18 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         Ok(())
     }
 
-    /// Subscribes to a topic of messages without numbers, which the thread of [`Link::listen`] will hear too. They are
-    /// not in its counts.
-    pub(super) fn listen_aside<N: DeserializeOwned + Send + Sync + 'static>(
+    /// Subscribes to another topic, of messages without numbers, for the thread of [`Link::listen`]. They are not in its
+    /// counts.
+    pub(super) fn aside<N: DeserializeOwned + Send + Sync + 'static>(
         &mut self,
         topic: &'static str,
         kind: MessageTypeName,
         sink: impl FnMut(Heard<N>) + Send + 'static,
-    ) -> Result<(), Ros2Error> {
+    ) -> Result<Hearing, Ros2Error> {
         let subscription = self.subscribe::<N>(topic, &kind)?;
-        self.aside.push(Box::pin(async move {
+        Ok(Box::pin(async move {
             hear(&subscription, |_| 0, sink, &Counters::default()).await;
-        }));
-        Ok(())
+        }))
     }
 
     fn subscribe<N: 'static>(
