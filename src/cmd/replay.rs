@@ -243,6 +243,7 @@ impl Player {
                 Payload::Prediction(message) => others.publish_prediction(message)?,
                 Payload::SessionEvent(message) => others.publish_session_event(message)?,
                 Payload::RigInfo(message) => others.publish_rig(message)?,
+                Payload::Sensitivity(message) => others.publish_sensitivity(message)?,
                 Payload::Diagnostics(message) => others.publish_diagnostics(message)?,
                 Payload::Vibration(message) => inputs.publish_vibration(message)?,
             }

@@ -14,7 +14,7 @@ use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig};
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::{Parameters, Ros2};
-use crate::io::shm::{ShmInput, ShmOutput, ShmVibrationInput};
+use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::node::{self, Incoming, Node, Outputs, Watch};
 use crate::rig::Rig;
 use crate::session::Counters;
@@ -83,6 +83,7 @@ pub fn serve(
     let mut outputs = Outputs { recorder: recorder.as_ref().map(Recorder::handle), ..Default::default() };
     if let Some(shm) = buses.shm() {
         outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
+        outputs.shm_sensitivity = Some(ShmSensitivity::new(&shm)?);
         if listening == Listening::ToTheBuses {
             let lost = &outputs.lost_inputs;
             outputs.shm_input = Some(ShmInput::spawn(&shm, hear(listening, &sender, lost, Incoming::Input))?);
