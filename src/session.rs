@@ -598,6 +598,53 @@ mod tests {
         assert_eq!((counters.solved, counters.charted, counters.reused, counters.faults), (4, 0, 2, 0));
     }
 
+    /// A rig whose contact stiffens with load: between two loads for which the ends of its windows were worked out, the
+    /// margin is off by no more than its bound; where they were, it is exact.
+    #[test]
+    fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
+        use crate::physics::synthetic::{Synthetic, rig};
+        let law = crate::physics::ContactLaw { exponent: 0.4, ..Default::default() };
+        let model = rig(&Synthetic { modes: 24, pairs: 12, damping_ratio: 0.0, contact_law: law, seed: 1 }).unwrap();
+        let like = Rig::load("nine-dof-case-2").expect("embedded");
+        let rig = Arc::new(Rig { model, band_max_hz: None, mu_max: 2.0, ..like });
+        let session = Session::new(rig.clone(), Settings::for_rig(&rig));
+        let mut session = with_map(session);
+        let mut solver = Solver::new(rig.model.dimension());
+        let mut exact_at = |load: f64| {
+            let point = OperatingPoint { normal_load_n: load, ..rig.reference };
+            StabilityMap::build(&rig.model, &mut solver, &point, &map_options(&rig)).unwrap().windows[0].mu_from
+        };
+        let (mut seq, mut largest) = (0, 0.0f64);
+        for load in [498.0, 501.0, 503.0] {
+            let truth = exact_at(load);
+            let mut asked = None;
+            for _ in 0..300 {
+                seq += 1;
+                // The friction coefficient moves a little: nothing is reused.
+                let input = conditions(seq, load, 13.0, 1e-4 * (seq % 10) as f64);
+                let effects = session.step(input).unwrap();
+                let prediction = effects.publish.unwrap();
+                let off = (prediction.critical_friction - truth).abs();
+                assert!(off <= prediction.friction_margin_error + 1e-12, "{load} N: {off} {prediction:?}");
+                if let Some(Want::Ends(point)) = effects.want {
+                    largest = largest.max(off);
+                    assert!(asked.replace(point).is_none(), "{load} N: asked for once");
+                    let map = session.map().cloned().unwrap();
+                    let ends = Ends::carried(&rig.model, &mut session.solver, &map, &point).unwrap().unwrap();
+                    session.step(Event::EndsReady(Arc::new(ends))).unwrap();
+                }
+            }
+            assert!(asked.is_some(), "{load} N");
+            let rests = predict(&mut session, conditions(seq + 1, load, 13.0, 1e-3));
+            assert!(
+                (rests.critical_friction - truth).abs() < 1e-10 && rests.friction_margin_error < 1e-10,
+                "{rests:?}"
+            );
+            seq += 1;
+        }
+        assert!(largest > 1e-10, "worth testing: extrapolation is off by {largest}");
+    }
+
     /// The same conditions read off the chart and solved: same identities, same level, every value within the bounds.
     #[test]
     fn a_chart_predicts_what_a_solve_does() {
