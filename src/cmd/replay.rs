@@ -150,7 +150,7 @@ impl Options {
                 played.fetch_add(1, Ordering::Relaxed);
                 match payload {
                     Payload::OperatingPoint(input) => watch.input(&input),
-                    Payload::Prediction(prediction) => watch.prediction(prediction),
+                    Payload::Prediction(prediction) => watch.prediction(&prediction),
                     _ => {}
                 }
             }

@@ -138,7 +138,7 @@ fn frame(rig: &Rig, node: Sender<Incoming>) -> live::Frame {
         title: rig.name.clone(),
         instability_threshold: rig.instability_threshold,
         foot: Box::new(|snapshot| {
-            let Counters { solved, charted, reused, faults } = snapshot.counters;
+            let Counters { solved, charted, reused, faults, .. } = snapshot.counters;
             let passed_over = snapshot.passed_over;
             format!(
                 "solved {solved}  from the chart {charted}  reused {reused}  faults {faults}  passed over {passed_over}"
