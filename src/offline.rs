@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use crate::io::message::{Message, Payload};
 use crate::io::recorder::{Recorder, RecorderConfig, RecorderError};
-use crate::node::{map_hash, parameter_event, rig_info, session_map};
+use crate::node::{at_load_and_speed, ends_hash, map_hash, parameter_event, rig_info, session_ends, session_map};
 use crate::physics::Solver;
 use crate::rig::Rig;
-use crate::session::{Effect, Event, Session};
+use crate::session::{Event, Session, Want};
 use crate::settings::Settings;
 use crate::wire::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
 
@@ -69,26 +69,26 @@ pub fn record(
         }
         write(stamp, Payload::OperatingPoint(input.clone()));
         // Settings are the rig's own here, and inputs are no settings: nothing can be refused.
-        for effect in session.step(Event::Input(input)).unwrap_or_default() {
-            match effect {
-                Effect::Publish(prediction) => write(stamp, Payload::Prediction(prediction)),
-                Effect::WantMap(point) => {
-                    let map = session_map(rig, &mut solver, &point).map_err(OfflineError::Map)?;
-                    write(
-                        stamp,
-                        Payload::SessionEvent(SessionEvent {
-                            header: header.clone(),
-                            kind: event_kind::STABILITY_MAP,
-                            normal_load_n: point.normal_load_n,
-                            disc_speed_rad_s: point.disc_speed_rad_s,
-                            hash: map_hash(&map),
-                            ..Default::default()
-                        }),
-                    );
-                    let _ = session.step(Event::MapReady(Arc::new(map)));
-                }
-            }
+        let effects = session.step(Event::Input(input)).unwrap_or_default();
+        if let Some(prediction) = effects.publish {
+            write(stamp, Payload::Prediction(prediction.clone()));
         }
+        let Some(want) = effects.want else { continue };
+        let (kind, point, hash, event) = match want {
+            Want::Map(point) => {
+                let map = session_map(rig, &mut solver, &point).map_err(OfflineError::Map)?;
+                (event_kind::STABILITY_MAP, point, map_hash(&map), Event::MapReady(Arc::new(map)))
+            }
+            Want::Ends(point) => {
+                let Some(map) = session.map() else { continue };
+                let found = session_ends(rig, &mut solver, map, &point).map_err(OfflineError::Map)?;
+                let Some(ends) = found else { continue };
+                (event_kind::WINDOW_ENDS, point, ends_hash(&ends), Event::EndsReady(Arc::new(ends)))
+            }
+        };
+        let event_at = SessionEvent { header, ..at_load_and_speed(kind, &point, hash) };
+        write(stamp, Payload::SessionEvent(event_at));
+        let _ = session.step(event);
     }
     let finished = recorder.finish(Duration::from_secs(600))?;
     match finished.status.dropped() {

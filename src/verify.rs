@@ -1,17 +1,18 @@
 //! Predicting a recorded session again and comparing, byte for byte.
 //!
 //! Exactly the inputs that were predicted are predicted again, in the recorded order, with the recorded session events
-//! between them; stability maps are computed anew at the load and speed their events name.
+//! between them; stability maps and ends of windows are computed anew at the load and speed their events name.
+//! Sensitivities are left out: nothing depends on them.
 
 use std::collections::{HashSet, VecDeque};
 use std::sync::Arc;
 
 use crate::io::message::Payload;
 use crate::io::recording::{Recorded, Recording, RecordingError};
-use crate::node::{chart_hash, map_hash, session_chart, session_map};
-use crate::physics::{OperatingPoint, Solver};
+use crate::node::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map};
+use crate::physics::{OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
-use crate::session::{Effect, Event, Session};
+use crate::session::{Event, Session};
 use crate::settings::Settings;
 use crate::wire::{self, Prediction, SessionEvent, Time, event_kind};
 
@@ -31,7 +32,7 @@ pub struct Verification {
     /// Recorded predictions that were not predicted now, and the other way round.
     pub missing: u64,
     pub extra: u64,
-    /// Stability maps and charts whose hash differs.
+    /// Stability maps, ends of windows and charts whose hash differs.
     pub different_maps: u64,
     /// Largest relative difference of a frequency, and difference of a growth rate in 1/s, over modes of equal identity.
     pub frequency_difference: f64,
@@ -96,11 +97,8 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, Ver
     let mut computed: VecDeque<Prediction> = VecDeque::new();
     let step = |session: &mut Session, computed: &mut VecDeque<Prediction>, event: Event| {
         // A parameter that the session refuses changed nothing when it was recorded either.
-        for effect in session.step(event).unwrap_or_default() {
-            if let Effect::Publish(prediction) = effect {
-                computed.push_back(prediction);
-            }
-        }
+        let effects = session.step(event).unwrap_or_default();
+        computed.extend(effects.publish.cloned());
     };
     for entry in recording.messages() {
         match entry.message {
@@ -112,7 +110,8 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, Ver
                 }
             }
             Recorded::Known(Payload::SessionEvent(event)) => {
-                let event = session_event(event, rig, &mut solver, &mut found)?;
+                let map = session.map().cloned();
+                let event = session_event(event, rig, map.as_deref(), &mut solver, &mut found)?;
                 step(&mut session, &mut computed, event);
             }
             Recorded::Known(Payload::Prediction(recorded)) => match computed.pop_front() {
@@ -136,6 +135,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, Ver
 fn session_event(
     event: SessionEvent,
     rig: &Rig,
+    map: Option<&StabilityMap>,
     solver: &mut Solver,
     found: &mut Verification,
 ) -> Result<Event, VerifyError> {
@@ -155,6 +155,19 @@ fn session_event(
                 found.describe(|| format!("stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s differs"));
             }
             Ok(Event::MapReady(Arc::new(map)))
+        }
+        event_kind::WINDOW_ENDS => {
+            let SessionEvent { normal_load_n, disc_speed_rad_s, hash, .. } = event;
+            let point = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient: 0.0 };
+            let failed = |reason: String| VerifyError::Map { normal_load_n, disc_speed_rad_s, reason };
+            let map = map.ok_or_else(|| failed("ends of windows before any map".to_owned()))?;
+            let ends = session_ends(rig, solver, map, &point).map_err(failed)?;
+            let ends = ends.ok_or_else(|| failed("the ends of its windows are not found again".to_owned()))?;
+            if ends_hash(&ends) != hash {
+                found.different_maps += 1;
+                found.describe(|| format!("ends of windows at {normal_load_n} N, {disc_speed_rad_s} rad/s differ"));
+            }
+            Ok(Event::EndsReady(Arc::new(ends)))
         }
         event_kind::CHART => {
             let chart = session_chart(rig, std::thread::available_parallelism().map_or(1, usize::from), &|| true)

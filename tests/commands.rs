@@ -14,6 +14,7 @@ use program::{Running, command, files_below, json, launch, number, run, text, un
 use serde_json::Value;
 use squealcast::io::message::Payload;
 use squealcast::io::recording::{Recorded, Recording};
+use squealcast::wire::event_kind;
 use tempfile::TempDir;
 
 fn folder() -> TempDir {
@@ -832,6 +833,32 @@ fn a_recording_verifies_and_another_rig_differs() {
     drop(folder);
 }
 
+/// A rig whose contact stiffens with load, its load on the way: the ends of its windows are carried along, and a replay
+/// carries them along the same.
+#[test]
+fn a_moving_load_carries_the_windows_along() {
+    let folder = folder();
+    let rig = std::fs::read_to_string(launch("nine-dof-case-2.toml")).expect("an embedded rig");
+    let rig = write(folder.path(), "stiffening.toml", &format!("{rig}\n[load]\nexponent = 0.4\n"));
+    let profile = "[[point]]\ntime_s = 0.0\nnormal_load_n = 500.0\ndisc_speed_rad_s = 13.0\nfriction_coefficient = 0.3\n\
+                   [[point]]\ntime_s = 2.0\nnormal_load_n = 510.0\ndisc_speed_rad_s = 13.0\nfriction_coefficient = 0.3\n";
+    let profile = write(folder.path(), "rising.toml", profile);
+    let out = text(folder.path());
+    run(["simulate", "--profile", &profile, "--rig", &rig, "--rate", "50", "--duration", "2", "--record", &out])
+        .exits(0);
+    let file = mcap(folder.path());
+    let events = |kind: u8| {
+        let recording = Recording::open(&file).expect("a recording");
+        let of_kind = recording.messages().filter(|entry| match &entry.message {
+            Recorded::Known(Payload::SessionEvent(event)) => event.kind == kind,
+            _ => false,
+        });
+        of_kind.count()
+    };
+    assert!(events(event_kind::STABILITY_MAP) >= 2 && events(event_kind::WINDOW_ENDS) >= 5);
+    run(["replay", "--verify", &text(&file)]).exits(0).says("0 different, 0 missing, 0 extra");
+}
+
 #[test]
 fn the_same_command_records_the_same_predictions() {
     let messages = |path: &Path| -> Vec<Vec<u8>> {
@@ -996,6 +1023,23 @@ fn a_node_predicts_what_shared_memory_brings_until_it_is_told_to_end() {
     for session in sessions {
         check_finished(&session);
         let recording = Recording::open(&session).expect("a recording");
+        // The rig was charted while it ran, and sensitivities were told.
+        let kinds: Vec<u8> = recording
+            .messages()
+            .filter_map(|entry| match entry.message {
+                Recorded::Known(Payload::SessionEvent(event)) => Some(event.kind),
+                _ => None,
+            })
+            .collect();
+        assert!(kinds.contains(&event_kind::CHART) && kinds.contains(&event_kind::STABILITY_MAP), "{kinds:?}");
+        let told = recording.messages().find_map(|entry| match entry.message {
+            Recorded::Known(Payload::Sensitivity(told)) if !told.nearest_window_end.is_nan() => Some(told),
+            _ => None,
+        });
+        if let Some(told) = told {
+            assert!((told.nearest_window_end - 0.82001495938185).abs() < 1e-10, "{told:?}");
+            assert_eq!((told.modes.len(), told.nearest_window_end_derivatives.by_normal_load_n), (9, 0.0));
+        }
         let predictions = recording.messages().filter_map(|entry| match entry.message {
             Recorded::Known(Payload::Prediction(prediction)) if prediction.level != 3 => Some(prediction),
             _ => None,

@@ -23,7 +23,7 @@ use squealcast::io::recording::{Recorded, Recording};
 use squealcast::io::ros_args::RosArgs;
 use squealcast::io::ros2::{Ros2Options, Ros2Source};
 use squealcast::io::shm::{ShmOptions, ShmSink, ShmSource};
-use squealcast::wire::{Header, OperatingPoint, Prediction, RigInfo, Time};
+use squealcast::wire::{Header, OperatingPoint, Prediction, RigInfo, Sensitivity, Time};
 use tempfile::TempDir;
 
 const RIG: &str = "nine-dof-case-2";
@@ -246,6 +246,7 @@ struct Content {
     inputs: Vec<OperatingPoint>,
     predictions: Vec<Prediction>,
     rigs: Vec<RigInfo>,
+    sensitivities: Vec<Sensitivity>,
     /// The values of the last diagnostics.
     diagnostics: HashMap<String, String>,
     last_log_time_ns: u64,
@@ -267,6 +268,7 @@ impl Content {
                     content.diagnostics = values.map(|pair| (pair.key, pair.value)).collect();
                 }
                 Recorded::Known(Payload::SessionEvent(_)) => {}
+                Recorded::Known(Payload::Sensitivity(sensitivity)) => content.sensitivities.push(sensitivity),
                 other => panic!("{other:?}"),
             }
         }
@@ -345,7 +347,10 @@ fn rclpy_is_answered_at_500_hz_for_30_s_and_the_recording_serves_others() {
     assert_eq!(found["topics"]["/rig/operating_point"], 15_000, "{found}");
     assert_eq!(found["predictions_of_an_input"], serde_json::json!({"1": 15_000}), "{found}");
     assert_eq!(found["attachments"], serde_json::json!([format!("{RIG}.toml")]));
-    assert_eq!(Content::read(&recording).count("messages_dropped"), 0);
+    let content = Content::read(&recording);
+    assert_eq!(content.count("messages_dropped"), 0);
+    assert!(!content.sensitivities.is_empty());
+    assert_eq!(found["topics"]["/squealcast/sensitivity"], content.sensitivities.len(), "{found}");
     verify(&recording);
 }
 

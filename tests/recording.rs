@@ -596,6 +596,7 @@ fn others_read_our_recordings() {
                 Payload::Prediction(m) => serde_json::to_value(m),
                 Payload::SessionEvent(m) => serde_json::to_value(m),
                 Payload::RigInfo(m) => serde_json::to_value(m),
+                Payload::Sensitivity(m) => serde_json::to_value(m),
                 Payload::Diagnostics(m) => serde_json::to_value(m),
             };
             assert_eq!(theirs["message"], ours.unwrap(), "{reader}");

@@ -150,7 +150,7 @@ impl Options {
                 played.fetch_add(1, Ordering::Relaxed);
                 match payload {
                     Payload::OperatingPoint(input) => watch.input(&input),
-                    Payload::Prediction(prediction) => watch.prediction(prediction),
+                    Payload::Prediction(prediction) => watch.prediction(&prediction),
                     _ => {}
                 }
             }
@@ -243,6 +243,7 @@ impl Player {
                 Payload::Prediction(message) => others.publish_prediction(message)?,
                 Payload::SessionEvent(message) => others.publish_session_event(message)?,
                 Payload::RigInfo(message) => others.publish_rig(message)?,
+                Payload::Sensitivity(message) => others.publish_sensitivity(message)?,
                 Payload::Diagnostics(message) => others.publish_diagnostics(message)?,
                 Payload::Vibration(message) => inputs.publish_vibration(message)?,
             }

@@ -14,7 +14,7 @@ use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig};
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::{Parameters, Ros2};
-use crate::io::shm::{ShmInput, ShmOutput, ShmVibrationInput};
+use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::node::{self, Incoming, Node, Outputs, Watch};
 use crate::rig::Rig;
 use crate::session::Counters;
@@ -83,6 +83,7 @@ pub fn serve(
     let mut outputs = Outputs { recorder: recorder.as_ref().map(Recorder::handle), ..Default::default() };
     if let Some(shm) = buses.shm() {
         outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
+        outputs.shm_sensitivity = Some(ShmSensitivity::new(&shm)?);
         if listening == Listening::ToTheBuses {
             let lost = &outputs.lost_inputs;
             outputs.shm_input = Some(ShmInput::spawn(&shm, hear(listening, &sender, lost, Incoming::Input))?);
@@ -137,7 +138,7 @@ fn frame(rig: &Rig, node: Sender<Incoming>) -> live::Frame {
         title: rig.name.clone(),
         instability_threshold: rig.instability_threshold,
         foot: Box::new(|snapshot| {
-            let Counters { solved, charted, reused, faults } = snapshot.counters;
+            let Counters { solved, charted, reused, faults, .. } = snapshot.counters;
             let passed_over = snapshot.passed_over;
             format!(
                 "solved {solved}  from the chart {charted}  reused {reused}  faults {faults}  passed over {passed_over}"

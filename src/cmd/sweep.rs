@@ -1,3 +1,4 @@
+use std::panic::resume_unwind;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -99,12 +100,31 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
     let mut solver = Solver::new(rig.model.dimension());
     let followed = MapOptions { mu_min: range.from.min(0.0), mu_max: range.to.max(0.0), windows, ..map_options(rig) };
     let map = StabilityMap::build(&rig.model, &mut solver, point, &followed)?;
-    let mut modes = vec![];
-    for mu in range.values() {
+    let values: Vec<f64> = range.values().collect();
+    let modes_at = |solver: &mut Solver, mu: f64| -> anyhow::Result<Vec<Swept>> {
         let spectrum = solver.solve(&rig.model, &point.with_friction(mu), Vectors::Right)?;
         let ids = map.identify(&spectrum);
         let summary = Summary::of_spectrum(&spectrum, &ids, rig.band_max_hz, rig.instability_threshold);
-        modes.extend(summary.modes.into_iter().map(|mode| (mu, mode)));
+        Ok(summary.modes.into_iter().map(|mode| (mu, mode)).collect())
+    };
+    // One thread for a solve, many solves at once: each condition by itself is the same wherever it is solved.
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let share = values.len().div_ceil(threads).max(1);
+    let sweep_part = |part: &[f64]| {
+        let mut solver = Solver::new(rig.model.dimension());
+        let mut modes = vec![];
+        for &mu in part {
+            modes.extend(modes_at(&mut solver, mu)?);
+        }
+        Ok(modes)
+    };
+    let parts: Vec<anyhow::Result<Vec<Swept>>> = std::thread::scope(|scope| {
+        let workers: Vec<_> = values.chunks(share).map(|part| scope.spawn(|| sweep_part(part))).collect();
+        workers.into_iter().map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic))).collect()
+    });
+    let mut modes = vec![];
+    for part in parts {
+        modes.extend(part?);
     }
     Ok((modes, map.windows))
 }

@@ -67,7 +67,7 @@ pub struct CountersShown {
 
 impl CountersShown {
     pub fn new(counters: Counters, passed_over: u64) -> Self {
-        let Counters { solved, charted, reused, faults } = counters;
+        let Counters { solved, charted, reused, faults, .. } = counters;
         Self { solved, charted, reused, faults, passed_over }
     }
 }

@@ -1,6 +1,8 @@
 //! A recorded message of any of the node's topics.
 
-use crate::wire::{self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, SessionEvent, Vibration, schema::Topic};
+use crate::wire::{
+    self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, schema::Topic,
+};
 
 /// The content of a recorded message; which it is decides its topic.
 #[derive(Clone, Debug, PartialEq)]
@@ -9,6 +11,7 @@ pub enum Payload {
     Prediction(Prediction),
     SessionEvent(SessionEvent),
     RigInfo(RigInfo),
+    Sensitivity(Sensitivity),
     Diagnostics(DiagnosticArray),
     Vibration(Vibration),
 }
@@ -21,6 +24,7 @@ impl Payload {
             Self::Prediction(_) => Topic::Prediction,
             Self::SessionEvent(_) => Topic::SessionEvent,
             Self::RigInfo(_) => Topic::RigInfo,
+            Self::Sensitivity(_) => Topic::Sensitivity,
             Self::Diagnostics(_) => Topic::Diagnostics,
             Self::Vibration(_) => Topic::Vibration,
         }
@@ -37,6 +41,7 @@ impl Payload {
             Self::Prediction(message) => wire::to_cdr(message),
             Self::SessionEvent(message) => wire::to_cdr(message),
             Self::RigInfo(message) => wire::to_cdr(message),
+            Self::Sensitivity(message) => wire::to_cdr(message),
             Self::Diagnostics(message) => wire::to_cdr(message),
             Self::Vibration(message) => wire::to_cdr(message),
         }
@@ -53,6 +58,7 @@ impl Payload {
             Topic::Prediction => Self::Prediction(wire::from_cdr(cdr)?),
             Topic::SessionEvent => Self::SessionEvent(wire::from_cdr(cdr)?),
             Topic::RigInfo => Self::RigInfo(wire::from_cdr(cdr)?),
+            Topic::Sensitivity => Self::Sensitivity(wire::from_cdr(cdr)?),
             Topic::Diagnostics => Self::Diagnostics(wire::from_cdr(cdr)?),
             Topic::Vibration => Self::Vibration(wire::from_cdr(cdr)?),
         })

@@ -16,7 +16,7 @@ use thiserror::Error;
 use self::link::{Durability, Link};
 use super::heard::{Bus, Counts, Heard};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
-use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, SessionEvent, Vibration, topic};
+use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
 /// The name of the node, before remapping.
 pub const NODE_NAME: &str = "squealcast";
@@ -127,6 +127,7 @@ pub struct Ros2 {
     prediction: Publisher<Prediction>,
     rig: Publisher<RigInfo>,
     session_event: Publisher<SessionEvent>,
+    sensitivity: Publisher<Sensitivity>,
     diagnostics: Publisher<DiagnosticArray>,
     link: Link<OperatingPoint>,
 }
@@ -148,12 +149,13 @@ impl Ros2 {
         let prediction = link.publisher(topic::PREDICTION, ours("Prediction"), Durability::Volatile)?;
         let rig = link.publisher(topic::RIG, ours("RigInfo"), Durability::TransientLocal)?;
         let session_event = link.publisher(topic::SESSION_EVENT, ours("SessionEvent"), Durability::Volatile)?;
+        let sensitivity = link.publisher(topic::SENSITIVITY, ours("Sensitivity"), Durability::Volatile)?;
         let diagnostics_type = MessageTypeName::new("diagnostic_msgs", "DiagnosticArray");
         let diagnostics = link.publisher(topic::DIAGNOSTICS, diagnostics_type, Durability::Volatile)?;
         let aside = link.aside(topic::VIBRATION, ours("Vibration"), vibration)?;
         link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink, Some(aside))?;
         started.store(true, Ordering::Release);
-        Ok(Self { prediction, rig, session_event, diagnostics, link })
+        Ok(Self { prediction, rig, session_event, sensitivity, diagnostics, link })
     }
 
     /// Publishes a prediction, without waiting.
@@ -178,6 +180,19 @@ impl Ros2 {
     /// [`Ros2Error::Publish`].
     pub fn publish_session_event(&self, event: &SessionEvent) -> Result<(), Ros2Error> {
         publish(&self.session_event, topic::SESSION_EVENT, event)
+    }
+
+    /// Publishes how predictions change with conditions and contact.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn publish_sensitivity(&self, sensitivity: &Sensitivity) -> Result<(), Ros2Error> {
+        publish(&self.sensitivity, topic::SENSITIVITY, sensitivity)
+    }
+
+    /// How many readers the sensitivities have, those included that were killed less than their lease ago.
+    pub fn sensitivity_readers(&self) -> usize {
+        self.sensitivity.get_subscription_count(self.link.node())
     }
 
     /// Publishes how the node does.

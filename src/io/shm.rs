@@ -25,7 +25,7 @@ use iceoryx2::waitset::{WaitSetAttachmentError, WaitSetCreateError};
 use thiserror::Error;
 
 use super::heard::{Bus, Counters, Counts, Gaps, Heard};
-use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm, VibrationForm};
+use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
 
 /// The ports may be used from any thread; peers with single-threaded ports connect to them all the same.
 type Ipc = ipc_threadsafe::Service;
@@ -34,6 +34,10 @@ type Ipc = ipc_threadsafe::Service;
 pub type ShmInput = ShmReader<OperatingPointForm>;
 /// Publishes predictions: the node's output.
 pub type ShmOutput = ShmWriter<PredictionForm>;
+/// Publishes sensitivities.
+pub type ShmSensitivity = ShmWriter<SensitivityForm>;
+/// Hears sensitivities.
+pub type ShmSensitivitySink = ShmReader<SensitivityForm>;
 /// Publishes operating points: a rig, or its simulator.
 pub type ShmSource = ShmWriter<OperatingPointForm>;
 /// Hears the measured vibration.
@@ -110,6 +114,7 @@ pub struct ShmWriter<F: Form> {
     service: String,
     publisher: Publisher<Ipc, F, ()>,
     notifier: Notifier<Ipc>,
+    topic: publish_subscribe::PortFactory<Ipc, F, ()>,
     // Last: the ports go before their node.
     _node: Node<Ipc>,
 }
@@ -132,7 +137,7 @@ impl<F: Form> ShmWriter<F> {
             .notifier_builder()
             .create()
             .map_err(|source| ShmError::Notifier { service: service.clone(), source })?;
-        Ok(Self { service, publisher, notifier, _node: node })
+        Ok(Self { service, publisher, notifier, topic, _node: node })
     }
 
     /// Publishes a message and wakes the readers; returns how many readers got it.
@@ -152,6 +157,13 @@ impl<F: Form> ShmWriter<F> {
             }
             Err(source) => Err(ShmError::Notify { service: self.service.clone(), source }),
         }
+    }
+}
+
+impl<F: Form> ShmWriter<F> {
+    /// How many readers there are, those included that were killed and not cleaned up after.
+    pub fn readers(&self) -> usize {
+        self.topic.dynamic_config().number_of_subscribers()
     }
 }
 

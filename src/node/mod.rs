@@ -5,6 +5,7 @@
 
 mod mapper;
 mod outputs;
+mod sensitivity;
 mod statistics;
 mod watch;
 
@@ -15,19 +16,21 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
 
-pub use mapper::{chart_hash, map_hash, session_chart, session_map};
+pub use mapper::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map};
 pub use outputs::Outputs;
+pub use sensitivity::end_derivatives;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
 use crate::io::clock;
 use crate::io::heard::{Bus, Heard};
 use crate::io::message::Payload;
-use crate::physics::{Chart, OperatingPoint, StabilityMap};
+use crate::physics::{Chart, Ends, OperatingPoint, StabilityMap};
 use crate::rig::Rig;
-use crate::session::{Effect, Event, Session, map_serves};
+use crate::session::{Event, Session, Want, map_serves};
 use crate::settings::Settings;
 use crate::wire::{self, Header, RigInfo, SessionEvent, Time, event_kind};
 use mapper::Mapper;
+use sensitivity::Question;
 use statistics::Statistics;
 
 /// What may wait for the node; more inputs than this are lost before they are recorded, and counted.
@@ -38,6 +41,8 @@ const CATCH_UP: Duration = Duration::from_millis(100);
 const REMEMBERED: usize = 8192;
 /// Time between diagnostics.
 const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
+/// Time between sensitivities, at least.
+const SENSITIVITY_EVERY: Duration = Duration::from_secs(1);
 
 /// Something the node has to deal with.
 #[derive(Clone, Debug)]
@@ -50,6 +55,11 @@ pub enum Incoming {
     Parameter { name: String, value: f64 },
     /// The stability map that was asked for, or why there is none.
     Map { point: OperatingPoint, map: Result<Arc<StabilityMap>, String> },
+    /// The ends of the windows of `map` that were asked for; the load and speed at which another map is due; or why there
+    /// is nothing.
+    Ends { map: Arc<StabilityMap>, ends: Result<Result<Arc<Ends>, OperatingPoint>, String> },
+    /// The sensitivities that were asked for, or why there are none.
+    Sensitivity(Box<Result<wire::Sensitivity, String>>),
     /// The chart of the rig, or why there is none.
     Chart(Result<Arc<Chart>, String>),
     /// Finish.
@@ -79,6 +89,7 @@ pub struct Node {
     passing_over: bool,
     /// Tells the thread that charts the rig that nobody waits for it any more.
     stopped: Arc<AtomicBool>,
+    next_sensitivity: Instant,
 }
 
 impl Node {
@@ -98,6 +109,7 @@ impl Node {
             silent: false,
             prediction_time: Duration::ZERO,
             passing_over: false,
+            next_sensitivity: Instant::now(),
         }
     }
 
@@ -135,6 +147,8 @@ impl Node {
                     Incoming::Vibration(heard) => self.vibration(heard),
                     Incoming::Parameter { name, value } => self.parameter(name, value),
                     Incoming::Map { point, map } => self.map(point, map),
+                    Incoming::Ends { map, ends } => self.ends(&map, ends),
+                    Incoming::Sensitivity(found) => self.sensitivity(*found),
                     Incoming::Chart(chart) => self.chart(chart),
                 }
                 if Instant::now() >= next_diagnostics {
@@ -193,11 +207,13 @@ impl Node {
             return;
         }
         self.watch.input(&input);
+        let point = input.point();
         let worked_before = self.session.counters().worked();
         let started = clock::monotonic_ns();
         self.step(Event::Input(input));
         let took = Duration::from_nanos(clock::monotonic_ns().saturating_sub(started));
         self.statistics.predicted(took);
+        self.sensitivity_due(point);
         if self.session.counters().worked() > worked_before {
             let known = if self.prediction_time.is_zero() { took } else { self.prediction_time };
             self.prediction_time = (known * 7 + took) / 8;
@@ -220,30 +236,67 @@ impl Node {
     }
 
     fn map(&mut self, point: OperatingPoint, map: Result<Arc<StabilityMap>, String>) {
-        self.mapper.done();
         match map {
             Ok(map) => {
                 self.statistics.maps += 1;
                 self.statistics.map_failure = None;
-                let hash = map_hash(&map);
-                self.note(SessionEvent {
-                    header: now_header(),
-                    kind: event_kind::STABILITY_MAP,
-                    normal_load_n: point.normal_load_n,
-                    disc_speed_rad_s: point.disc_speed_rad_s,
-                    hash,
-                    ..Default::default()
-                });
-                self.mapper
-                    .go_on(|wish| map_serves(&self.rig.model, &map, wish, self.session.settings().map_tolerance));
+                self.note(at_load_and_speed(event_kind::STABILITY_MAP, &point, map_hash(&map)));
+                let tolerance = self.session.settings().map_tolerance;
+                self.mapper.done(|wish| map_serves(&self.rig.model, &map, wish, tolerance));
                 self.watch.map(&map);
                 self.step(Event::MapReady(map));
             }
             Err(reason) => {
                 self.mapper.give_up_on(point);
-                self.mapper.go_on(|_| false);
+                self.mapper.done(|_| false);
                 self.statistics.map_failure = Some(reason);
             }
+        }
+    }
+
+    fn ends(&mut self, map: &Arc<StabilityMap>, ends: Result<Result<Arc<Ends>, OperatingPoint>, String>) {
+        self.mapper.done(|_| false);
+        // Ends belong to their map; those of one that is no longer in force are of no use.
+        let in_force = self.session.map().is_some_and(|other| Arc::ptr_eq(other, map));
+        match ends {
+            Ok(Ok(ends)) if in_force => {
+                self.statistics.ends += 1;
+                self.note(at_load_and_speed(event_kind::WINDOW_ENDS, &ends.point, ends_hash(&ends)));
+                self.step(Event::EndsReady(ends));
+            }
+            Ok(Err(point)) if in_force => self.mapper.want(point),
+            Ok(_) => {}
+            Err(reason) => self.statistics.map_failure = Some(reason),
+        }
+    }
+
+    /// Asks for the sensitivities of the prediction for `point`, once in a while and if somebody wants them.
+    fn sensitivity_due(&mut self, point: OperatingPoint) {
+        let now = Instant::now();
+        if now < self.next_sensitivity {
+            return;
+        }
+        self.next_sensitivity = now + SENSITIVITY_EVERY;
+        let prediction = self.session.prediction();
+        if prediction.level == wire::level::FAULT || !self.outputs.want_sensitivities() {
+            return;
+        }
+        let question = Question::new(prediction, point);
+        let map = self.session.map_at(&point).cloned();
+        let ends = map.as_ref().and_then(|_| self.session.ends().cloned());
+        if !self.mapper.want_sensitivity(question, map, ends) {
+            self.next_sensitivity = now; // busy: the next prediction will do as well
+        }
+    }
+
+    fn sensitivity(&mut self, found: Result<wire::Sensitivity, String>) {
+        self.mapper.done(|_| false);
+        match found {
+            Ok(sensitivity) => {
+                self.statistics.sensitivities += 1;
+                self.outputs.sensitivity(sensitivity);
+            }
+            Err(reason) => self.statistics.sensitivity_failure = Some(reason),
         }
     }
 
@@ -280,15 +333,19 @@ impl Node {
     fn step(&mut self, event: Event) {
         match self.session.step(event) {
             Ok(effects) => {
-                for effect in effects {
-                    match effect {
-                        Effect::Publish(prediction) => {
-                            self.statistics.level = prediction.level;
-                            self.outputs.prediction(&prediction);
-                            self.watch.prediction(prediction);
+                if let Some(prediction) = effects.publish {
+                    self.statistics.level = prediction.level;
+                    self.outputs.prediction(prediction);
+                    self.watch.prediction(prediction);
+                }
+                match effects.want {
+                    Some(Want::Map(point)) => self.mapper.want(point),
+                    Some(Want::Ends(point)) => {
+                        if let Some(map) = self.session.map() {
+                            self.mapper.want_ends(map.clone(), point);
                         }
-                        Effect::WantMap(point) => self.mapper.want(point),
                     }
+                    None => {}
                 }
             }
             Err(refused) => self.statistics.refused = Some(refused.to_string()),
@@ -317,6 +374,12 @@ pub fn rig_info(rig: &Rig) -> RigInfo {
 
 fn now_header() -> Header {
     Header { stamp: Time::from_ns(clock::now_ns()), frame_id: String::new() }
+}
+
+/// The event of something that became ready for a load and speed.
+pub fn at_load_and_speed(kind: u8, point: &OperatingPoint, hash: String) -> SessionEvent {
+    let OperatingPoint { normal_load_n, disc_speed_rad_s, .. } = *point;
+    SessionEvent { header: now_header(), kind, normal_load_n, disc_speed_rad_s, hash, ..Default::default() }
 }
 
 /// The event of a setting that was changed.

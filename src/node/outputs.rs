@@ -2,19 +2,21 @@
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
+use std::time::{Duration, Instant};
 
 use crate::io::clock;
 use crate::io::heard::Counts;
 use crate::io::message::{Message, Payload};
 use crate::io::recorder::RecorderHandle;
 use crate::io::ros2::Ros2;
-use crate::io::shm::{ShmInput, ShmOutput, ShmVibrationInput};
-use crate::wire::{DiagnosticArray, Prediction, RigInfo, SessionEvent};
+use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
+use crate::wire::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
 
 /// The buses and the recorder of a node; any of them may be missing.
 #[derive(Default)]
 pub struct Outputs {
     pub shm: Option<ShmOutput>,
+    pub shm_sensitivity: Option<ShmSensitivity>,
     pub shm_input: Option<ShmInput>,
     pub shm_vibration: Option<ShmVibrationInput>,
     pub ros2: Option<Ros2>,
@@ -24,6 +26,29 @@ pub struct Outputs {
     /// Messages a bus refused, and what it said last.
     pub failures: u64,
     pub last_failure: Option<String>,
+    /// Predictions that were not encoded for ROS 2, since nobody heard them there.
+    pub encodings_skipped: u64,
+    /// Whether predictions have readers on ROS 2.
+    pub ros2_readers: Readers,
+}
+
+/// How many readers a topic of ROS 2 has, asked for now and then: the answer takes locks.
+#[derive(Default)]
+pub struct Readers {
+    asked: Option<Instant>,
+    any: bool,
+}
+
+/// A reader that has just come may miss what is published until it is looked for again.
+const LOOK_FOR_READERS_EVERY: Duration = Duration::from_millis(20);
+
+impl Readers {
+    fn any(&mut self, count: impl FnOnce() -> usize) -> bool {
+        if self.asked.is_none_or(|asked| asked.elapsed() >= LOOK_FOR_READERS_EVERY) {
+            (self.asked, self.any) = (Some(Instant::now()), count() > 0);
+        }
+        self.any
+    }
 }
 
 impl Outputs {
@@ -40,8 +65,12 @@ impl Outputs {
         if let Some(Err(error)) = self.shm.as_ref().map(|shm| shm.publish(prediction)) {
             self.failed(&error);
         }
-        if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_prediction(prediction)) {
-            self.failed(&error);
+        if let Some(ros2) = &self.ros2 {
+            if !self.ros2_readers.any(|| ros2.prediction_readers()) {
+                self.encodings_skipped += 1;
+            } else if let Err(error) = ros2.publish_prediction(prediction) {
+                self.failed(&error);
+            }
         }
         if self.recorder.is_some() {
             self.record(clock::now_ns(), Payload::Prediction(prediction.clone()));
@@ -60,6 +89,23 @@ impl Outputs {
             self.failed(&error);
         }
         self.record(clock::now_ns(), Payload::RigInfo(info.clone()));
+    }
+
+    /// Whether somebody hears sensitivities, or records them.
+    pub fn want_sensitivities(&self) -> bool {
+        self.recorder.is_some()
+            || self.shm_sensitivity.as_ref().is_some_and(|shm| shm.readers() > 0)
+            || self.ros2.as_ref().is_some_and(|ros2| ros2.sensitivity_readers() > 0)
+    }
+
+    pub fn sensitivity(&mut self, sensitivity: Sensitivity) {
+        if let Some(Err(error)) = self.shm_sensitivity.as_ref().map(|shm| shm.publish(&sensitivity)) {
+            self.failed(&error);
+        }
+        if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_sensitivity(&sensitivity)) {
+            self.failed(&error);
+        }
+        self.record(clock::now_ns(), Payload::Sensitivity(sensitivity));
     }
 
     pub fn diagnostics(&mut self, diagnostics: DiagnosticArray) {

@@ -27,6 +27,9 @@ pub struct Statistics {
     pub duplicates: u64,
     pub passed_over: u64,
     pub maps: u64,
+    pub ends: u64,
+    pub sensitivities: u64,
+    pub sensitivity_failure: Option<String>,
     chart: Option<(usize, usize)>,
     pub map_failure: Option<String>,
     pub chart_failure: Option<String>,
@@ -85,7 +88,13 @@ impl Statistics {
             pair("prediction_time_median_us", format!("{:.1}", quantile(0.5))),
             pair("prediction_time_p99_us", format!("{:.1}", quantile(0.99))),
             pair("stability_maps", self.maps),
+            pair("window_ends", self.ends),
+            pair("sensitivities", self.sensitivities),
             pair("stability_map_pending", map_pending),
+            // What the situation did not need. A prediction off the chart is a dense solve and its vectors saved.
+            pair("skipped_zero_terms", counters.zero_terms),
+            pair("skipped_roots_beyond_band", counters.roots_beyond_band),
+            pair("skipped_encodings", outputs.encodings_skipped),
             pair("publish_failures", outputs.failures),
         ];
         if let Some((leaves, bytes)) = self.chart {
@@ -101,6 +110,7 @@ impl Statistics {
         let mut warnings: Vec<String> = vec![];
         warnings.extend(self.map_failure.iter().map(|why| format!("no stability map: {why}")));
         warnings.extend(self.chart_failure.iter().map(|why| format!("no chart: {why}")));
+        warnings.extend(self.sensitivity_failure.iter().map(|why| format!("no sensitivities: {why}")));
         warnings.extend(self.refused.take());
         warnings.extend(outputs.last_failure.iter().cloned());
         let passed_over = self.passed_over - self.passed_over_before;

@@ -159,18 +159,19 @@ impl Watch {
     }
 
     /// It was predicted.
-    pub fn prediction(&self, prediction: Prediction) {
+    pub fn prediction(&self, prediction: &Prediction) {
         self.with(|watched| {
             let Watched { snapshot, input, samples, lost, .. } = watched;
             if let Some(samples) = samples {
                 if samples.len() < MOST_SAMPLES {
-                    samples.push(Sample::new(clock::now_ns(), input.as_ref(), &prediction));
+                    samples.push(Sample::new(clock::now_ns(), input.as_ref(), prediction));
                 } else {
                     *lost += 1;
                 }
             }
             snapshot.input.clone_from(input);
-            snapshot.prediction = Some(prediction);
+            // In the memory it has.
+            snapshot.prediction.get_or_insert_default().clone_from(prediction);
         });
     }
 
@@ -219,10 +220,10 @@ mod tests {
     fn samples_are_kept_only_for_a_follower_and_never_more_than_may_wait() {
         let watch = Watch::default();
         let mut samples = vec![];
-        watch.prediction(prediction(&[], 0));
+        watch.prediction(&prediction(&[], 0));
         assert_eq!((watch.take_samples(&mut samples), samples.len()), (0, 0), "nobody followed yet");
         for _ in 0..MOST_SAMPLES + 3 {
-            watch.prediction(prediction(&[], 0));
+            watch.prediction(&prediction(&[], 0));
         }
         assert_eq!((watch.take_samples(&mut samples), samples.len()), (3, MOST_SAMPLES));
         assert_eq!((watch.take_samples(&mut samples), samples.len()), (3, 0));

@@ -50,23 +50,6 @@ pub struct Window {
     pub kind: WindowKind,
 }
 
-/// Distance of `mu` from the nearest end of the union of `windows`, negative inside; `None` without windows.
-pub fn margin(windows: &[Window], mu: f64) -> Option<f64> {
-    let mut union: Vec<(f64, f64)> = vec![];
-    let mut sorted: Vec<(f64, f64)> = windows.iter().map(|w| (w.mu_from, w.mu_to.unwrap_or(f64::INFINITY))).collect();
-    sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
-    for (from, to) in sorted {
-        match union.last_mut() {
-            Some(last) if from <= last.1 => last.1 = last.1.max(to),
-            _ => union.push((from, to)),
-        }
-    }
-    let inside = union.iter().any(|&(from, to)| from <= mu && mu <= to);
-    let ends = union.iter().flat_map(|&(from, to)| [from, to]);
-    let distance = ends.map(|end| (end - mu).abs()).reduce(f64::min)?;
-    Some(if inside { -distance } else { distance })
-}
-
 /// Samples of an interpolated quantity inside an interval.
 const SAMPLES: usize = 9;
 /// An interpolated discriminant must keep this share of its smaller end value for an interval to be free of merging.
@@ -581,22 +564,5 @@ mod tests {
             }
         }
         assert!(windows > 40 && growing > 4000, "the rigs are worth testing: {windows} windows, {growing} points");
-    }
-
-    #[test]
-    fn margin_is_to_the_union() {
-        let window = |mu_from, mu_to| Window {
-            mode_ids: vec![],
-            mu_from,
-            mu_to,
-            frequency_hz: 1.0,
-            kind: WindowKind::ZeroGrowth,
-        };
-        let windows = [window(0.2, Some(0.5)), window(0.4, Some(0.7)), window(1.5, None)];
-        assert_eq!(margin(&[], 0.1), None);
-        for (mu, expected) in [(0.1, 0.1), (0.45, -0.25), (0.6, -0.1), (0.9, 0.2), (1.75, -0.25)] {
-            let found = margin(&windows, mu).unwrap();
-            assert!((found - expected).abs() < 1e-15, "{mu}: {found} is not {expected}");
-        }
     }
 }

@@ -4,9 +4,11 @@
 
 pub mod chart;
 pub mod critical;
+pub mod ends;
 pub mod model;
 pub mod operating_point;
 pub mod reference;
+pub mod sensitivity;
 pub mod spectrum;
 pub mod stability_map;
 pub mod summary;
@@ -17,7 +19,8 @@ pub mod tracking;
 
 pub use chart::{Chart, NotCharted};
 pub use critical::{Window, WindowKind};
-pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Term, Traces};
+pub use ends::{Bounded, End, Ends};
+pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Parameter, Term, Traces};
 pub use operating_point::{ContactState, OperatingPoint};
 pub use spectrum::{Root, RootError, SolveError, Solver, Spectrum, Vectors};
 pub use stability_map::{MapError, MapOptions, StabilityMap};

@@ -97,6 +97,26 @@ pub struct ContactPairs {
     pub radius_m: Vec<f64>,
 }
 
+/// What derivatives are taken with respect to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Parameter {
+    /// The friction coefficient.
+    Friction,
+    /// The normal load, N.
+    Load,
+    /// The disc speed, rad/s.
+    Speed,
+    /// The logarithm of a factor on the stiffness of all contact pairs: the change for a relative change.
+    ContactStiffness,
+    /// The logarithm of a factor on the damping of all contact pairs.
+    ContactDamping,
+}
+
+impl Parameter {
+    /// All of them, in the order in which derivatives are listed.
+    pub const ALL: [Self; 5] = [Self::Friction, Self::Load, Self::Speed, Self::ContactStiffness, Self::ContactDamping];
+}
+
 /// Why a model could not be built or evaluated.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ModelError {
@@ -331,29 +351,72 @@ impl Model {
         Ok(Structure { damped, symmetric_stiffness })
     }
 
-    /// Writes `dK/dμ` and `dC/dμ` at `p`, both `n×n`, by central differences of the laws: exact up to rounding for
-    /// laws linear in `μ`, which all but custom ones are.
+    /// Writes the derivatives of `K` and `C` at `p` with respect to `parameter`, both `n×n`; those of custom laws are
+    /// central differences, exact up to rounding where a law is linear.
     ///
     /// # Errors
     /// [`ModelError::LawNotFinite`].
-    pub fn assemble_friction_derivative(
+    pub fn assemble_derivative(
         &self,
         p: &OperatingPoint,
+        parameter: Parameter,
         stiffness: &mut Mat<f64>,
         damping: &mut Mat<f64>,
     ) -> Result<(), ModelError> {
-        let mu = p.friction_coefficient;
-        let step = 1e-6 * mu.abs().max(1.0);
-        let (above, below) = (p.with_friction(mu + step), p.with_friction(mu - step));
-        let derivative = |law: &Law| {
-            let (up, down) = (self.coefficient(law, &above), self.coefficient(law, &below));
-            // A law need not exist for negative friction coefficients.
-            if down.is_finite() { (up - down) / (2.0 * step) } else { (up - self.coefficient(law, p)) / step }
-        };
+        let derivative = |law: &Law| self.derivative(law, p, parameter);
         sum(&self.stiffness, derivative, p, stiffness)?;
         sum(&self.damping, derivative, p, damping)?;
         Ok(())
     }
+
+    /// Derivative of the value of `law` at `p`.
+    fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
+        use Parameter::{ContactDamping, ContactStiffness, Friction, Load, Speed};
+        if let Law::Custom(custom) = law {
+            return self.custom_derivative(custom, law, p, parameter);
+        }
+        let value = self.coefficient(law, p);
+        // What multiplies the friction coefficient, which may be zero itself.
+        let per_friction = || self.coefficient(law, &p.with_friction(1.0));
+        match (parameter, law) {
+            (Friction, Law::FrictionStiffness | Law::FrictionDamping | Law::LateralFriction) => per_friction(),
+            (Load, Law::ContactStiffness | Law::FrictionStiffness) if value != 0.0 => {
+                value * self.contact_law.exponent / p.normal_load_n
+            }
+            (Load, Law::FrictionSlope | Law::LateralFriction) if value != 0.0 => value / p.normal_load_n,
+            (Speed, Law::LateralFriction) if value != 0.0 => -value / p.disc_speed_rad_s,
+            (ContactStiffness, Law::ContactStiffness | Law::FrictionStiffness) => value,
+            (ContactDamping, Law::ContactDamping | Law::FrictionDamping) => value,
+            _ => 0.0,
+        }
+    }
+
+    fn custom_derivative(&self, custom: &CustomLaw, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
+        let (depends, at, least) = match parameter {
+            Parameter::Friction => (custom.depends_on_friction, p.friction_coefficient, 1.0),
+            Parameter::Load => (custom.depends_on_load, p.normal_load_n, 1e-3),
+            Parameter::Speed => (custom.depends_on_speed, p.disc_speed_rad_s, 1e-3),
+            Parameter::ContactStiffness | Parameter::ContactDamping => return 0.0,
+        };
+        if !depends {
+            return 0.0;
+        }
+        let step = 1e-6 * at.abs().max(least);
+        let moved = |to: f64| match parameter {
+            Parameter::Load => OperatingPoint { normal_load_n: to, ..*p },
+            Parameter::Speed => OperatingPoint { disc_speed_rad_s: to, ..*p },
+            _ => p.with_friction(to),
+        };
+        let (up, down) = (self.coefficient(law, &moved(at + step)), self.coefficient(law, &moved(at - step)));
+        // A law need not exist for negative friction coefficients.
+        if down.is_finite() { (up - down) / (2.0 * step) } else { (up - self.coefficient(law, p)) / step }
+    }
+
+    /// How many terms have a coefficient of zero at `p`: matrices that need not be added.
+    pub fn zero_terms(&self, p: &OperatingPoint) -> usize {
+        self.stiffness.iter().chain(&self.damping).filter(|known| self.coefficient(&known.term.law, p) == 0.0).count()
+    }
+
     /// Whether any term's coefficient changes with load or with speed beyond opening, stopping and reversing.
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
         let (mut load, mut speed) = (false, false);

@@ -15,7 +15,7 @@ use faer::linalg::evd::{
 };
 use faer::{Auto, Col, Mat, MatRef, Par, Spec, c64};
 
-use super::model::{Model, ModelError};
+use super::model::{Model, ModelError, Parameter};
 use super::operating_point::OperatingPoint;
 
 /// Residual above which a root counts as not found.
@@ -221,7 +221,7 @@ impl Solver {
         let structure = model.assemble(p, &mut self.stiffness, &mut self.damping)?;
         let with_left = vectors == Vectors::Both;
         if with_left {
-            model.assemble_friction_derivative(p, &mut self.stiffness_slope, &mut self.damping_slope)?;
+            model.assemble_derivative(p, Parameter::Friction, &mut self.stiffness_slope, &mut self.damping_slope)?;
         }
         let mut raw = if structure.damped {
             self.damped(n, with_left)?
@@ -447,7 +447,7 @@ impl Dense {
 /// `S`: what each displacement is multiplied by, so that it weighs as much as its velocity, rad/s.
 ///
 /// `√|K_ii|`, kept within six decades of the largest so that a free coordinate does not blow up its column.
-fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
+pub(super) fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
     let diagonal = || (0..stiffness.nrows()).map(|i| stiffness[(i, i)].abs().sqrt());
     let largest = diagonal().fold(0.0, f64::max);
     if largest == 0.0 {

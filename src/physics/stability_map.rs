@@ -4,6 +4,7 @@
 use faer::c64;
 
 use super::critical::{self, Window};
+use super::ends::Ends;
 use super::model::Model;
 use super::operating_point::OperatingPoint;
 use super::spectrum::{SolveError, Solver, Spectrum, Vectors};
@@ -70,6 +71,8 @@ pub struct StabilityMap {
     pub nodes: Vec<Node>,
     /// Windows of instability, ascending in their lower end; empty unless asked for.
     pub windows: Vec<Window>,
+    /// Their ends, and how these move with load and speed.
+    pub ends: Ends,
     /// Windows narrower than this may have been missed.
     pub resolution: f64,
     /// False where the refinement was cut short by the number of nodes.
@@ -116,9 +119,11 @@ impl StabilityMap {
             }
         }
         let nodes = identify_all(spectra, &links);
-        let mut map = Self { point: *point, nodes, windows: vec![], resolution, complete };
+        let ends = Ends { point: *point, windows: vec![] };
+        let mut map = Self { point: *point, nodes, windows: vec![], ends, resolution, complete };
         if options.windows {
             map.windows = critical::windows(model, solver, &map, options)?;
+            map.ends = Ends::of_map(model, solver, &map)?;
         }
         Ok(map)
     }
@@ -142,13 +147,6 @@ impl StabilityMap {
         self.windows.iter().map(|window| window.mu_from).reduce(f64::min)
     }
 
-    /// Distance of `mu` from the nearest end of the union of the windows, negative inside; `None` without windows.
-    ///
-    /// An open end (beyond the searched range) is no end.
-    pub fn margin(&self, mu: f64) -> Option<f64> {
-        critical::margin(&self.windows, mu)
-    }
-
     /// Every number that a prediction can depend on, as bits: two maps with equal words predict the same.
     pub fn words(&self) -> Vec<u64> {
         let mut words = vec![];
@@ -161,6 +159,7 @@ impl StabilityMap {
         for window in &self.windows {
             words.extend([window.mu_from.to_bits(), window.mu_to.map_or(u64::MAX, f64::to_bits)]);
         }
+        words.extend(self.ends.words());
         words
     }
 }

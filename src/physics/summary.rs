@@ -12,7 +12,7 @@ pub struct Mode {
 }
 
 /// The modes of the band, and how many of them grow, how fast.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Summary {
     /// Modes of the band, ascending in frequency.
     pub modes: Vec<Mode>,
@@ -30,40 +30,53 @@ impl Summary {
     /// Summarises `spectrum`, whose roots have identities `ids`, for modes up to `band_max_hz`; a root is unstable
     /// when `σ > threshold · |λ|`.
     pub fn of_spectrum(spectrum: &Spectrum, ids: &[Option<u32>], band_max_hz: Option<f64>, threshold: f64) -> Self {
-        let id = |k: usize| ids.get(k).copied().flatten().unwrap_or(k as u32);
-        let modes = spectrum.modes().iter().enumerate().map(|(k, root)| Mode { id: id(k), root: *root }).collect();
-        let statics = &spectrum.roots[spectrum.mode_count..];
-        Self::new(modes, statics, spectrum.nonoscillatory_growth_per_s(), band_max_hz, threshold)
+        let mut summary = Self::default();
+        summary.take_spectrum(spectrum, ids, band_max_hz, threshold);
+        summary
     }
 
-    /// Summarises roots read off a chart, in any order.
-    pub fn of_chart(charted: &[Mode], band_max_hz: Option<f64>, threshold: f64) -> Self {
-        let mut modes: Vec<Mode> = charted.iter().filter(|mode| mode.root.oscillates()).copied().collect();
-        modes.sort_by(|a, b| super::spectrum::order(&a.root, &b.root));
-        let statics: Vec<Root> = charted.iter().map(|mode| mode.root).filter(|root| !root.oscillates()).collect();
-        // Only those of undamped models are charted, each for both signs.
-        let mut growth: Vec<f64> = statics.iter().flat_map(|root| [root.lambda.re, 0.0 - root.lambda.re]).collect();
-        growth.sort_by(|a, b| b.total_cmp(a));
-        Self::new(modes, &statics, growth, band_max_hz, threshold)
-    }
-
-    fn new(
-        mut modes: Vec<Mode>,
-        statics: &[Root],
-        nonoscillatory_growth_per_s: Vec<f64>,
+    /// Becomes what [`Summary::of_spectrum`] makes, in the memory it has.
+    pub fn take_spectrum(
+        &mut self,
+        spectrum: &Spectrum,
+        ids: &[Option<u32>],
         band_max_hz: Option<f64>,
         threshold: f64,
-    ) -> Self {
-        modes.retain(|mode| band_max_hz.is_none_or(|max_hz| mode.root.frequency_hz() <= max_hz));
-        let judged = || modes.iter().map(|mode| &mode.root).chain(statics);
-        let fastest = judged().max_by(|a, b| a.lambda.re.total_cmp(&b.lambda.re));
-        Self {
-            unstable_modes: judged().filter(|root| root.is_unstable(threshold)).count() as u32,
-            max_growth_rate_per_s: fastest.map(|root| root.lambda.re),
-            worst_frequency_hz: fastest.filter(|root| root.is_unstable(threshold)).map(Root::frequency_hz),
-            nonoscillatory_growth_per_s,
-            modes,
+    ) {
+        let id = |k: usize| ids.get(k).copied().flatten().unwrap_or(k as u32);
+        self.modes.clear();
+        self.modes.extend(spectrum.modes().iter().enumerate().map(|(k, root)| Mode { id: id(k), root: *root }));
+        let statics = spectrum.roots[spectrum.mode_count..].iter().copied();
+        self.nonoscillatory_growth_per_s.clear();
+        self.nonoscillatory_growth_per_s.extend(statics.clone().map(|root| root.lambda.re));
+        if spectrum.undamped {
+            self.nonoscillatory_growth_per_s.extend(statics.clone().map(|root| 0.0 - root.lambda.re));
         }
+        self.judge(statics, band_max_hz, threshold);
+    }
+
+    /// Becomes the summary of roots read off a chart, in any order, in the memory it has.
+    pub fn take_chart(&mut self, charted: &[Mode], band_max_hz: Option<f64>, threshold: f64) {
+        self.modes.clear();
+        self.modes.extend(charted.iter().filter(|mode| mode.root.oscillates()).copied());
+        self.modes.sort_unstable_by(|a, b| super::spectrum::order(&a.root, &b.root).then(a.id.cmp(&b.id)));
+        let statics = charted.iter().map(|mode| mode.root).filter(|root| !root.oscillates());
+        // Only those of undamped models are charted, each for both signs.
+        self.nonoscillatory_growth_per_s.clear();
+        self.nonoscillatory_growth_per_s
+            .extend(statics.clone().flat_map(|root| [root.lambda.re, 0.0 - root.lambda.re]));
+        self.judge(statics, band_max_hz, threshold);
+    }
+
+    /// Keeps the modes of the band and says how they and the static roots do.
+    fn judge(&mut self, statics: impl Iterator<Item = Root> + Clone, band_max_hz: Option<f64>, threshold: f64) {
+        self.modes.retain(|mode| band_max_hz.is_none_or(|max_hz| mode.root.frequency_hz() <= max_hz));
+        self.nonoscillatory_growth_per_s.sort_unstable_by(|a, b| b.total_cmp(a));
+        let judged = || self.modes.iter().map(|mode| mode.root).chain(statics.clone());
+        let fastest = judged().max_by(|a, b| a.lambda.re.total_cmp(&b.lambda.re));
+        self.unstable_modes = judged().filter(|root| root.is_unstable(threshold)).count() as u32;
+        self.max_growth_rate_per_s = fastest.map(|root| root.lambda.re);
+        self.worst_frequency_hz = fastest.filter(|root| root.is_unstable(threshold)).map(|root| root.frequency_hz());
     }
 
     /// The fastest growing static root, if it grows.

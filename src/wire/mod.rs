@@ -21,6 +21,8 @@ pub mod topic {
     pub const RIG: &str = "/squealcast/rig";
     /// What else shaped the predictions; transient local is not needed, it is for recordings.
     pub const SESSION_EVENT: &str = "/squealcast/session_event";
+    /// How predictions change with conditions and contact.
+    pub const SENSITIVITY: &str = "/squealcast/sensitivity";
     /// How the node does.
     pub const DIAGNOSTICS: &str = "/diagnostics";
 }
@@ -85,8 +87,64 @@ pub struct Prediction {
     pub worst_frequency_hz: f64,
     pub critical_friction: f64,
     pub friction_margin: f64,
+    pub friction_margin_error: f64,
     pub reason: String,
     pub modes: Vec<Mode>,
+}
+
+/// `squealcast_msgs/Derivatives`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Derivatives {
+    pub by_friction_coefficient: f64,
+    pub by_normal_load_n: f64,
+    pub by_disc_speed_rad_s: f64,
+    pub by_contact_stiffness: f64,
+    pub by_contact_damping: f64,
+}
+
+/// `squealcast_msgs/ModeSensitivity`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ModeSensitivity {
+    pub id: u32,
+    pub law: u8,
+    pub frequency_hz: Derivatives,
+    pub growth_rate_per_s: Derivatives,
+}
+
+/// The values of [`ModeSensitivity::law`].
+pub mod sensitivity_law {
+    pub const LINEAR: u8 = 0;
+    pub const SQUARE_ROOT: u8 = 1;
+}
+
+/// `squealcast_msgs/PairSensitivity`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct PairSensitivity {
+    pub first_id: u32,
+    pub second_id: u32,
+    pub squares: bool,
+    pub mean_real: f64,
+    pub mean_imaginary: f64,
+    pub discriminant_real: f64,
+    pub discriminant_imaginary: f64,
+    pub mean_real_derivatives: Derivatives,
+    pub mean_imaginary_derivatives: Derivatives,
+    pub discriminant_real_derivatives: Derivatives,
+    pub discriminant_imaginary_derivatives: Derivatives,
+}
+
+/// `squealcast_msgs/Sensitivity`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Sensitivity {
+    pub header: Header,
+    pub input_seq: u64,
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub friction_coefficient: f64,
+    pub nearest_window_end: f64,
+    pub nearest_window_end_derivatives: Derivatives,
+    pub modes: Vec<ModeSensitivity>,
+    pub pairs: Vec<PairSensitivity>,
 }
 
 /// The values of [`Prediction::level`].
@@ -135,6 +193,7 @@ pub mod event_kind {
     pub const SILENCE: u8 = 1;
     pub const STABILITY_MAP: u8 = 2;
     pub const CHART: u8 = 3;
+    pub const WINDOW_ENDS: u8 = 4;
 }
 
 /// `diagnostic_msgs/DiagnosticArray`.
@@ -159,6 +218,40 @@ pub struct DiagnosticStatus {
 pub struct KeyValue {
     pub key: String,
     pub value: String,
+}
+
+impl Derivatives {
+    /// Nothing is known.
+    pub const UNKNOWN: Self = Self {
+        by_friction_coefficient: f64::NAN,
+        by_normal_load_n: f64::NAN,
+        by_disc_speed_rad_s: f64::NAN,
+        by_contact_stiffness: f64::NAN,
+        by_contact_damping: f64::NAN,
+    };
+
+    /// From derivatives in the order of [`physics::Parameter::ALL`].
+    pub fn new(derivatives: [f64; 5]) -> Self {
+        let [friction, load, speed, stiffness, damping] = derivatives;
+        Self {
+            by_friction_coefficient: friction,
+            by_normal_load_n: load,
+            by_disc_speed_rad_s: speed,
+            by_contact_stiffness: stiffness,
+            by_contact_damping: damping,
+        }
+    }
+
+    /// In the order of [`physics::Parameter::ALL`].
+    pub fn values(&self) -> [f64; 5] {
+        [
+            self.by_friction_coefficient,
+            self.by_normal_load_n,
+            self.by_disc_speed_rad_s,
+            self.by_contact_stiffness,
+            self.by_contact_damping,
+        ]
+    }
 }
 
 impl Time {
@@ -187,9 +280,19 @@ impl OperatingPoint {
 
 /// The CDR bytes of a message: encapsulation header `00 01 00 00`, then little-endian CDR.
 pub fn to_cdr<M: Serialize>(message: &M) -> Result<Vec<u8>, cdr_encoding::Error> {
-    let mut bytes = vec![0, 1, 0, 0];
-    bytes.extend(cdr_encoding::to_vec::<_, byteorder::LittleEndian>(message)?);
+    let mut bytes = vec![];
+    write_cdr(message, &mut bytes)?;
     Ok(bytes)
+}
+
+/// Writes what [`to_cdr`] makes into `bytes`, in place of what they held and in the memory they have.
+///
+/// # Errors
+/// As [`to_cdr`].
+pub fn write_cdr<M: Serialize>(message: &M, bytes: &mut Vec<u8>) -> Result<(), cdr_encoding::Error> {
+    bytes.clear();
+    bytes.extend([0, 1, 0, 0]);
+    cdr_encoding::to_writer::<_, byteorder::LittleEndian, _>(bytes, message)
 }
 
 /// A message from its CDR bytes, encapsulation header included; either byte order.

@@ -16,6 +16,8 @@ pub enum Topic {
     SessionEvent,
     /// [`topic::RIG`]
     RigInfo,
+    /// [`topic::SENSITIVITY`]
+    Sensitivity,
     /// [`topic::DIAGNOSTICS`]
     Diagnostics,
     /// [`topic::VIBRATION`]
@@ -28,6 +30,11 @@ const HEADER: (&str, &str) = (
 );
 const TIME: (&str, &str) = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n");
 const MODE: (&str, &str) = ("squealcast_msgs/Mode", include_str!("../../msgs/msg/Mode.msg"));
+const DERIVATIVES: (&str, &str) = ("squealcast_msgs/Derivatives", include_str!("../../msgs/msg/Derivatives.msg"));
+const MODE_SENSITIVITY: (&str, &str) =
+    ("squealcast_msgs/ModeSensitivity", include_str!("../../msgs/msg/ModeSensitivity.msg"));
+const PAIR_SENSITIVITY: (&str, &str) =
+    ("squealcast_msgs/PairSensitivity", include_str!("../../msgs/msg/PairSensitivity.msg"));
 const DIAGNOSTIC_STATUS: (&str, &str) = (
     "diagnostic_msgs/DiagnosticStatus",
     "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\nstring hardware_id\n\
@@ -38,8 +45,15 @@ const DIAGNOSTIC_ARRAY: &str = "std_msgs/Header header\nDiagnosticStatus[] statu
 
 impl Topic {
     /// All of them, in the order recordings list them.
-    pub const ALL: [Self; 6] =
-        [Self::OperatingPoint, Self::Prediction, Self::SessionEvent, Self::RigInfo, Self::Diagnostics, Self::Vibration];
+    pub const ALL: [Self; 7] = [
+        Self::OperatingPoint,
+        Self::Prediction,
+        Self::SessionEvent,
+        Self::RigInfo,
+        Self::Sensitivity,
+        Self::Diagnostics,
+        Self::Vibration,
+    ];
 
     /// The topic's name on ROS 2 and in recordings.
     pub fn name(self) -> &'static str {
@@ -48,6 +62,7 @@ impl Topic {
             Self::Prediction => topic::PREDICTION,
             Self::SessionEvent => topic::SESSION_EVENT,
             Self::RigInfo => topic::RIG,
+            Self::Sensitivity => topic::SENSITIVITY,
             Self::Diagnostics => topic::DIAGNOSTICS,
             Self::Vibration => topic::VIBRATION,
         }
@@ -60,6 +75,7 @@ impl Topic {
             Self::Prediction => "squealcast_msgs/msg/Prediction",
             Self::SessionEvent => "squealcast_msgs/msg/SessionEvent",
             Self::RigInfo => "squealcast_msgs/msg/RigInfo",
+            Self::Sensitivity => "squealcast_msgs/msg/Sensitivity",
             Self::Diagnostics => "diagnostic_msgs/msg/DiagnosticArray",
             Self::Vibration => "squealcast_msgs/msg/Vibration",
         }
@@ -82,6 +98,7 @@ impl Topic {
             Self::Prediction => include_str!("../../msgs/msg/Prediction.msg"),
             Self::SessionEvent => include_str!("../../msgs/msg/SessionEvent.msg"),
             Self::RigInfo => include_str!("../../msgs/msg/RigInfo.msg"),
+            Self::Sensitivity => include_str!("../../msgs/msg/Sensitivity.msg"),
             Self::Diagnostics => DIAGNOSTIC_ARRAY,
             Self::Vibration => include_str!("../../msgs/msg/Vibration.msg"),
         }
@@ -93,6 +110,7 @@ impl Topic {
             Self::OperatingPoint | Self::SessionEvent | Self::Vibration => &[HEADER, TIME],
             Self::Prediction => &[HEADER, TIME, MODE],
             Self::RigInfo => &[],
+            Self::Sensitivity => &[HEADER, TIME, MODE_SENSITIVITY, PAIR_SENSITIVITY, DERIVATIVES],
             Self::Diagnostics => &[HEADER, TIME, DIAGNOSTIC_STATUS, KEY_VALUE],
         }
     }

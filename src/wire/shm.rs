@@ -12,7 +12,7 @@
 //! | `friction_coefficient` | 32 | f64 |
 //! | *size 40, alignment 8* | | |
 //!
-//! | `squealcast/Prediction/1` | offset | type |
+//! | `squealcast/Prediction/2` | offset | type |
 //! |---|---|---|
 //! | `stamp_ns` (of the input) | 0 | i64 |
 //! | `input_seq` | 8 | u64 |
@@ -20,15 +20,16 @@
 //! | `worst_frequency_hz` | 24 | f64 |
 //! | `critical_friction` | 32 | f64 |
 //! | `friction_margin` | 40 | f64 |
-//! | `unstable_modes` | 48 | u32 |
-//! | `mode_count` (0..=64) | 52 | u32 |
-//! | `level` (0..=3) | 56 | u8 |
-//! | `reused` (0 or 1) | 57 | u8 |
-//! | `reason_len` (0..=128) | 58 | u8 |
-//! | zero | 59 | u8 × 5 |
-//! | `reason` (UTF-8, zero-filled) | 64 | u8 × 128 |
-//! | `modes` (zero-filled) | 192 | mode × 64 |
-//! | *size 4288, alignment 8* | | |
+//! | `friction_margin_error` | 48 | f64 |
+//! | `unstable_modes` | 56 | u32 |
+//! | `mode_count` (0..=64) | 60 | u32 |
+//! | `level` (0..=3) | 64 | u8 |
+//! | `reused` (0 or 1) | 65 | u8 |
+//! | `reason_len` (0..=128) | 66 | u8 |
+//! | zero | 67 | u8 × 5 |
+//! | `reason` (UTF-8, zero-filled) | 72 | u8 × 128 |
+//! | `modes` (zero-filled) | 200 | mode × 64 |
+//! | *size 4296, alignment 8* | | |
 //!
 //! | `squealcast/Vibration/1` | offset | type |
 //! |---|---|---|
@@ -49,11 +50,54 @@
 //! | `frequency_error_hz` | 48 | f64 |
 //! | `growth_rate_error_per_s` | 56 | f64 |
 //! | *size 64, alignment 8* | | |
+//!
+//! | `squealcast/Sensitivity/1` | offset | type |
+//! |---|---|---|
+//! | `stamp_ns` (of the input) | 0 | i64 |
+//! | `input_seq` | 8 | u64 |
+//! | `normal_load_n` | 16 | f64 |
+//! | `disc_speed_rad_s` | 24 | f64 |
+//! | `friction_coefficient` | 32 | f64 |
+//! | `nearest_window_end` | 40 | f64 |
+//! | `nearest_window_end_derivatives` | 48 | f64 × 5 |
+//! | `mode_count` (0..=64) | 88 | u32 |
+//! | `pair_count` (0..=32) | 92 | u32 |
+//! | `modes` (zero-filled) | 96 | mode sensitivity × 64 |
+//! | `pairs` (zero-filled) | 5728 | pair sensitivity × 32 |
+//! | *size 12384, alignment 8* | | |
+//!
+//! Derivatives are by friction coefficient, normal load, disc speed, contact stiffness and contact damping, in this order.
+//!
+//! | mode sensitivity | offset | type |
+//! |---|---|---|
+//! | `id` | 0 | u32 |
+//! | `law` (0 or 1) | 4 | u32 |
+//! | `frequency_hz` | 8 | f64 × 5 |
+//! | `growth_rate_per_s` | 48 | f64 × 5 |
+//! | *size 88, alignment 8* | | |
+//!
+//! | pair sensitivity | offset | type |
+//! |---|---|---|
+//! | `first_id` | 0 | u32 |
+//! | `second_id` | 4 | u32 |
+//! | `squares` (0 or 1) | 8 | u32 |
+//! | zero | 12 | u32 |
+//! | `mean` (real, imaginary) | 16 | f64 × 2 |
+//! | `discriminant` (real, imaginary) | 32 | f64 × 2 |
+//! | `mean_derivatives` (real, then imaginary) | 48 | f64 × 10 |
+//! | `discriminant_derivatives` (real, then imaginary) | 128 | f64 × 10 |
+//! | *size 208, alignment 8* | | |
 
 use iceoryx2::prelude::ZeroCopySend;
 use thiserror::Error;
 
-use super::{Header, MAX_MODES, Mode, OperatingPoint, Prediction, Time, Vibration, level};
+use super::{
+    Derivatives, Header, MAX_MODES, Mode, ModeSensitivity, OperatingPoint, PairSensitivity, Prediction, Sensitivity,
+    Time, Vibration, level, sensitivity_law,
+};
+
+/// At most this many pairs of a sensitivity are carried: as many as there can be of its modes.
+pub const MAX_PAIRS: usize = MAX_MODES / 2;
 
 /// At most this many bytes of [`Prediction::reason`] are carried.
 pub const REASON_BYTES: usize = 128;
@@ -65,6 +109,12 @@ pub enum FormError {
     Stamp(i64),
     #[error("{found} modes, at most {MAX_MODES} are carried")]
     ModeCount { found: usize },
+    #[error("{found} pairs, at most {MAX_PAIRS} are carried")]
+    PairCount { found: usize },
+    #[error("law {0}, expected 0 or 1")]
+    Law(u32),
+    #[error("squares {0}, expected 0 or 1")]
+    Squares(u32),
     #[error("level {0}, expected 0 to {fault}", fault = level::FAULT)]
     Level(u8),
     #[error("reused {0}, expected 0 or 1")]
@@ -136,10 +186,10 @@ pub struct ModeForm {
     pub growth_rate_error_per_s: f64,
 }
 
-/// `squealcast/Prediction/1`.
+/// `squealcast/Prediction/2`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
-#[type_name("squealcast/Prediction/1")]
+#[type_name("squealcast/Prediction/2")]
 pub struct PredictionForm {
     pub stamp_ns: i64,
     pub input_seq: u64,
@@ -147,6 +197,7 @@ pub struct PredictionForm {
     pub worst_frequency_hz: f64,
     pub critical_friction: f64,
     pub friction_margin: f64,
+    pub friction_margin_error: f64,
     pub unstable_modes: u32,
     pub mode_count: u32,
     pub level: u8,
@@ -232,6 +283,7 @@ impl Form for PredictionForm {
             worst_frequency_hz: message.worst_frequency_hz,
             critical_friction: message.critical_friction,
             friction_margin: message.friction_margin,
+            friction_margin_error: message.friction_margin_error,
             unstable_modes: message.unstable_modes,
             mode_count: message.modes.len() as u32,
             level: message.level,
@@ -264,6 +316,7 @@ impl Form for PredictionForm {
             worst_frequency_hz: self.worst_frequency_hz,
             critical_friction: self.critical_friction,
             friction_margin: self.friction_margin,
+            friction_margin_error: self.friction_margin_error,
             reason: reason.to_owned(),
             modes: modes.iter().map(Mode::from).collect(),
         })
@@ -305,6 +358,151 @@ impl From<&ModeForm> for Mode {
     }
 }
 
+/// One mode of a [`SensitivityForm`].
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/ModeSensitivity/1")]
+pub struct ModeSensitivityForm {
+    pub id: u32,
+    pub law: u32,
+    pub frequency_hz: [f64; 5],
+    pub growth_rate_per_s: [f64; 5],
+}
+
+/// One pair of a [`SensitivityForm`].
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/PairSensitivity/1")]
+pub struct PairSensitivityForm {
+    pub first_id: u32,
+    pub second_id: u32,
+    pub squares: u32,
+    pub zero: u32,
+    pub mean: [f64; 2],
+    pub discriminant: [f64; 2],
+    pub mean_derivatives: [[f64; 5]; 2],
+    pub discriminant_derivatives: [[f64; 5]; 2],
+}
+
+/// `squealcast/Sensitivity/1`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/Sensitivity/1")]
+pub struct SensitivityForm {
+    pub stamp_ns: i64,
+    pub input_seq: u64,
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub friction_coefficient: f64,
+    pub nearest_window_end: f64,
+    pub nearest_window_end_derivatives: [f64; 5],
+    pub mode_count: u32,
+    pub pair_count: u32,
+    pub modes: [ModeSensitivityForm; MAX_MODES],
+    pub pairs: [PairSensitivityForm; MAX_PAIRS],
+}
+
+impl Form for SensitivityForm {
+    type Message = Sensitivity;
+    const SERVICE: &'static str = "squealcast/sensitivity";
+
+    fn from_message(message: &Sensitivity) -> Result<Self, FormError> {
+        let (mode_count, pair_count) = (message.modes.len(), message.pairs.len());
+        if mode_count > MAX_MODES {
+            return Err(FormError::ModeCount { found: mode_count });
+        }
+        if pair_count > MAX_PAIRS {
+            return Err(FormError::PairCount { found: pair_count });
+        }
+        let mut modes = [ModeSensitivityForm::default(); MAX_MODES];
+        for (form, mode) in modes.iter_mut().zip(&message.modes) {
+            *form = ModeSensitivityForm {
+                id: mode.id,
+                law: mode.law.into(),
+                frequency_hz: mode.frequency_hz.values(),
+                growth_rate_per_s: mode.growth_rate_per_s.values(),
+            };
+        }
+        let mut pairs = [PairSensitivityForm::default(); MAX_PAIRS];
+        for (form, pair) in pairs.iter_mut().zip(&message.pairs) {
+            *form = PairSensitivityForm {
+                first_id: pair.first_id,
+                second_id: pair.second_id,
+                squares: pair.squares.into(),
+                zero: 0,
+                mean: [pair.mean_real, pair.mean_imaginary],
+                discriminant: [pair.discriminant_real, pair.discriminant_imaginary],
+                mean_derivatives: [pair.mean_real_derivatives.values(), pair.mean_imaginary_derivatives.values()],
+                discriminant_derivatives: [
+                    pair.discriminant_real_derivatives.values(),
+                    pair.discriminant_imaginary_derivatives.values(),
+                ],
+            };
+        }
+        Ok(Self {
+            stamp_ns: message.header.stamp.as_ns(),
+            input_seq: message.input_seq,
+            normal_load_n: message.normal_load_n,
+            disc_speed_rad_s: message.disc_speed_rad_s,
+            friction_coefficient: message.friction_coefficient,
+            nearest_window_end: message.nearest_window_end,
+            nearest_window_end_derivatives: message.nearest_window_end_derivatives.values(),
+            mode_count: mode_count as u32,
+            pair_count: pair_count as u32,
+            modes,
+            pairs,
+        })
+    }
+
+    fn to_message(&self) -> Result<Sensitivity, FormError> {
+        let (mode_count, pair_count) = (self.mode_count as usize, self.pair_count as usize);
+        let modes = self.modes.get(..mode_count).ok_or(FormError::ModeCount { found: mode_count })?;
+        let pairs = self.pairs.get(..pair_count).ok_or(FormError::PairCount { found: pair_count })?;
+        let mode = |form: &ModeSensitivityForm| {
+            let law = u8::try_from(form.law).ok().filter(|&law| law <= sensitivity_law::SQUARE_ROOT);
+            Ok(ModeSensitivity {
+                id: form.id,
+                law: law.ok_or(FormError::Law(form.law))?,
+                frequency_hz: Derivatives::new(form.frequency_hz),
+                growth_rate_per_s: Derivatives::new(form.growth_rate_per_s),
+            })
+        };
+        let pair = |form: &PairSensitivityForm| {
+            if form.squares > 1 {
+                return Err(FormError::Squares(form.squares));
+            }
+            Ok(PairSensitivity {
+                first_id: form.first_id,
+                second_id: form.second_id,
+                squares: form.squares == 1,
+                mean_real: form.mean[0],
+                mean_imaginary: form.mean[1],
+                discriminant_real: form.discriminant[0],
+                discriminant_imaginary: form.discriminant[1],
+                mean_real_derivatives: Derivatives::new(form.mean_derivatives[0]),
+                mean_imaginary_derivatives: Derivatives::new(form.mean_derivatives[1]),
+                discriminant_real_derivatives: Derivatives::new(form.discriminant_derivatives[0]),
+                discriminant_imaginary_derivatives: Derivatives::new(form.discriminant_derivatives[1]),
+            })
+        };
+        Ok(Sensitivity {
+            header: header(self.stamp_ns)?,
+            input_seq: self.input_seq,
+            normal_load_n: self.normal_load_n,
+            disc_speed_rad_s: self.disc_speed_rad_s,
+            friction_coefficient: self.friction_coefficient,
+            nearest_window_end: self.nearest_window_end,
+            nearest_window_end_derivatives: Derivatives::new(self.nearest_window_end_derivatives),
+            modes: modes.iter().map(mode).collect::<Result<_, _>>()?,
+            pairs: pairs.iter().map(pair).collect::<Result<_, _>>()?,
+        })
+    }
+
+    fn seq(&self) -> u64 {
+        self.input_seq
+    }
+}
+
 /// A header with this stamp. One that the message cannot hold is refused: it would come back as another time.
 fn header(stamp_ns: i64) -> Result<Header, FormError> {
     let stamp = Time::from_ns(stamp_ns);
@@ -339,6 +537,7 @@ mod tests {
             worst_frequency_hz: 1750.25,
             critical_friction: 0.4,
             friction_margin: -0.1,
+            friction_margin_error: 1e-12,
             reason: reason.to_owned(),
             modes: (0..modes)
                 .map(|i| Mode { id: i as u32, frequency_hz: 100.0 * i as f64, residual: 1e-12, ..Mode::default() })
@@ -384,7 +583,7 @@ mod tests {
             ],
             [0, 4, 8, 16, 24, 32, 40, 48, 56]
         );
-        assert_eq!((size_of::<PredictionForm>(), align_of::<PredictionForm>()), (4288, 8));
+        assert_eq!((size_of::<PredictionForm>(), align_of::<PredictionForm>()), (4296, 8));
         assert_eq!(
             [
                 offset_of!(PredictionForm, stamp_ns),
@@ -393,6 +592,7 @@ mod tests {
                 offset_of!(PredictionForm, worst_frequency_hz),
                 offset_of!(PredictionForm, critical_friction),
                 offset_of!(PredictionForm, friction_margin),
+                offset_of!(PredictionForm, friction_margin_error),
                 offset_of!(PredictionForm, unstable_modes),
                 offset_of!(PredictionForm, mode_count),
                 offset_of!(PredictionForm, level),
@@ -402,8 +602,56 @@ mod tests {
                 offset_of!(PredictionForm, reason),
                 offset_of!(PredictionForm, modes),
             ],
-            [0, 8, 16, 24, 32, 40, 48, 52, 56, 57, 58, 59, 64, 192]
+            [0, 8, 16, 24, 32, 40, 48, 56, 60, 64, 65, 66, 67, 72, 200]
         );
+    }
+
+    #[test]
+    fn sensitivities_come_back_whole_in_the_documented_layout() {
+        assert_eq!([size_of::<ModeSensitivityForm>(), size_of::<PairSensitivityForm>()], [88, 208]);
+        assert_eq!((size_of::<SensitivityForm>(), align_of::<SensitivityForm>()), (12384, 8));
+        let counts = [offset_of!(SensitivityForm, mode_count), offset_of!(SensitivityForm, pair_count)];
+        let lists = [offset_of!(SensitivityForm, modes), offset_of!(SensitivityForm, pairs)];
+        assert_eq!((counts, lists), ([88, 92], [96, 5728]));
+        assert_eq!(offset_of!(PairSensitivityForm, discriminant_derivatives), 128);
+        let derivatives = |k: usize| Derivatives::new(std::array::from_fn(|j| (10 * k + j) as f64));
+        let mode = |k: usize| ModeSensitivity {
+            id: k as u32,
+            law: (k % 2) as u8,
+            frequency_hz: derivatives(k),
+            growth_rate_per_s: derivatives(k + 100),
+        };
+        let pair = |k: usize| PairSensitivity {
+            first_id: k as u32,
+            second_id: 1 + k as u32,
+            squares: k % 2 == 1,
+            mean_real: 1.0,
+            mean_imaginary: 2.0,
+            discriminant_real: 3.0,
+            discriminant_imaginary: 4.0,
+            mean_real_derivatives: derivatives(k),
+            mean_imaginary_derivatives: derivatives(k + 1),
+            discriminant_real_derivatives: derivatives(k + 2),
+            discriminant_imaginary_derivatives: derivatives(k + 3),
+        };
+        let message = Sensitivity {
+            header: Header { stamp: Time { sec: 7, nanosec: 8 }, frame_id: String::new() },
+            input_seq: 9,
+            normal_load_n: 500.0,
+            disc_speed_rad_s: 13.0,
+            friction_coefficient: 0.3,
+            nearest_window_end: 0.35,
+            nearest_window_end_derivatives: derivatives(7),
+            modes: (0..MAX_MODES).map(mode).collect(),
+            pairs: (0..MAX_PAIRS).map(pair).collect(),
+        };
+        let form = SensitivityForm::from_message(&message).expect("fits");
+        assert_eq!(form.to_message().expect("is one"), message);
+        let refused = |form: SensitivityForm| form.to_message().expect_err("is none");
+        assert_eq!(refused(SensitivityForm { pair_count: 33, ..form }), FormError::PairCount { found: 33 });
+        let mut bad = form;
+        bad.modes[3].law = 2;
+        assert_eq!(refused(bad), FormError::Law(2));
     }
 
     #[test]
@@ -417,7 +665,7 @@ mod tests {
             ]
         };
         let expected =
-            ["squealcast/OperatingPoint/1", "squealcast/Prediction/1", "squealcast/Mode/1", "squealcast/Vibration/1"];
+            ["squealcast/OperatingPoint/1", "squealcast/Prediction/2", "squealcast/Mode/1", "squealcast/Vibration/1"];
         assert_eq!(names, expected);
     }
 

@@ -78,6 +78,7 @@ class Prediction(IdlStruct, typename="squealcast_msgs::msg::dds_::Prediction_"):
     worst_frequency_hz: float64
     critical_friction: float64
     friction_margin: float64
+    friction_margin_error: float64
     reason: str
     modes: sequence[Mode]
 

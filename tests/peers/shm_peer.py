@@ -54,6 +54,7 @@ class Prediction(ctypes.Structure):
         ("worst_frequency_hz", ctypes.c_double),
         ("critical_friction", ctypes.c_double),
         ("friction_margin", ctypes.c_double),
+        ("friction_margin_error", ctypes.c_double),
         ("unstable_modes", ctypes.c_uint32),
         ("mode_count", ctypes.c_uint32),
         ("level", ctypes.c_uint8),
@@ -66,10 +67,10 @@ class Prediction(ctypes.Structure):
 
     @staticmethod
     def type_name() -> str:
-        return "squealcast/Prediction/1"
+        return "squealcast/Prediction/2"
 
 
-assert (ctypes.sizeof(OperatingPoint), ctypes.sizeof(Mode), ctypes.sizeof(Prediction)) == (40, 64, 4288)
+assert (ctypes.sizeof(OperatingPoint), ctypes.sizeof(Mode), ctypes.sizeof(Prediction)) == (40, 64, 4296)
 
 
 def open_services(node, name, payload, rig):

@@ -1,0 +1,432 @@
+//! The ends of the windows of instability at loads and speeds near those they were found at.
+//!
+//! An end is where a condition `F(μ, p)` is zero: the discriminant of a pair, a growth rate, the square of a static root.
+//! So it moves with load, speed and contact by `dμ/dp = -F_p / F_μ`, and at another load and speed Newton's method
+//! finds it again from there in two or three solves.
+
+use super::critical::{Window, WindowKind};
+use super::model::{Model, Parameter};
+use super::operating_point::OperatingPoint;
+use super::sensitivity::{of_pair, of_roots};
+use super::spectrum::{Solver, Spectrum, Vectors};
+use super::stability_map::{MapError, StabilityMap};
+
+/// How far load and speed may be, relative, from where ends are known for these to be extrapolated with a bound.
+pub const REACH: f64 = 0.02;
+
+/// Steps of Newton's method before it is given up.
+const STEPS: usize = 12;
+/// A step this short, relative, is the last.
+const NEAR: f64 = 1e-9;
+/// The longest step that still counts as near.
+const LONGEST: f64 = 0.1;
+/// Two merging roots are told apart this far beside the merging point, relative: their discriminant has the same slope
+/// there, but their span is known to more digits.
+const BESIDE: f64 = 1e-10;
+/// The conditions, beside the friction coefficient, that ends move with while a rig runs.
+const MOVING: [Parameter; 2] = [Parameter::Load, Parameter::Speed];
+
+/// What is zero at an end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Condition {
+    /// The discriminant of a pair.
+    Discriminant(u32, u32),
+    /// The growth rate of a damped mode.
+    Growth(u32),
+    /// The square of a root of an undamped model.
+    Square(u32),
+    /// The static root of a damped model that is nearest to zero.
+    Static,
+    /// None: the edge of the range that was searched.
+    Edge,
+}
+
+/// An end of a window.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct End {
+    condition: Condition,
+    /// Friction coefficient.
+    pub mu: f64,
+    /// Bound of its error; NaN where nothing is known.
+    pub error: f64,
+    /// Derivatives with respect to load (1/N), speed (s/rad), contact stiffness and contact damping (relative), as
+    /// [`Parameter::ALL`] from the second on.
+    pub slope: [f64; 4],
+    /// Second derivatives with respect to load and speed.
+    curvature: [[f64; 2]; 2],
+}
+
+/// The ends of all windows of a map, at one load and speed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Ends {
+    /// Load and speed; the friction coefficient is of no meaning.
+    pub point: OperatingPoint,
+    /// For every window of the map, in its order, where it begins and, unless it is open, where it ends.
+    pub windows: Vec<(End, Option<End>)>,
+}
+
+/// A value with a bound of its error; NaN where none is known.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bounded {
+    pub value: f64,
+    pub error: f64,
+}
+
+impl End {
+    /// The end at a load and speed that differ by `moved` from where it is known.
+    ///
+    /// `μ + μ' δ + δᵀ μ'' δ / 2`; the bound takes the last term as uncertain as it is large.
+    fn at(&self, moved: [f64; 2], reached: bool) -> Bounded {
+        let (mut bend, mut size) = (0.0, 0.0);
+        for (j, row) in self.curvature.iter().enumerate() {
+            for (k, second) in row.iter().enumerate() {
+                let term = 0.5 * second * moved[j] * moved[k];
+                bend += term;
+                size += term.abs();
+            }
+        }
+        let along = self.slope[0] * moved[0] + self.slope[1] * moved[1];
+        Bounded { value: self.mu + along + bend, error: if reached { self.error + size } else { f64::NAN } }
+    }
+}
+
+impl Ends {
+    /// The ends of the windows of `map` at its own load and speed.
+    ///
+    /// # Errors
+    /// [`MapError`].
+    pub fn of_map(model: &Model, solver: &mut Solver, map: &StabilityMap) -> Result<Self, MapError> {
+        let mut search = Search { model, solver, map };
+        let mut windows = vec![];
+        for window in &map.windows {
+            let from = search.first(window, window.mu_from)?;
+            let to = window.mu_to.map(|mu| search.first(window, mu)).transpose()?;
+            windows.push((from, to));
+        }
+        Ok(Self { point: map.point, windows })
+    }
+
+    /// The ends of the windows of `map` at the load and speed of `point`, which the map serves; `None` where one of
+    /// them is not found again, so that another map is due.
+    ///
+    /// # Errors
+    /// [`MapError`].
+    pub fn carried(
+        model: &Model,
+        solver: &mut Solver,
+        map: &StabilityMap,
+        point: &OperatingPoint,
+    ) -> Result<Option<Self>, MapError> {
+        let mut search = Search { model, solver, map };
+        let mut windows = vec![];
+        for ((from, to), (from_there, to_there)) in map.ends.windows.iter().zip(map.ends.at(point)) {
+            let Some(from) = search.carry(from, from_there.value, point)? else { return Ok(None) };
+            let to = match to.as_ref().zip(to_there) {
+                None => None,
+                Some((to, there)) => match search.carry(to, there.value, point)? {
+                    None => return Ok(None),
+                    found => found,
+                },
+            };
+            windows.push((from, to));
+        }
+        Ok(Some(Self { point: point.with_friction(0.0), windows }))
+    }
+
+    /// The ends at the load and speed of `point`, window by window.
+    pub fn at(&self, point: &OperatingPoint) -> impl Iterator<Item = (Bounded, Option<Bounded>)> + Clone {
+        let (load, speed) = (self.point.normal_load_n, self.point.disc_speed_rad_s);
+        let moved = [point.normal_load_n - load, point.disc_speed_rad_s - speed];
+        let within = |moved: f64, at: f64| moved.abs() <= REACH * at.abs();
+        self.windows.iter().map(move |(from, to)| {
+            // An end that does not move with a condition is good for any value of it.
+            let reached = |end: &End| {
+                let moves = |k: usize| end.slope[k] != 0.0 || end.curvature[k] != [0.0; 2];
+                (!moves(0) || within(moved[0], load)) && (!moves(1) || within(moved[1], speed))
+            };
+            (from.at(moved, reached(from)), to.as_ref().map(|to| to.at(moved, reached(to))))
+        })
+    }
+
+    /// The smallest friction coefficient at which an instability begins.
+    pub fn critical_friction(&self, point: &OperatingPoint) -> Option<Bounded> {
+        self.at(point).map(|(from, _)| from).min_by(|a, b| a.value.total_cmp(&b.value))
+    }
+
+    /// Distance of the friction coefficient of `point` from the nearest end of the union of the windows, negative
+    /// inside; `None` without windows. An open end (beyond the searched range) is no end.
+    pub fn margin(&self, point: &OperatingPoint) -> Option<Bounded> {
+        let mu = point.friction_coefficient;
+        let windows = self.at(point);
+        let upper = |to: Option<Bounded>| to.map_or(f64::INFINITY, |to| to.value);
+        let ends = windows.clone().enumerate().flat_map(|(k, (from, to))| {
+            // An end that another window covers is none of the union.
+            let mut others = windows.clone().enumerate().filter(move |&(j, _)| j != k).map(|(_, other)| other);
+            let covered_from = others.clone().any(|(a, b)| a.value < from.value && from.value <= upper(b));
+            let covered_to = to.is_some_and(|to| others.any(|(a, b)| a.value <= to.value && to.value < upper(b)));
+            [Some(from).filter(|_| !covered_from), to.filter(|_| !covered_to)]
+        });
+        let nearest = ends.flatten().min_by(|a, b| (a.value - mu).abs().total_cmp(&(b.value - mu).abs()))?;
+        let inside = windows.clone().any(|(from, to)| from.value <= mu && mu <= upper(to));
+        let distance = (nearest.value - mu).abs();
+        Some(Bounded { value: if inside { -distance } else { distance }, error: nearest.error })
+    }
+
+    /// The end nearest to the friction coefficient of `point`, of those that are not edges of the searched range, and
+    /// where it is at its load and speed.
+    pub fn nearest(&self, point: &OperatingPoint) -> Option<(&End, f64)> {
+        let both = self.windows.iter().zip(self.at(point));
+        let ends = both.flat_map(|((from, to), (a, b))| [Some((from, a.value)), to.as_ref().zip(b.map(|b| b.value))]);
+        let distance = |mu: f64| (mu - point.friction_coefficient).abs();
+        let moving = ends.flatten().filter(|(end, _)| end.condition != Condition::Edge);
+        moving.min_by(|a, b| distance(a.1).total_cmp(&distance(b.1)))
+    }
+
+    /// Every number that a prediction can depend on, as bits.
+    pub fn words(&self) -> impl Iterator<Item = u64> {
+        self.windows.iter().flat_map(|(from, to)| std::iter::once(from).chain(to)).flat_map(|end| {
+            let numbers = [end.mu, end.error].into_iter().chain(end.slope).chain(end.curvature.into_iter().flatten());
+            numbers.map(f64::to_bits)
+        })
+    }
+}
+
+/// The value of a condition with its derivatives and a bound of its error.
+struct Value {
+    f: f64,
+    slope: [f64; 5],
+    error: f64,
+}
+
+/// Looks for ends.
+struct Search<'a> {
+    model: &'a Model,
+    solver: &'a mut Solver,
+    map: &'a StabilityMap,
+}
+
+impl Search<'_> {
+    fn solve(&mut self, point: &OperatingPoint, mu: f64) -> Result<Spectrum, MapError> {
+        let solved = self.solver.solve(self.model, &point.with_friction(mu), Vectors::Right);
+        solved.map_err(|source| MapError::Solve { mu, source })
+    }
+
+    /// The end of `window` that the map has found at `mu`, with all there is to know of it.
+    fn first(&mut self, window: &Window, mu: f64) -> Result<End, MapError> {
+        let edge = [self.map.nodes.first(), self.map.nodes.last()].iter().flatten().any(|node| node.mu() == mu);
+        let condition = if edge { Condition::Edge } else { self.condition(window, mu)? };
+        let end = End { condition, mu, error: 0.0, slope: [0.0; 4], curvature: [[0.0; 2]; 2] };
+        if edge {
+            return Ok(end);
+        }
+        let map = self.map;
+        let unknown = End { error: f64::NAN, ..end };
+        let Some(mut end) = self.carry(&end, mu, &map.point)?.filter(|found| (found.mu - mu).abs() < 1e-6) else {
+            return Ok(unknown);
+        };
+        // What the map has polished is at least as good.
+        end.mu = mu;
+        let depends: [bool; 2] = self.model.depends_on_load_and_speed().into();
+        for k in (0..2).filter(|&k| depends[k]) {
+            let mut probe = map.point;
+            let at = match MOVING[k] {
+                Parameter::Load => &mut probe.normal_load_n,
+                _ => &mut probe.disc_speed_rad_s,
+            };
+            let step = REACH * *at;
+            *at += step;
+            let guess = mu + end.slope[k] * step;
+            let Some(there) = self.carry(&end, guess, &probe)? else { return Ok(unknown) };
+            end.curvature[k] = std::array::from_fn(|j| (there.slope[j] - end.slope[j]) / step);
+        }
+        Ok(end)
+    }
+
+    /// What is zero where `window` ends at `mu`.
+    fn condition(&mut self, window: &Window, mu: f64) -> Result<Condition, MapError> {
+        Ok(match (window.kind, window.mode_ids.as_slice()) {
+            (WindowKind::Coalescence, &[a, b]) => Condition::Discriminant(a, b),
+            (WindowKind::ZeroGrowth, &[a]) => Condition::Growth(a),
+            (WindowKind::Divergence, &[a]) => {
+                let map = self.map;
+                let spectrum = self.solve(&map.point, mu)?;
+                let ids = map.identify(&spectrum);
+                let at = ids.iter().position(|&id| id == Some(a));
+                let square = at.map(|k| spectrum.roots[k].square);
+                // Where it ends by meeting another root on the real axis, the two are close and zero is far.
+                let partner = square.and_then(|z| {
+                    let others = (0..spectrum.roots.len()).filter(|&j| Some(j) != at);
+                    let distance = |j: usize| (spectrum.roots[j].square - z).norm();
+                    others.min_by(|&i, &j| distance(i).total_cmp(&distance(j))).filter(|&j| distance(j) < z.norm())
+                });
+                match partner.and_then(|j| ids[j]) {
+                    Some(b) => Condition::Discriminant(a, b),
+                    None => Condition::Square(a),
+                }
+            }
+            _ => Condition::Static,
+        })
+    }
+
+    /// The end at another load and speed, by Newton's method from `mu`; `None` where it does not converge.
+    fn carry(&mut self, end: &End, mut mu: f64, point: &OperatingPoint) -> Result<Option<End>, MapError> {
+        if end.condition == Condition::Edge {
+            return Ok(Some(*end));
+        }
+        let unit = mu.abs().max(1e-3);
+        for _ in 0..STEPS {
+            let value = match self.value(end.condition, point, mu)? {
+                Some(value) => value,
+                None => {
+                    // Exactly at a merging point both roots have one vector.
+                    mu += BESIDE * unit;
+                    let Some(value) = self.value(end.condition, point, mu)? else { return Ok(None) };
+                    value
+                }
+            };
+            let step = -value.f / value.slope[0];
+            if step.is_nan() || step.abs() > LONGEST {
+                return Ok(None);
+            }
+            mu += step;
+            // What the next step would correct is of the order of this one squared.
+            if step.abs() <= NEAR * unit {
+                let Some(beside) = self.value(end.condition, point, mu + BESIDE * unit)? else { return Ok(None) };
+                let slope = std::array::from_fn(|k| -beside.slope[k + 1] / beside.slope[0]);
+                let error = value.error / beside.slope[0].abs() + 4.0 * f64::EPSILON * unit;
+                return Ok(Some(End { mu, error, slope, ..*end }));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The condition at `mu`; `None` where a root is gone or not to be followed.
+    fn value(&mut self, condition: Condition, point: &OperatingPoint, mu: f64) -> Result<Option<Value>, MapError> {
+        let spectrum = self.solve(point, mu)?;
+        let ids = self.map.identify(&spectrum);
+        let find = |id: u32| ids.iter().position(|&other| other == Some(id));
+        let single = |k: usize| {
+            let found = of_roots(self.model, &spectrum, &[k]).ok()?;
+            found.first().map(|root| (root.slope.map(|slope| slope.re), root.error))
+        };
+        Ok(match condition {
+            Condition::Discriminant(a, b) => find(a).zip(find(b)).and_then(|(i, j)| {
+                let pair = of_pair(self.model, &spectrum, i, j).ok()?;
+                let slope = pair.discriminant_slope.map(|slope| slope.re);
+                Some(Value { f: pair.discriminant.re, slope, error: pair.discriminant_error })
+            }),
+            Condition::Growth(a) => find(a)
+                .and_then(|k| single(k).map(|(slope, error)| Value { f: spectrum.roots[k].lambda.re, slope, error })),
+            Condition::Square(a) => find(a)
+                .and_then(|k| single(k).map(|(slope, error)| Value { f: spectrum.roots[k].square.re, slope, error })),
+            Condition::Static => {
+                let size = |k: &usize| spectrum.roots[*k].lambda.norm();
+                let nearest = (spectrum.mode_count..spectrum.roots.len()).min_by(|a, b| size(a).total_cmp(&size(b)));
+                nearest.and_then(|k| {
+                    single(k).map(|(slope, error)| Value { f: spectrum.roots[k].lambda.re, slope, error })
+                })
+            }
+            Condition::Edge => None,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::model::ContactLaw;
+    use super::super::stability_map::MapOptions;
+    use super::super::synthetic::{Synthetic, Uniform, rig};
+    use super::super::test_models::{REFERENCE, hulten, nine_dof};
+    use super::*;
+
+    const OPTIONS: MapOptions =
+        MapOptions { mu_min: 0.0, mu_max: 2.0, band_max_hz: None, instability_threshold: 1e-6, windows: true };
+
+    fn map(model: &Model, point: &OperatingPoint) -> StabilityMap {
+        StabilityMap::build(model, &mut Solver::new(model.dimension()), point, &OPTIONS).expect("it can be mapped")
+    }
+
+    #[test]
+    fn margin_is_to_the_union() {
+        let end = |mu| End { condition: Condition::Edge, mu, error: 0.0, slope: [0.0; 4], curvature: [[0.0; 2]; 2] };
+        let ends = |windows: &[(f64, Option<f64>)]| Ends {
+            point: REFERENCE,
+            windows: windows.iter().map(|&(from, to)| (end(from), to.map(end))).collect(),
+        };
+        assert_eq!(ends(&[]).margin(&REFERENCE), None);
+        let overlapping = ends(&[(0.2, Some(0.5)), (0.4, Some(0.7)), (1.5, None)]);
+        let touching = ends(&[(0.2, Some(0.5)), (0.5, Some(0.7)), (1.5, None), (1.6, None)]);
+        for (mu, expected) in [(0.1, 0.1), (0.45, -0.25), (0.6, -0.1), (0.9, 0.2), (1.75, -0.25)] {
+            for ends in [&overlapping, &touching] {
+                let found = ends.margin(&REFERENCE.with_friction(mu)).unwrap().value;
+                assert!((found - expected).abs() < 1e-15, "{mu}: {found} is not {expected}");
+            }
+        }
+    }
+
+    /// Ends carried to another load and speed are those that a map made there finds, to 1e-10; extrapolated ones are off
+    /// by no more than their bound. Undamped and damped rigs whose stiffness and damping depend on load and speed.
+    #[test]
+    fn ends_follow_load_and_speed() {
+        let laws = [
+            (0.0, ContactLaw { exponent: 0.4, ..Default::default() }),
+            (2e-3, ContactLaw { exponent: 0.4, slope_s_per_m: -2e-3, lateral_damping: true, ..Default::default() }),
+        ];
+        let mut uniform = Uniform::new(5);
+        let (mut carried_ends, mut moved_most) = (0, 0.0f64);
+        for (law, seed) in (1..=12).map(|seed| (usize::from(seed % 3 == 0), seed)) {
+            let (damping_ratio, contact_law) = laws[law];
+            let model = rig(&Synthetic { modes: 24, pairs: 12, damping_ratio, contact_law, seed }).unwrap();
+            let map = map(&model, &REFERENCE);
+            for _ in 0..2 {
+                let point = OperatingPoint {
+                    normal_load_n: REFERENCE.normal_load_n * (1.0 + 0.01 * uniform.draw()),
+                    disc_speed_rad_s: REFERENCE.disc_speed_rad_s * (1.0 + 0.01 * uniform.draw()),
+                    ..REFERENCE
+                };
+                let mut solver = Solver::new(model.dimension());
+                let carried = Ends::carried(&model, &mut solver, &map, &point).unwrap().expect("they are found again");
+                let there = self::map(&model, &point);
+                assert_eq!(there.windows.len(), map.windows.len(), "law {law}, seed {seed}: a window came or went");
+                let both = |ends: &Ends, at: &OperatingPoint| -> Vec<Bounded> {
+                    ends.at(at).flat_map(|(from, to)| std::iter::once(from).chain(to)).collect()
+                };
+                let (exact, found, guessed) =
+                    (both(&there.ends, &point), both(&carried, &point), both(&map.ends, &point));
+                for k in 0..exact.len() {
+                    let mu = exact[k].value;
+                    assert!((found[k].value - mu).abs() < 1e-10, "law {law}, seed {seed}: {:?} {mu}", found[k]);
+                    let limit = guessed[k].error + exact[k].error;
+                    assert!((guessed[k].value - mu).abs() <= limit, "law {law}, seed {seed}: {:?} {mu}", guessed[k]);
+                    carried_ends += 1;
+                    moved_most = moved_most.max((both(&map.ends, &REFERENCE)[k].value - mu).abs());
+                }
+            }
+        }
+        assert!(carried_ends > 15 && moved_most > 1e-3, "worth testing: {carried_ends} ends, moved by {moved_most}");
+    }
+
+    /// An end moves with the contact's stiffness as the ends of a stiffer rig say. The nine degrees of freedom with
+    /// contact springs a thousandth stiffer and softer.
+    #[test]
+    fn ends_follow_the_contact() {
+        let step = 1e-4;
+        let ends = |stiffer: f64| map(&nine_dof(2.0, 2.0, 5.0 * stiffer), &REFERENCE);
+        let (map, up, down) = (ends(1.0), ends(1.0 + step), ends(1.0 - step));
+        let slope = map.ends.windows[0].0.slope;
+        let difference = (up.windows[0].mu_from - down.windows[0].mu_from) / (2.0 * step);
+        assert!((slope[2] - difference).abs() < 1e-6 * difference.abs().max(1.0), "{slope:?} {difference}");
+        assert_eq!((slope[0], slope[1], slope[3]), (0.0, 0.0, 0.0), "no load, speed or damping in it");
+        assert!(map.ends.windows[0].0.error < 1e-12, "{:?}", map.ends.windows[0]);
+    }
+
+    /// The growth rate of Hultén's damped model: its end is known with a bound, and carried to where it is it stays.
+    #[test]
+    fn damped_ends_stay() {
+        let model = hulten(0.02, 0.10);
+        let map = map(&model, &REFERENCE);
+        let carried = Ends::carried(&model, &mut Solver::new(2), &map, &REFERENCE).unwrap().expect("it is found");
+        let (was, is) = (map.ends.windows[0].0, carried.windows[0].0);
+        assert!((was.mu - is.mu).abs() <= was.error + is.error && was.error < 1e-11, "{was:?} {is:?}");
+    }
+}
