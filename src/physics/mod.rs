@@ -9,6 +9,7 @@ pub mod operating_point;
 pub mod reference;
 pub mod spectrum;
 pub mod stability_map;
+pub mod stress;
 pub mod summary;
 pub mod synthetic;
 #[cfg(test)]

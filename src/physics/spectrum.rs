@@ -290,6 +290,12 @@ impl Solver {
         })
     }
 
+    /// The matrix whose eigenvalues the last solve computed, which gave `spectrum`: `K`, whose eigenvalues are `-λ²`, or the
+    /// scaled state matrix.
+    pub fn matrix(&self, spectrum: &Spectrum) -> MatRef<'_, f64> {
+        if spectrum.undamped { self.stiffness.as_ref() } else { self.state.as_ref() }
+    }
+
     /// Writes `[0 S; -K S⁻¹ -C]`.
     fn assemble_state(&mut self) {
         let n = self.stiffness.nrows();
