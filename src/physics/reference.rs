@@ -118,6 +118,8 @@ pub struct Refined {
 pub const MAX_TOGETHER: usize = 4;
 /// Roots nearer to one another than this many times their bounds are refined together.
 const APART: f64 = 100.0;
+/// So are those closer than this, relative to themselves: the bordered matrix of one alone would be too close to singular.
+const CLOSE: f64 = 1e-9;
 
 /// Which modes of `spectrum` belong together: those that their bounds do not clearly keep apart.
 pub fn clusters(spectrum: &Spectrum) -> Vec<Vec<usize>> {
@@ -125,7 +127,7 @@ pub fn clusters(spectrum: &Spectrum) -> Vec<Vec<usize>> {
     for k in 0..spectrum.mode_count {
         let near = |&j: &usize| {
             let gap = (solved_for(spectrum, j) - solved_for(spectrum, k)).norm();
-            gap <= APART * bound(spectrum, j).max(bound(spectrum, k))
+            gap <= (APART * bound(spectrum, j).max(bound(spectrum, k))).max(CLOSE * solved_for(spectrum, k).norm())
         };
         let (with, mut without): (Vec<_>, Vec<_>) =
             clusters.into_iter().partition(|cluster: &Vec<usize>| cluster.iter().any(near));
@@ -248,7 +250,7 @@ impl Pencil<'_> {
                 let mut x = vec![Complex::default(); n];
                 let mut f = vec![Complex::default(); k];
                 let mut previous = f64::INFINITY;
-                for _ in 0..12 {
+                for _ in 0..30 {
                     let top = self.apply(&x, last.get(column), before.get(column));
                     let right = Mat::<c64>::from_fn(n + k, 1, |i, _| {
                         if i < n {
@@ -272,7 +274,7 @@ impl Pencil<'_> {
                     if !size.is_finite() {
                         return None;
                     }
-                    if size <= 1e-28 * whole || (size >= 0.1 * previous && size <= 1e-22 * whole) {
+                    if size <= 1e-28 * whole || (size >= 0.1 * previous && size <= 1e-17 * whole) {
                         previous = 0.0;
                         break;
                     }
@@ -362,7 +364,7 @@ fn roots_near(polynomial: &[Complex], guesses: &[Complex]) -> Option<Vec<Complex
         let angle = 1.0 + std::f64::consts::TAU * i as f64 / k as f64;
         *root = root.plus(Complex::from(c64::new(angle.cos(), angle.sin()) * (1e-3 * scale)));
     }
-    for _ in 0..200 {
+    for round in 0..200 {
         let mut largest: f64 = 0.0;
         for i in 0..k {
             let (mut value, mut slope) = (Complex::default(), Complex::default());
@@ -383,17 +385,12 @@ fn roots_near(polynomial: &[Complex], guesses: &[Complex]) -> Option<Vec<Complex
             roots[i] = roots[i].minus(step);
             largest = largest.max(size(step));
         }
-        // Half of the thirty digits are left at a multiple zero.
-        if largest <= 1e-26 * scale || (k > 1 && largest <= 1e-14 * scale && scale_is_noise(polynomial, k)) {
+        // Half of the thirty digits are left at a multiple zero, and steps that only halve the distance.
+        if largest <= 1e-26 * scale || (round > 100 && largest <= 1e-8 * scale) {
             return Some(roots);
         }
     }
     None
-}
-
-/// Whether the zeros are one multiple zero to the digits there are.
-fn scale_is_noise(polynomial: &[Complex], k: usize) -> bool {
-    polynomial[0].rounded().norm() <= 1e-24 * polynomial[k].rounded().norm()
 }
 
 /// `exact` in the order of `given`: the assignment of the least total distance.

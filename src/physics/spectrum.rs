@@ -267,7 +267,7 @@ impl Solver {
             Problem::Undamped => self.dense.eigen(self.stiffness.as_ref(), matrix_norm, vectors)?,
             Problem::Damped => self.dense.eigen(self.state.as_ref(), matrix_norm, vectors)?,
         }
-        let mut raw = self.roots(problem, stiffness_norm);
+        let mut raw = self.roots(problem, stiffness_norm, matrix_norm);
         if vectors != Vectors::None {
             self.multiply(problem, vectors);
             self.judge(&mut raw, problem, stiffness_norm, model.pad_modes())?;
@@ -314,10 +314,16 @@ impl Solver {
     }
 
     /// The roots of the eigenvalues that were found, one for each conjugate pair of a damped model.
-    fn roots(&self, problem: Problem, stiffness_norm: f64) -> Vec<Raw> {
+    fn roots(&self, problem: Problem, stiffness_norm: f64, matrix_norm: f64) -> Vec<Raw> {
+        let rounding = 16.0 * self.stiffness.nrows() as f64 * f64::EPSILON;
         // `|λ²|` below which a root is a zero disturbed by rounding. A double root at the origin splits into ±√(rounding):
         // as a square it is zero to rounding.
-        let zero = 16.0 * self.stiffness.nrows() as f64 * f64::EPSILON * stiffness_norm;
+        let mut zero = rounding * stiffness_norm;
+        let near_origin = self.dense.values.iter().filter(|value| value.norm_sqr() <= zero).count();
+        if problem == Problem::Damped && near_origin == 1 {
+            // A simple one, as where a static root crosses, is known far better.
+            zero = (rounding * matrix_norm).powi(2);
+        }
         let mut raw = Vec::with_capacity(self.stiffness.nrows() + 8);
         for (&value, packing) in self.dense.values.iter().zip(packing(&self.dense.values)) {
             let (lambda, square) = match problem {
@@ -647,30 +653,43 @@ fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
 
 /// Bounds every root's error from its condition and the distance of its nearest neighbour, where left vectors are known.
 ///
-/// A backward stable solver is exact for a matrix that is off by `E`; to first order a root is then off by `κ E`. Close
-/// to a merging point `κ` grows like one over the gap `g`, and what remains is `√(g κ E)`: half the digits.
+/// A backward stable solver is exact for a matrix that is off by `E`; to first order a root is then off by `κ E`. Where `m`
+/// roots come together, `κ` grows like one over the product of the gaps between them, and what remains is the `m`-th root
+/// of `κ E g₁ … g₍ₘ₋₁₎`: half the digits at a merging point, a third where three modes meet.
 fn bound_errors(raw: &mut [Raw], damped: bool, matrix_norm: f64) {
     let backward_error = ROUNDING * f64::EPSILON * matrix_norm;
+    // Gaps below are no gaps to the solver, nor to the condition that is computed from its vectors.
+    let least_gap = f64::EPSILON * matrix_norm;
     let values: Vec<c64> = raw.iter().map(|raw| if damped { raw.root.lambda } else { raw.root.square }).collect();
     for (k, entry) in raw.iter_mut().enumerate() {
         let Some(left) = entry.left else { continue };
         let z = values[k];
         // In a damped model the conjugate is a neighbour too.
         let mirror = if damped && z.im != 0.0 { 4.0 * z.im * z.im } else { f64::INFINITY };
-        let others = values.iter().enumerate().filter(|&(j, _)| j != k).map(|(_, other)| (other - z).norm_sqr());
-        let gap = others.fold(mirror, f64::min).sqrt();
-        let first_order = 2.0 * left.condition * backward_error;
-        let error = if gap.is_finite() {
-            first_order.min(2.0 * (gap * first_order).sqrt()).max(backward_error)
-        } else {
-            first_order
-        };
-        // At a gap of nothing the condition is infinite and the product is not known, but it is not above the norm.
-        let error = if error.is_finite() { error } else { 2.0 * (backward_error * matrix_norm).sqrt() };
+        let mut gaps = [mirror, f64::INFINITY, f64::INFINITY];
+        for (j, other) in values.iter().enumerate() {
+            let mut gap = if j == k { f64::INFINITY } else { (other - z).norm_sqr() };
+            for kept in &mut gaps {
+                if gap < *kept {
+                    std::mem::swap(kept, &mut gap);
+                }
+            }
+        }
+        let gaps = gaps.map(|gap| gap.sqrt().max(least_gap));
+        let mut product = 2.0 * left.condition * backward_error;
+        let mut error = product;
+        for (together, gap) in (2..).zip(gaps) {
+            product *= gap;
+            let power = f64::from(together);
+            error = error.min(power * product.powf(power.recip()));
+        }
+        // Vectors that are orthogonal to rounding tell nothing but that roots have met.
+        let error = if error.is_finite() { error } else { 4.0 * matrix_norm * f64::EPSILON.powf(0.25) };
+        let error = error.max(backward_error);
         entry.root.error = if damped {
             RootError::from_lambda(entry.root.lambda, error)
         } else {
-            RootError::from_square(entry.root.lambda, error, z.im == 0.0 && 2.0 * error < gap)
+            RootError::from_square(entry.root.lambda, error, z.im == 0.0 && 2.0 * error < gaps[0])
         };
     }
 }
