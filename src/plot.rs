@@ -8,6 +8,7 @@ use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
+use crate::bench::Route;
 use crate::display::curves::Curves;
 use crate::display::history::{Bin, History};
 use crate::physics::Window;
@@ -260,6 +261,50 @@ fn style(id: u32) -> ShapeStyle {
 /// Behind what is unstable.
 fn shade() -> ShapeStyle {
     RGBColor(213, 94, 0).mix(0.12).filled()
+}
+
+/// Error against run time of the routes to a prediction, both axes logarithmic, a curve for each number of modes. From each
+/// route's median error a line goes up to its largest.
+///
+/// # Errors
+/// [`PlotError`] where the drawing library refuses.
+pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
+    // Errors of nothing at all are drawn at the lower edge.
+    let at = |route: &Route, error: f64| (route.median_us.log10(), error.max(1e-18).log10());
+    let mut curves: BTreeMap<usize, Vec<&Route>> = BTreeMap::new();
+    for route in routes.iter().filter(|route| route.median_error.is_finite()) {
+        curves.entry(route.modes).or_default().push(route);
+    }
+    let drawn = || curves.values().flatten();
+    let x = padded(range(drawn().map(|route| route.median_us.log10())));
+    let x = (x.0.floor(), x.1.ceil() + 1.0); // labels stand to the right of their points
+    let y =
+        padded(range(drawn().flat_map(|route| [at(route, route.median_error).1, at(route, route.largest_error).1])));
+    let mut svg = String::new();
+    {
+        let area = SVGBackend::with_string(&mut svg, (SIZE.0, 640)).into_drawing_area();
+        area.fill(&WHITE).map_err(failed)?;
+        let area = area.titled(title, ("sans-serif", 18)).map_err(failed)?;
+        let labels = ("run time per condition, log10 us", "relative error of the square, log10");
+        let mut chart = axes(&area, x, y, labels.0, labels.1)?;
+        for (k, (modes, mut curve)) in curves.into_iter().enumerate() {
+            let colour = COLOURS[k % COLOURS.len()];
+            curve.sort_by(|a, b| a.median_us.total_cmp(&b.median_us));
+            let line = curve.iter().map(|route| at(route, route.median_error));
+            chart.draw_series(LineSeries::new(line, colour.stroke_width(2))).map_err(failed)?;
+            for route in curve {
+                let (median, largest) = (at(route, route.median_error), at(route, route.largest_error));
+                chart
+                    .draw_series(LineSeries::new([median, largest], colour.mix(0.5).stroke_width(1)))
+                    .map_err(failed)?;
+                chart.draw_series([Circle::new(median, 4, colour.filled())]).map_err(failed)?;
+                let label = format!("  {modes}: {}", route.route);
+                chart.draw_series([Text::new(label, median, ("sans-serif", 13))]).map_err(failed)?;
+            }
+        }
+        area.present().map_err(failed)?;
+    }
+    Ok(svg)
 }
 
 /// Bins without a gap between them that all have something, with it.

@@ -1,5 +1,6 @@
 //! The commands, one file each; exit codes and output in one place.
 
+mod bench;
 mod buses;
 mod check;
 mod completions;
@@ -50,6 +51,7 @@ enum Command {
     Import(import::Options),
     Recover(recover::Options),
     Check(check::Options),
+    Bench(bench::Options),
     Completions(completions::Options),
 }
 
@@ -85,6 +87,7 @@ pub fn main() -> ExitCode {
         Command::Sweep(options) => options.run(),
         Command::Critical(options) => options.run(),
         Command::Check(options) => options.run(),
+        Command::Bench(options) => options.run(),
         Command::Completions(options) => options.run(),
     };
     match result {

@@ -11,6 +11,7 @@ pub mod reference;
 pub mod sensitivity;
 pub mod spectrum;
 pub mod stability_map;
+pub mod stress;
 pub mod summary;
 pub mod synthetic;
 #[cfg(test)]

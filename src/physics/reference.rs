@@ -1,8 +1,22 @@
-//! Roots to about thirty digits, to measure the others against: Newton's method from a dense root, residuals in
-//! double-double arithmetic (Dekker 1971; Wilkinson 1963 for the refinement).
+//! Roots to about thirty digits, to measure the others against: from dense roots by series and iterations in double-double
+//! arithmetic (Dekker 1971; Wilkinson 1963 for the refinement).
+//!
+//! Roots that rounding does not tell apart are refined together. With `A(z) = z I + K` or `z² I + z C + K`, `m` the mean of
+//! `k` roots and `W` an orthonormal basis of their shapes,
+//!
+//! ```text
+//! [ A(z)  s W ] [ X(z) ]   [ 0 ]
+//! [ Wᴴ     0  ] [ F(z) ] = [ I ],     det F(z) = 0 at the roots,
+//! ```
+//!
+//! and the bordered matrix is regular there, also where roots merge, so that the Taylor series of `F` about `m` converges
+//! like the ratio of the distances to these roots and to the next (Beyn and Thümmler 2009 for the bordering).
 
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef, c64};
+
+use super::spectrum::Spectrum;
+use super::synthetic::Uniform;
 
 /// An unevaluated sum `high + low` of two numbers.
 #[derive(Clone, Copy, Debug, Default)]
@@ -67,9 +81,19 @@ impl Complex {
         }
     }
 
+    fn minus(self, other: Self) -> Self {
+        Self { re: self.re.minus(other.re), im: self.im.minus(other.im) }
+    }
+
     fn scaled(self, factor: f64) -> Self {
         let factor = Double::from(factor);
         Self { re: self.re.times(factor), im: self.im.times(factor) }
+    }
+
+    /// `1 / self`, by a step of Newton's from what a double knows of it.
+    fn inverse(self) -> Self {
+        let guess = Self::from(self.rounded().inv());
+        guess.times(Self::from(c64::new(2.0, 0.0)).minus(self.times(guess)))
     }
 
     fn rounded(self) -> c64 {
@@ -77,122 +101,395 @@ impl Complex {
     }
 }
 
-/// What a root is compared in: the number that was solved for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Unknown {
-    /// `z = λ²` of `(z I + K) x = 0`.
-    Square,
-    /// `λ` of `(λ² I + λ C + K) x = 0`.
-    Root,
+/// Roots that rounding does not tell apart, or a single one, and what they are off by.
+#[derive(Clone, Debug)]
+pub struct Refined {
+    /// Which roots of the spectrum.
+    pub members: Vec<usize>,
+    /// What each lacks, in the number that was solved for: `λ²` of an undamped model, `λ` of a damped one.
+    pub errors: Vec<c64>,
+    /// What their mean lacks, likewise.
+    pub mean_error: c64,
+    /// The discriminant of a pair, `((z₁ - z₂)/2)²`; 0 for any other number of roots.
+    pub discriminant: c64,
 }
 
-/// The exact root of `K` (and `C`) near `z` with shape near `x`, less `z`: the error of `z`, to about ten digits.
-/// `None` where Newton's method does not converge, as at a merging point.
-pub fn error_of(
-    unknown: Unknown,
+/// The most roots that are refined together.
+pub const MAX_TOGETHER: usize = 4;
+/// Roots nearer to one another than this many times their bounds are refined together.
+const APART: f64 = 100.0;
+/// So are those closer than this, relative to themselves: the bordered matrix of one alone would be too close to singular.
+const CLOSE: f64 = 1e-9;
+
+/// Which modes of `spectrum` belong together: those that their bounds do not clearly keep apart.
+pub fn clusters(spectrum: &Spectrum) -> Vec<Vec<usize>> {
+    let mut clusters: Vec<Vec<usize>> = vec![];
+    for k in 0..spectrum.mode_count {
+        let near = |&j: &usize| {
+            let gap = (solved_for(spectrum, j) - solved_for(spectrum, k)).norm();
+            gap <= (APART * bound(spectrum, j).max(bound(spectrum, k))).max(CLOSE * solved_for(spectrum, k).norm())
+        };
+        let (with, mut without): (Vec<_>, Vec<_>) =
+            clusters.into_iter().partition(|cluster: &Vec<usize>| cluster.iter().any(near));
+        let mut joined: Vec<usize> = with.concat();
+        joined.push(k);
+        without.push(joined);
+        clusters = without;
+    }
+    clusters
+}
+
+/// The number that was solved for: `λ²` of an undamped model, `λ` of a damped one.
+pub fn solved_for(spectrum: &Spectrum, k: usize) -> c64 {
+    if spectrum.undamped { spectrum.roots[k].square } else { spectrum.roots[k].lambda }
+}
+
+/// Bound of the error of that number.
+pub fn bound(spectrum: &Spectrum, k: usize) -> f64 {
+    if spectrum.undamped { spectrum.roots[k].error.square } else { spectrum.roots[k].error.omega }
+}
+
+/// The exact roots of `K` and `C`, `n×n`, near the roots `members` of `spectrum`, less those: errors to about ten digits.
+/// `None` where they could not be found.
+pub fn refine(
     stiffness: MatRef<'_, f64>,
     damping: MatRef<'_, f64>,
-    z: c64,
-    x: &[c64],
-) -> Option<c64> {
-    let n = x.len();
-    // The largest entry is held at 1.
-    let fixed = (0..n).max_by(|&a, &b| x[a].norm().total_cmp(&x[b].norm()))?;
-    let mut shape: Vec<Complex> = x.iter().map(|&entry| Complex::from(entry / x[fixed])).collect();
-    let mut root = Complex::from(z);
-    let mut last = f64::INFINITY;
-    for _ in 0..12 {
-        let (residual, slope) = residual(unknown, stiffness, damping, root, &shape);
-        let at = root.rounded();
-        let jacobian = Mat::<c64>::from_fn(n, n, |i, j| {
-            if j == fixed {
-                return slope[i];
-            }
-            let (k, c) = (stiffness[(i, j)], damping[(i, j)]);
-            let diagonal = if i == j { if unknown == Unknown::Square { at } else { at * at } } else { c64::ZERO };
-            diagonal + k + if unknown == Unknown::Square { c64::ZERO } else { at * c }
-        });
-        let right = Mat::<c64>::from_fn(n, 1, |i, _| -residual[i]);
-        let step = jacobian.partial_piv_lu().solve(&right);
+    spectrum: &Spectrum,
+    members: &[usize],
+) -> Option<Refined> {
+    let k = members.len();
+    if k == 0 || k > MAX_TOGETHER {
+        return None;
+    }
+    let values: Vec<c64> = members.iter().map(|&j| solved_for(spectrum, j)).collect();
+    let mean = values.iter().sum::<c64>() / k as f64;
+    let pencil = Pencil { stiffness, damping, undamped: spectrum.undamped, at: Complex::from(mean) };
+    let basis = orthonormal(spectrum, members);
+    let series = pencil.series(&basis, 4 * k - 1)?;
+    let polynomial = determinant(&series);
+    let given: Vec<Complex> = values.iter().map(|&z| Complex::from(z).minus(pencil.at)).collect();
+    let exact = matched(&given, roots_near(&polynomial, &given)?);
+    let errors: Vec<Complex> = exact.iter().zip(&given).map(|(exact, given)| exact.minus(*given)).collect();
+    let sum = errors.iter().fold(Complex::default(), |sum, &error| sum.plus(error));
+    let discriminant = match exact.as_slice() {
+        &[a, b] => {
+            let half = a.minus(b).scaled(0.5);
+            half.times(half).rounded()
+        }
+        _ => c64::ZERO,
+    };
+    Some(Refined {
+        members: members.to_vec(),
+        errors: errors.into_iter().map(Complex::rounded).collect(),
+        mean_error: sum.rounded() / k as f64,
+        discriminant,
+    })
+}
+
+/// `A(z)` about a point.
+struct Pencil<'a> {
+    stiffness: MatRef<'a, f64>,
+    damping: MatRef<'a, f64>,
+    undamped: bool,
+    at: Complex,
+}
+
+/// A column vector of doubled precision.
+type Vector = Vec<Complex>;
+
+impl Pencil<'_> {
+    /// `A x₀ + A' x₁ + ½A'' x₂` with derivatives at the point.
+    fn apply(&self, x0: &[Complex], x1: Option<&Vector>, x2: Option<&Vector>) -> Vector {
+        let n = x0.len();
+        // z x₀ + x₁, of which C takes its product; z (z x₀ + x₁) + z x₁ + x₂ is the rest of the mass's part.
+        let shifted = |i: usize| self.at.times(x0[i]).plus(x1.map_or(Complex::default(), |x| x[i]));
+        let velocity: Vector = (0..n).map(shifted).collect();
+        let mut out: Vector = if self.undamped {
+            velocity.clone()
+        } else {
+            let rest = |i: usize| {
+                let first = x1.map_or(Complex::default(), |x| self.at.times(x[i]));
+                first.plus(x2.map_or(Complex::default(), |x| x[i]))
+            };
+            (0..n).map(|i| self.at.times(velocity[i]).plus(rest(i))).collect()
+        };
         for j in 0..n {
-            let correction = Complex::from(step[(j, 0)]);
-            if j == fixed {
-                root = root.plus(correction);
-            } else {
-                shape[j] = shape[j].plus(correction);
+            let (stiffness, damping) = (self.stiffness.col(j), self.damping.col(j));
+            for (i, out) in out.iter_mut().enumerate() {
+                *out = out.plus(x0[j].scaled(stiffness[i]));
+                if !self.undamped && damping[i] != 0.0 {
+                    *out = out.plus(velocity[j].scaled(damping[i]));
+                }
             }
         }
-        let size = step[(fixed, 0)].norm();
-        if !size.is_finite() {
-            return None;
+        out
+    }
+
+    /// Taylor coefficients of `F`, `k×k` row by row, up to `degree`.
+    fn series(&self, basis: &[Vec<c64>], degree: usize) -> Option<Vec<Vec<Complex>>> {
+        let (n, k) = (self.stiffness.nrows(), basis.len());
+        let at = self.at.rounded();
+        let scale = self.stiffness.norm_l2();
+        let bordered = Mat::<c64>::from_fn(n + k, n + k, |i, j| match (i < n, j < n) {
+            (true, true) => {
+                let mass = if self.undamped { at } else { at * at };
+                let rest = if self.undamped { c64::ZERO } else { at * self.damping[(i, j)] };
+                rest + self.stiffness[(i, j)] + if i == j { mass } else { c64::ZERO }
+            }
+            (true, false) => basis[j - n][i] * scale,
+            (false, true) => basis[i - n][j].conj() * scale,
+            (false, false) => c64::ZERO,
+        });
+        let factor = bordered.partial_piv_lu();
+        let mut series: Vec<Vec<Complex>> = vec![];
+        let (mut before, mut last): (Vec<Vector>, Vec<Vector>) = (vec![], vec![]);
+        for order in 0..=degree {
+            let mut coefficient = vec![Complex::default(); k * k];
+            let mut columns = vec![];
+            for column in 0..k {
+                let mut x = vec![Complex::default(); n];
+                let mut f = vec![Complex::default(); k];
+                let mut previous = f64::INFINITY;
+                for _ in 0..30 {
+                    let top = self.apply(&x, last.get(column), before.get(column));
+                    let right = Mat::<c64>::from_fn(n + k, 1, |i, _| {
+                        if i < n {
+                            let border = (0..k).fold(Complex::default(), |sum, j| {
+                                sum.plus(f[j].times(Complex::from(basis[j][i])).scaled(scale))
+                            });
+                            return -top[i].plus(border).rounded();
+                        }
+                        let row = &basis[i - n];
+                        let wanted = if order == 0 && i - n == column { 1.0 } else { 0.0 };
+                        let found = row.iter().zip(&x).fold(Complex::from(c64::new(-wanted, 0.0)), |sum, (w, x)| {
+                            sum.plus(x.times(Complex::from(w.conj())))
+                        });
+                        -found.rounded() * scale
+                    });
+                    let step = factor.solve(&right);
+                    x.iter_mut().enumerate().for_each(|(i, x)| *x = x.plus(Complex::from(step[(i, 0)])));
+                    f.iter_mut().enumerate().for_each(|(i, f)| *f = f.plus(Complex::from(step[(n + i, 0)])));
+                    let size = step.norm_l2();
+                    let whole = x.iter().chain(&f).map(|x| x.rounded().norm_sqr()).sum::<f64>().sqrt();
+                    if !size.is_finite() {
+                        return None;
+                    }
+                    if size <= 1e-28 * whole || (size >= 0.1 * previous && size <= 1e-17 * whole) {
+                        previous = 0.0;
+                        break;
+                    }
+                    previous = size;
+                }
+                if previous != 0.0 {
+                    return None; // the bordered matrix is as good as singular
+                }
+                (0..k).for_each(|row| coefficient[row * k + column] = f[row]);
+                columns.push(x);
+            }
+            series.push(coefficient);
+            before = std::mem::replace(&mut last, columns);
         }
-        if size <= 1e-24 * at.norm() || (size >= 0.1 * last && size <= 1e-20 * at.norm()) {
-            return Some(root.plus(Complex::from(-z)).rounded());
+        Some(series)
+    }
+}
+
+/// An orthonormal basis of the shapes of `members`; where they do not span as many directions, any others.
+fn orthonormal(spectrum: &Spectrum, members: &[usize]) -> Vec<Vec<c64>> {
+    let mut basis: Vec<Vec<c64>> = vec![];
+    let mut any = Uniform::new(1);
+    for &j in members {
+        let mut vector = spectrum.shapes.col_as_slice(j).to_vec();
+        loop {
+            let before = norm(&vector);
+            for _ in 0..2 {
+                for unit in &basis {
+                    let along: c64 = unit.iter().zip(&vector).map(|(u, v)| u.conj() * v).sum();
+                    vector.iter_mut().zip(unit).for_each(|(v, u)| *v -= along * u);
+                }
+            }
+            let after = norm(&vector);
+            vector.iter_mut().for_each(|v| *v /= after);
+            if after > 1e-12 * before {
+                break;
+            }
+            vector.iter_mut().for_each(|v| *v = c64::new(any.draw(), any.draw()));
         }
-        last = size;
+        basis.push(vector);
+    }
+    basis
+}
+
+fn norm(vector: &[c64]) -> f64 {
+    vector.iter().map(|v| v.norm_sqr()).sum::<f64>().sqrt()
+}
+
+/// The determinant of a series of `k×k` matrices, as a series, by expansion along the first row.
+fn determinant(series: &[Vec<Complex>]) -> Vec<Complex> {
+    let degree = series.len();
+    let k = series[0].len().isqrt();
+    let entry = |row: usize, column: usize| -> Vec<Complex> { series.iter().map(|f| f[row * k + column]).collect() };
+    if k == 1 {
+        return entry(0, 0);
+    }
+    let mut sum = vec![Complex::default(); degree];
+    for column in 0..k {
+        let rest: Vec<usize> =
+            (1..k).flat_map(|row| (0..k).filter(move |&c| c != column).map(move |c| row * k + c)).collect();
+        let minor: Vec<Vec<Complex>> = series.iter().map(|f| rest.iter().map(|&at| f[at]).collect()).collect();
+        let (factor, minor) = (entry(0, column), determinant(&minor));
+        let sign = if column % 2 == 0 { 1.0 } else { -1.0 };
+        for (i, a) in factor.iter().enumerate() {
+            for (j, b) in minor.iter().enumerate().take(degree - i) {
+                sum[i + j] = sum[i + j].plus(a.times(*b).scaled(sign));
+            }
+        }
+    }
+    sum
+}
+
+/// The zeros of a polynomial, lowest coefficient first, nearest to `guesses`: Newton steps that keep off one another
+/// (Aberth 1973).
+fn roots_near(polynomial: &[Complex], guesses: &[Complex]) -> Option<Vec<Complex>> {
+    let mut roots = guesses.to_vec();
+    let size = |z: Complex| z.rounded().norm();
+    // The scale of the zeros: |p₀/p_k|^(1/k).
+    let k = guesses.len();
+    let scale = (size(polynomial[0]) / size(polynomial[k])).powf(1.0 / k as f64);
+    let scale = roots.iter().map(|&z| size(z)).fold(scale, f64::max);
+    if scale == 0.0 {
+        return Some(roots);
+    }
+    for (i, root) in roots.iter_mut().enumerate() {
+        // Equal guesses would never part.
+        let angle = 1.0 + std::f64::consts::TAU * i as f64 / k as f64;
+        *root = root.plus(Complex::from(c64::new(angle.cos(), angle.sin()) * (1e-3 * scale)));
+    }
+    for round in 0..200 {
+        let mut largest: f64 = 0.0;
+        for i in 0..k {
+            let (mut value, mut slope) = (Complex::default(), Complex::default());
+            for &coefficient in polynomial.iter().rev() {
+                slope = slope.times(roots[i]).plus(value);
+                value = value.times(roots[i]).plus(coefficient);
+            }
+            if size(value) == 0.0 {
+                continue;
+            }
+            let repelled = (0..k)
+                .filter(|&j| j != i)
+                .fold(slope.times(value.inverse()), |sum, j| sum.minus(roots[i].minus(roots[j]).inverse()));
+            let step = repelled.inverse();
+            if !size(step).is_finite() {
+                return None;
+            }
+            roots[i] = roots[i].minus(step);
+            largest = largest.max(size(step));
+        }
+        // Half of the thirty digits are left at a multiple zero, and steps that only halve the distance.
+        if largest <= 1e-26 * scale || (round > 100 && largest <= 1e-8 * scale) {
+            return Some(roots);
+        }
     }
     None
 }
 
-/// `P(z) x` and `P'(z) x`.
-fn residual(
-    unknown: Unknown,
-    stiffness: MatRef<'_, f64>,
-    damping: MatRef<'_, f64>,
-    z: Complex,
-    x: &[Complex],
-) -> (Vec<c64>, Vec<c64>) {
-    let n = x.len();
-    let factor = if unknown == Unknown::Square { z } else { z.times(z) };
-    let (mut value, mut slope) = (Vec::with_capacity(n), Vec::with_capacity(n));
-    for i in 0..n {
-        let mut kx = Complex::default();
-        let mut cx = Complex::default();
-        for (j, &entry) in x.iter().enumerate() {
-            kx = kx.plus(entry.scaled(stiffness[(i, j)]));
-            if unknown == Unknown::Root {
-                cx = cx.plus(entry.scaled(damping[(i, j)]));
-            }
-        }
-        let sum = kx.plus(factor.times(x[i]));
-        if unknown == Unknown::Square {
-            value.push(sum.rounded());
-            slope.push(x[i].rounded());
-        } else {
-            value.push(sum.plus(z.times(cx)).rounded());
-            slope.push(z.times(x[i]).scaled(2.0).plus(cx).rounded());
-        }
+/// `exact` in the order of `given`: the assignment of the least total distance.
+fn matched(given: &[Complex], exact: Vec<Complex>) -> Vec<Complex> {
+    let cost = |order: &[Complex]| -> f64 {
+        order.iter().zip(given).map(|(exact, given)| exact.minus(*given).rounded().norm()).sum()
+    };
+    permutations(exact).into_iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).unwrap_or_default()
+}
+
+fn permutations(items: Vec<Complex>) -> Vec<Vec<Complex>> {
+    if items.len() < 2 {
+        return vec![items];
     }
-    (value, slope)
+    (0..items.len())
+        .flat_map(|k| {
+            let mut rest = items.clone();
+            let first = rest.swap_remove(k);
+            permutations(rest).into_iter().map(move |mut tail| {
+                tail.push(first);
+                tail
+            })
+        })
+        .collect()
 }
 
 #[cfg(test)]
 mod tests {
     use faer::mat;
 
-    use super::super::model::ContactLaw;
+    use super::super::model::{ContactLaw, Law, Model, Term};
+    use super::super::operating_point::OperatingPoint;
     use super::super::spectrum::{Solver, Vectors};
     use super::super::synthetic::{Synthetic, rig};
-    use super::super::test_models::{REFERENCE, random_rig};
+    use super::super::test_models::{REFERENCE, nine_dof, random_rig};
     use super::*;
 
-    /// `√2` to thirty digits: the error of the nearest double is known.
-    #[test]
-    fn finds_what_a_double_lacks() {
-        let stiffness = mat![[0.0, -2.0], [-1.0, 0.0]]; // its eigenvalue √2 has the vector (-√2, 1)
-        let none = Mat::zeros(2, 2);
-        let z = c64::new(-std::f64::consts::SQRT_2, 0.0);
-        let x = [c64::new(-std::f64::consts::SQRT_2, 0.0), c64::new(1.0, 0.0)];
-        let error = error_of(Unknown::Square, stiffness.as_ref(), none.as_ref(), z, &x).expect("it converges");
-        // √2 = 1.4142135623730950488016887242097, its double is 1.4142135623730951454746218587388.
-        assert!((error.re - 9.667_293_313_452_91e-17).abs() < 1e-26, "{error}");
+    /// A spectrum with its matrices.
+    fn solved(model: &Model, p: &OperatingPoint) -> (Mat<f64>, Mat<f64>, Spectrum) {
+        let n = model.dimension();
+        let (mut k, mut c) = (Mat::zeros(n, n), Mat::zeros(n, n));
+        model.assemble(p, &mut k, &mut c).unwrap();
+        (k, c, Solver::new(n).solve(model, p, Vectors::Both).unwrap())
     }
 
-    /// Every root of random and of synthetic rigs, undamped and damped, is within its bound of the root to thirty digits;
-    /// and the bounds are not idle: most are within a few thousand of the error.
+    fn constant(stiffness: Mat<f64>) -> Model {
+        let n = stiffness.nrows();
+        let term = Term { matrix: stiffness, law: Law::Constant };
+        Model::new(n, vec![term], vec![], ContactLaw::default(), None).unwrap()
+    }
+
+    /// `√2` to thirty digits: the error of whichever double near it was found is known.
+    #[test]
+    fn finds_what_a_double_lacks() {
+        // λ² = -2 ± √2; √2 = 1.4142135623730950488016887242097.
+        let (k, c, spectrum) = solved(&constant(mat![[2.0, 2.0], [1.0, 2.0]]), &REFERENCE);
+        let (high, low) = (std::f64::consts::SQRT_2, -9.667_293_313_452_913e-17);
+        for (j, sign) in [(0, 1.0), (1, -1.0)] {
+            let refined = refine(k.as_ref(), c.as_ref(), &spectrum, &[j]).expect("it converges");
+            // The difference of doubles a factor of two apart is exact (Sterbenz 1974); so is that from -2.
+            let expected = sign * high - (spectrum.roots[j].square.re + 2.0) + sign * low;
+            assert!((refined.errors[0].re - expected).abs() < 1e-26, "{:?} is not {expected:e}", refined.errors);
+        }
+    }
+
+    /// Two modes that merge at `w = 0`, `[[4, 1], [w, 4]]`: `λ² = -4 ± √w`, whatever is left of it in the dense roots.
+    #[test]
+    fn tells_merging_roots_apart() {
+        for w in [0.0, 1e-30, 1e-16, -1e-16, 1e-12, -1e-9] {
+            let (k, c, spectrum) = solved(&constant(mat![[4.0, 1.0], [w, 4.0]]), &REFERENCE);
+            let refined = refine(k.as_ref(), c.as_ref(), &spectrum, &[0, 1]).expect("it converges");
+            // Thirty digits of the matrix are thirty of the discriminant, relative to the product of the off-diagonals.
+            assert!((refined.discriminant - c64::new(w, 0.0)).norm() <= 1e-26, "{w}: {refined:?}");
+            for (&j, error) in refined.members.iter().zip(&refined.errors) {
+                let exact = spectrum.roots[j].square + error + 4.0;
+                assert!((exact * exact - w).norm() <= 1e-15 * exact.norm() + 1e-25, "{w}: {exact}");
+            }
+        }
+    }
+
+    /// Every root of random and of synthetic rigs, undamped and damped, merging or not, is within its bound of the root to
+    /// thirty digits; none is left out; and the bounds are not idle: most are within a few thousand of the error.
     #[test]
     fn dense_roots_are_within_their_bounds() {
         let mut ratios = vec![];
+        let mut together = 0;
+        let mut compare = |model: &Model, p: &OperatingPoint, of: &str| {
+            let (k, c, spectrum) = solved(model, p);
+            for cluster in clusters(&spectrum) {
+                together += usize::from(cluster.len() > 1);
+                let refined = refine(k.as_ref(), c.as_ref(), &spectrum, &cluster);
+                let refined = refined.unwrap_or_else(|| panic!("{of}, {p:?}: {cluster:?} of {:?}", spectrum.roots));
+                for (&j, error) in refined.members.iter().zip(&refined.errors) {
+                    let (error, bound) = (error.norm(), bound(&spectrum, j));
+                    assert!(error <= bound, "{of}, {p:?}, root {j}: off by {error:e}, bound {bound:e}");
+                    ratios.push(bound / error.max(1e-3 * bound * f64::EPSILON));
+                }
+            }
+        };
         for seed in 0..36 {
             let damping = [0.0, 1e-3, 3e-2][seed as usize % 3];
             let model = if seed < 24 {
@@ -201,29 +498,19 @@ mod tests {
                 let contact_law = ContactLaw::default();
                 rig(&Synthetic { modes: 20, pairs: 12, damping_ratio: damping, contact_law, seed }).unwrap()
             };
-            let n = model.dimension();
-            let (mut k, mut c) = (Mat::zeros(n, n), Mat::zeros(n, n));
             for step in 0..8 {
-                let p = REFERENCE.with_friction(0.13 * f64::from(step));
-                let structure = model.assemble(&p, &mut k, &mut c).unwrap();
-                let unknown = if structure.damped { Unknown::Root } else { Unknown::Square };
-                let spectrum = Solver::new(n).solve(&model, &p, Vectors::Both).unwrap();
-                for (j, root) in spectrum.modes().iter().enumerate() {
-                    let shape: Vec<c64> = (0..n).map(|i| spectrum.shapes[(i, j)]).collect();
-                    let z = if structure.damped { root.lambda } else { root.square };
-                    let Some(error) = error_of(unknown, k.as_ref(), c.as_ref(), z, &shape) else { continue };
-                    let (error, bound) = if structure.damped {
-                        (error.norm(), root.error.omega)
-                    } else {
-                        (error.norm(), root.error.square)
-                    };
-                    assert!(error <= bound, "seed {seed}, {p:?}, root {j}: off by {error:e}, bound {bound:e}");
-                    ratios.push(bound / error.max(1e-3 * bound * f64::EPSILON));
-                }
+                compare(&model, &REFERENCE.with_friction(0.13 * f64::from(step)), &format!("seed {seed}"));
+            }
+        }
+        // At a merging point of the nine-degree-of-freedom model, to thirty digits 0.82001495938185, and around it.
+        for exponent in 2..=17 {
+            for sign in [-1.0, 1.0] {
+                let mu = 0.82001495938185 + sign * 10f64.powi(-exponent);
+                compare(&nine_dof(1.0, 1.0, 1.0), &REFERENCE.with_friction(mu), "nine DoF");
             }
         }
         ratios.sort_by(f64::total_cmp);
-        assert!(ratios.len() > 2000, "{} roots were compared", ratios.len());
+        assert!(ratios.len() > 2000 && together > 10, "{} roots were compared, {together} together", ratios.len());
         assert!(ratios[ratios.len() / 2] < 5e3, "the median bound is {} times the error", ratios[ratios.len() / 2]);
     }
 }

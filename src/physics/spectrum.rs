@@ -13,7 +13,8 @@ use faer::linalg::evd::{
     ComputeEigenvectors, EvdParams, SelfAdjointEvdParams, evd_real, evd_scratch, self_adjoint_evd,
     self_adjoint_evd_scratch,
 };
-use faer::{Auto, Col, Mat, MatRef, Par, Spec, c64};
+use faer::linalg::matmul::matmul;
+use faer::{Accum, Auto, Col, Mat, MatRef, Par, Spec, c64};
 
 use super::model::{Model, ModelError, Parameter};
 use super::operating_point::OperatingPoint;
@@ -103,6 +104,8 @@ impl Root {
 /// What else than roots to compute.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Vectors {
+    /// None: no residuals, shapes or bounds; the roots are checked by their traces alone.
+    None,
     /// Right vectors only: residuals and shapes.
     Right,
     /// Left vectors too, and from them the conditioning of every root, bounds of its error, and `d(λ²)/dμ`.
@@ -124,8 +127,11 @@ pub struct Spectrum {
     pub mode_count: usize,
     /// No damping took part: every root stands for `±λ`.
     pub undamped: bool,
-    /// `n×roots`: right vectors `x`, one column for each root, norm 1.
+    /// `n×roots`: right vectors `x`, one column for each root, norm 1; empty unless asked for.
     pub shapes: Mat<c64>,
+    /// `n×roots`: left vectors `y`, empty unless asked for, of such length that a change `dC`, `dK` of the matrices moves an
+    /// undamped root by `d(λ²) = -yᴴ dK x`, a damped one by `dλ = -yᴴ (λ dC + dK) x`.
+    pub left: Mat<c64>,
     /// `d(λ²)/dμ` for each root, 1/s²; empty unless asked for.
     pub friction_sensitivity: Vec<c64>,
     /// Frobenius norm of the matrix whose eigenvalues were computed: `K`, 1/s², or the scaled state matrix, 1/s.
@@ -139,8 +145,10 @@ pub enum SolveError {
     Model(#[from] ModelError),
     #[error("the eigenvalue iteration did not converge on a {dimension}x{dimension} matrix")]
     NoConvergence { dimension: usize },
-    #[error("the roots sum to {found:e}, the trace is {expected:e}: they differ by more than {limit:e}")]
-    Trace { found: f64, expected: f64, limit: f64 },
+    #[error(
+        "powers {power} of the roots sum to {found:e}, the trace is {expected:e}: they differ by more than {limit:e}"
+    )]
+    Trace { power: u32, found: f64, expected: f64, limit: f64 },
     #[error("root {root} at {frequency_hz} Hz: residual {residual:e} exceeds {limit:e}")]
     Residual { root: usize, frequency_hz: f64, residual: f64, limit: f64 },
 }
@@ -171,26 +179,43 @@ pub struct Solver {
     damping_slope: Mat<f64>,
     state: Mat<f64>,
     dense: Dense,
+    /// Displacements of the right vectors, packed.
+    shapes: Mat<f64>,
+    /// `K X`, `C X`, `dK/dμ X` and `dC/dμ X`, packed: one product of matrices each, far cheaper than one for each root.
+    products: [Mat<f64>; 4],
 }
 
-/// Workspace of the dense unsymmetric eigenvalue problem, and its vectors in LAPACK's packing: a complex pair in two
+/// Workspace of the dense eigenvalue problem, and its answer: values, and vectors in LAPACK's packing, a complex pair in two
 /// columns, real and imaginary part.
 struct Dense {
+    values: Vec<c64>,
     left: Mat<f64>,
     right: Mat<f64>,
     memory: MemBuffer,
 }
 
-/// Roots and vectors before they are judged and ordered.
+/// Which problem gives the roots.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Problem {
+    Symmetric,
+    Undamped,
+    Damped,
+}
+
+/// A root before it is ordered, and where its vectors are.
 struct Raw {
     root: Root,
-    shape: Vec<c64>,
+    packing: Packing,
+    /// `‖x‖`.
+    length: f64,
     left: Option<Left>,
 }
 
 /// What a left vector tells of a root.
 #[derive(Clone, Copy)]
 struct Left {
+    /// `yᴴx`, in a damped model `yᴴ(2λ I + C)x`.
+    weight: c64,
     /// `d(λ²)/dμ`.
     sensitivity: c64,
     /// Condition of the eigenvalue, `‖y‖‖x‖ / |yᴴx|`, in the problem that was solved.
@@ -207,7 +232,14 @@ impl Solver {
             stiffness_slope: square(),
             damping_slope: square(),
             state: Mat::new(),
-            dense: Dense { left: Mat::new(), right: Mat::new(), memory: MemBuffer::new(StackReq::EMPTY) },
+            dense: Dense {
+                values: vec![],
+                left: Mat::new(),
+                right: Mat::new(),
+                memory: MemBuffer::new(StackReq::EMPTY),
+            },
+            shapes: Mat::new(),
+            products: [const { Mat::new() }; 4],
         }
     }
 
@@ -217,180 +249,174 @@ impl Solver {
     /// [`SolveError::Model`] where the model cannot be evaluated there, [`SolveError::NoConvergence`],
     /// [`SolveError::Trace`] and [`SolveError::Residual`] where the answer is not one.
     pub fn solve(&mut self, model: &Model, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, SolveError> {
-        let n = model.dimension();
         let structure = model.assemble(p, &mut self.stiffness, &mut self.damping)?;
-        let with_left = vectors == Vectors::Both;
-        if with_left {
+        if vectors == Vectors::Both {
             model.assemble_derivative(p, Parameter::Friction, &mut self.stiffness_slope, &mut self.damping_slope)?;
         }
-        let mut raw = if structure.damped {
-            self.damped(n, with_left)?
+        let stiffness_norm = self.stiffness.norm_l2();
+        let (problem, matrix_norm) = if structure.damped {
+            self.assemble_state();
+            (Problem::Damped, self.state.norm_l2())
         } else if structure.symmetric_stiffness {
-            self.symmetric(n, with_left)?
+            (Problem::Symmetric, stiffness_norm)
         } else {
-            self.undamped(n, with_left)?
+            (Problem::Undamped, stiffness_norm)
         };
-        self.judge(&mut raw, structure.damped, model.pad_modes())?;
+        match problem {
+            Problem::Symmetric => self.dense.symmetric_eigen(self.stiffness.as_ref(), vectors)?,
+            Problem::Undamped => self.dense.eigen(self.stiffness.as_ref(), matrix_norm, vectors)?,
+            Problem::Damped => self.dense.eigen(self.state.as_ref(), matrix_norm, vectors)?,
+        }
+        let mut raw = self.roots(problem, stiffness_norm, matrix_norm);
+        if vectors != Vectors::None {
+            self.multiply(problem, vectors);
+            self.judge(&mut raw, problem, stiffness_norm, model.pad_modes())?;
+        }
+        if vectors == Vectors::Both {
+            self.read_left(&mut raw, problem);
+        }
         raw.sort_by(|a, b| order(&a.root, &b.root));
-        let matrix_norm = if structure.damped { self.state.norm_l2() } else { self.stiffness.norm_l2() };
-        bound_errors(&mut raw, structure.damped, ROUNDING * f64::EPSILON * matrix_norm);
-        let mode_count = raw.iter().filter(|r| r.root.oscillates()).count();
-        let shapes = Mat::from_fn(n, raw.len(), |i, j| raw[j].shape[i]);
+        bound_errors(&mut raw, problem == Problem::Damped, matrix_norm);
+        let (shapes, left) = self.vectors(&raw, problem);
         Ok(Spectrum {
             point: *p,
-            mode_count,
-            undamped: !structure.damped,
+            mode_count: raw.iter().filter(|r| r.root.oscillates()).count(),
+            undamped: problem != Problem::Damped,
             matrix_norm,
             shapes,
+            left,
             friction_sensitivity: raw.iter().filter_map(|r| r.left.map(|left| left.sensitivity)).collect(),
             roots: raw.into_iter().map(|r| r.root).collect(),
         })
     }
 
-    /// `|κ|` below which an eigenvalue of `K` is a zero disturbed by rounding: `16 n ε ‖K‖`.
-    fn zero_square(&self, n: usize) -> f64 {
-        16.0 * n as f64 * f64::EPSILON * self.stiffness.norm_l2()
+    /// The matrix whose eigenvalues the last solve computed, which gave `spectrum`: `K`, whose eigenvalues are `-λ²`, or the
+    /// scaled state matrix.
+    pub fn matrix(&self, spectrum: &Spectrum) -> MatRef<'_, f64> {
+        if spectrum.undamped { self.stiffness.as_ref() } else { self.state.as_ref() }
     }
 
-    fn symmetric(&mut self, n: usize, with_left: bool) -> Result<Vec<Raw>, SolveError> {
-        let params: Spec<SelfAdjointEvdParams, f64> = <SelfAdjointEvdParams as Auto<f64>>::auto().into();
-        let request = self_adjoint_evd_scratch::<f64>(n, ComputeEigenvectors::Yes, Par::Seq, params);
-        let mut memory = MemBuffer::new(request);
-        let mut kappa = Col::<f64>::zeros(n);
-        let mut shapes = Mat::<f64>::zeros(n, n);
-        // faer stops at an absolute tolerance near 1e-16: entries are brought near 1, by a power of two so that no
-        // digit changes.
-        let exponent = self.stiffness.norm_max().log2().ceil();
-        let unit = if exponent.is_finite() { exponent.exp2() } else { 1.0 };
-        self_adjoint_evd(
-            (&self.stiffness * faer::Scale(unit.recip())).as_ref(),
-            kappa.as_mut().as_diagonal_mut(),
-            Some(shapes.as_mut()),
-            Par::Seq,
-            MemStack::new(&mut memory),
-            params,
-        )
-        .map_err(|_| SolveError::NoConvergence { dimension: n })?;
-        let zero = self.zero_square(n);
-        Ok((0..n)
-            .map(|k| {
-                let shape: Vec<c64> = (0..n).map(|i| c64::new(shapes[(i, k)], 0.0)).collect();
-                let left = with_left.then(|| Left {
-                    sensitivity: -bilinear(&shape, self.stiffness_slope.as_ref(), &shape) / inner(&shape, &shape),
-                    condition: 1.0,
-                });
-                Raw { root: from_square(c64::new(-kappa[k] * unit, 0.0), zero), shape, left }
-            })
-            .collect())
-    }
-
-    fn undamped(&mut self, n: usize, with_left: bool) -> Result<Vec<Raw>, SolveError> {
-        let kappa = self.dense.eigen(self.stiffness.as_ref(), with_left)?;
-        let zero = self.zero_square(n);
-        Ok((0..n)
-            .map(|k| {
-                let shape = column(self.dense.right.as_ref(), &kappa, k, 0..n);
-                let left = with_left.then(|| {
-                    let left = column(self.dense.left.as_ref(), &kappa, k, 0..n);
-                    let product = inner(&left, &shape);
-                    Left {
-                        sensitivity: -bilinear(&left, self.stiffness_slope.as_ref(), &shape) / product,
-                        condition: norm(&left) * norm(&shape) / product.norm(),
-                    }
-                });
-                Raw { root: from_square(-kappa[k], zero), shape, left }
-            })
-            .collect())
-    }
-
-    fn damped(&mut self, n: usize, with_left: bool) -> Result<Vec<Raw>, SolveError> {
-        let scale = displacement_scale(self.stiffness.as_ref());
+    /// Writes `[0 S; -K S⁻¹ -C]`.
+    fn assemble_state(&mut self) {
+        let n = self.stiffness.nrows();
         if self.state.nrows() != 2 * n {
             self.state = Mat::zeros(2 * n, 2 * n);
         }
-        for (j, &s) in scale.iter().enumerate() {
+        for (j, s) in displacement_scale(self.stiffness.as_ref()).into_iter().enumerate() {
             self.state[(j, n + j)] = s;
-            for i in 0..n {
-                self.state[(n + i, j)] = -self.stiffness[(i, j)] / s;
-                self.state[(n + i, n + j)] = -self.damping[(i, j)];
-            }
+            let stiffness = self.stiffness.col_as_slice(j);
+            let below = &mut self.state.col_as_slice_mut(j)[n..];
+            below.iter_mut().zip(stiffness).for_each(|(out, k)| *out = -k / s);
+            let damping = self.damping.col_as_slice(j);
+            let below = &mut self.state.col_as_slice_mut(n + j)[n..];
+            below.iter_mut().zip(damping).for_each(|(out, c)| *out = -c);
         }
-        let lambda = self.dense.eigen(self.state.as_ref(), with_left)?;
-        // A double root at the origin splits into ±√(rounding): as a square it is zero to rounding.
-        let zero = self.zero_square(n);
-        let mut raw = Vec::with_capacity(n + 8);
-        for (k, &value) in lambda.iter().enumerate() {
-            if value.im < 0.0 {
-                continue; // its conjugate stands for it
-            }
-            let displacement = column(self.dense.right.as_ref(), &lambda, k, 0..n);
-            let velocity = column(self.dense.right.as_ref(), &lambda, k, n..2 * n);
-            // x from whichever half of the state holds more of it: [S x; λ x].
-            let shape: Vec<c64> = if inner(&velocity, &velocity).re >= inner(&displacement, &displacement).re {
-                velocity
-            } else {
-                displacement.iter().zip(&scale).map(|(x, s)| x / s).collect()
-            };
-            let square = value * value;
-            let value = if square.norm() <= zero { c64::ZERO } else { value };
-            let left = with_left.then(|| {
-                let whole = column(self.dense.left.as_ref(), &lambda, k, 0..2 * n);
-                let left = &whole[n..];
-                let change = value * bilinear(left, self.damping_slope.as_ref(), &shape)
-                    + bilinear(left, self.stiffness_slope.as_ref(), &shape);
-                let weight = 2.0 * value * inner(left, &shape) + bilinear(left, self.damping.as_ref(), &shape);
-                let state = column(self.dense.right.as_ref(), &lambda, k, 0..2 * n);
-                Left {
-                    sensitivity: -2.0 * value * change / weight,
-                    condition: norm(&whole) * norm(&state) / inner(&whole, &state).norm(),
-                }
-            });
-            let root = Root {
-                lambda: value,
-                square,
-                residual: f64::NAN,
-                pad_participation: f64::NAN,
-                error: RootError::UNKNOWN,
-            };
-            raw.push(Raw { root, shape, left });
-        }
-        Ok(raw)
     }
 
-    /// Normalises the shapes, fills in residual and pad share, and refuses a root that does not satisfy the equation.
-    fn judge(&self, raw: &mut [Raw], damped: bool, pad_modes: Option<usize>) -> Result<(), SolveError> {
-        let n = self.stiffness.nrows();
-        let stiffness_norm = self.stiffness.norm_l2();
-        let damping_norm = if damped { self.damping.norm_l2() } else { 0.0 };
-        let shapes = Mat::from_fn(n, raw.len(), |i, j| raw[j].shape[i]);
-        let re = Mat::from_fn(n, raw.len(), |i, j| shapes[(i, j)].re);
-        let im = Mat::from_fn(n, raw.len(), |i, j| shapes[(i, j)].im);
-        let stiffness = (&self.stiffness * &re, &self.stiffness * &im);
-        let damping = damped.then(|| (&self.damping * &re, &self.damping * &im));
-        for (j, entry) in raw.iter_mut().enumerate() {
-            let size = entry.shape.iter().map(|x| x.norm_sqr()).sum::<f64>();
-            let product = |(re, im): &(Mat<f64>, Mat<f64>), i: usize| c64::new(re[(i, j)], im[(i, j)]);
-            let residual_of = |root: &Root| {
-                let (mut off, mut along, mut slope_size) = (0.0, c64::ZERO, 0.0);
-                for (i, &x) in entry.shape.iter().enumerate() {
-                    let cx = damping.as_ref().map_or(c64::ZERO, |damping| product(damping, i));
-                    let r = root.square * x + root.lambda * cx + product(&stiffness, i);
-                    let slope = 2.0 * root.lambda * x + cx;
-                    off += r.norm_sqr();
-                    along += slope.conj() * r;
-                    slope_size += slope.norm_sqr();
-                }
-                let weight =
-                    root.square.norm() * (n as f64).sqrt() + root.lambda.norm() * damping_norm + stiffness_norm;
-                let residual = if off == 0.0 { 0.0 } else { off.sqrt() / (weight * size.sqrt()) };
-                (residual, along / slope_size)
+    /// The roots of the eigenvalues that were found, one for each conjugate pair of a damped model.
+    fn roots(&self, problem: Problem, stiffness_norm: f64, matrix_norm: f64) -> Vec<Raw> {
+        let rounding = 16.0 * self.stiffness.nrows() as f64 * f64::EPSILON;
+        // `|λ²|` below which a root is a zero disturbed by rounding. A double root at the origin splits into ±√(rounding):
+        // as a square it is zero to rounding.
+        let mut zero = rounding * stiffness_norm;
+        let near_origin = self.dense.values.iter().filter(|value| value.norm_sqr() <= zero).count();
+        if problem == Problem::Damped && near_origin == 1 {
+            // A simple one, as where a static root crosses, is known far better.
+            zero = (rounding * matrix_norm).powi(2);
+        }
+        let mut raw = Vec::with_capacity(self.stiffness.nrows() + 8);
+        for (&value, packing) in self.dense.values.iter().zip(packing(&self.dense.values)) {
+            let (lambda, square) = match problem {
+                Problem::Damped if value.im < 0.0 => continue, // its conjugate stands for it
+                Problem::Damped => (value, value * value),
+                // The sum turns the -0 of a real root into 0.
+                _ => (square_root(c64::ZERO - value), c64::ZERO - value),
             };
-            let (mut residual, correction) = residual_of(&entry.root);
+            let lambda = if square.norm() <= zero { c64::ZERO } else { lambda };
+            let (residual, pad_participation) = (f64::NAN, f64::NAN);
+            let root = Root { lambda, square, residual, pad_participation, error: RootError::UNKNOWN };
+            raw.push(Raw { root, packing, length: f64::NAN, left: None });
+        }
+        raw
+    }
+
+    /// Fills in the displacements of the right vectors and their products with the matrices.
+    fn multiply(&mut self, problem: Problem, vectors: Vectors) {
+        let n = self.stiffness.nrows();
+        let damped = problem == Problem::Damped;
+        let columns = self.dense.right.ncols();
+        if self.shapes.ncols() != columns {
+            self.shapes = Mat::zeros(n, columns);
+            self.products = std::array::from_fn(|_| Mat::zeros(n, columns));
+        }
+        if damped {
+            let scale = displacement_scale(self.stiffness.as_ref());
+            for packing in packing(&self.dense.values) {
+                let state = Packed::new(&self.dense.right, packing);
+                let (displacement, velocity) = (state.rows(..n), state.rows(n..));
+                // x from whichever half of the state holds more of it: [S x; λ x].
+                let from_velocity = velocity.norm_sqr() >= displacement.norm_sqr();
+                for j in std::iter::once(packing.re).chain(packing.im) {
+                    let state = self.dense.right.col_as_slice(j);
+                    let shape = self.shapes.col_as_slice_mut(j);
+                    if from_velocity {
+                        shape.copy_from_slice(&state[n..]);
+                    } else {
+                        shape.iter_mut().zip(state).zip(&scale).for_each(|((x, q), s)| *x = q / s);
+                    }
+                }
+            }
+        } else {
+            self.shapes.copy_from(&self.dense.right);
+        }
+        let with_left = vectors == Vectors::Both;
+        let matrices = [
+            (&self.stiffness, true),
+            (&self.damping, damped),
+            (&self.stiffness_slope, with_left),
+            (&self.damping_slope, with_left && damped),
+        ];
+        for ((matrix, needed), product) in matrices.into_iter().zip(&mut self.products) {
+            if needed {
+                matmul(product, Accum::Replace, matrix, &self.shapes, 1.0, Par::Seq);
+            }
+        }
+    }
+
+    /// Fills in residual and pad share, and refuses a root that does not satisfy the equation.
+    fn judge(
+        &self,
+        raw: &mut [Raw],
+        problem: Problem,
+        stiffness_norm: f64,
+        pad_modes: Option<usize>,
+    ) -> Result<(), SolveError> {
+        let n = self.stiffness.nrows();
+        let damped = problem == Problem::Damped;
+        let damping_norm = if damped { self.damping.norm_l2() } else { 0.0 };
+        for (j, entry) in raw.iter_mut().enumerate() {
+            let [x, kx, cx] =
+                [&self.shapes, &self.products[0], &self.products[1]].map(|m| Packed::new(m, entry.packing));
+            let size = x.norm_sqr();
+            let weight = |root: &Root| {
+                root.square.norm() * (n as f64).sqrt() + root.lambda.norm() * damping_norm + stiffness_norm
+            };
+            let off = |root: &Root, i: usize| {
+                let r = root.square * x.at(i) + kx.at(i);
+                if damped { r + root.lambda * cx.at(i) } else { r }
+            };
+            let residual_of = |root: &Root| {
+                let off: f64 = (0..n).map(|i| off(root, i).norm_sqr()).sum();
+                if off == 0.0 { 0.0 } else { off.sqrt() / (weight(root) * size.sqrt()) }
+            };
+            let mut residual = residual_of(&entry.root);
             if damped && residual > RESIDUAL_LIMIT {
                 // Near the origin the state space loses relative accuracy; the best root for the given shape does not.
-                let lambda = entry.root.lambda - correction;
+                let slope = |i: usize| 2.0 * entry.root.lambda * x.at(i) + cx.at(i);
+                let along: c64 = (0..n).map(|i| slope(i).conj() * off(&entry.root, i)).sum();
+                let lambda = entry.root.lambda - along / (0..n).map(|i| slope(i).norm_sqr()).sum::<f64>();
                 let refined = Root { lambda, square: lambda * lambda, ..entry.root };
-                let (refined_residual, _) = residual_of(&refined);
+                let refined_residual = residual_of(&refined);
                 if refined_residual < residual {
                     (entry.root, residual) = (refined, refined_residual);
                 }
@@ -399,49 +425,218 @@ impl Solver {
                 let frequency_hz = entry.root.frequency_hz();
                 return Err(SolveError::Residual { root: j, frequency_hz, residual, limit: RESIDUAL_LIMIT });
             }
-            let pad = pad_modes.map(|pad_modes| entry.shape.iter().take(pad_modes).map(|x| x.norm_sqr()).sum::<f64>());
             entry.root.residual = residual;
-            entry.root.pad_participation = pad.map_or(f64::NAN, |pad| pad / size);
-            let length = size.sqrt();
-            entry.shape.iter_mut().for_each(|x| *x /= length);
+            entry.length = size.sqrt();
+            entry.root.pad_participation =
+                pad_modes.map_or(f64::NAN, |pad_modes| x.rows(..pad_modes.min(n)).norm_sqr() / size);
         }
         Ok(())
+    }
+
+    /// What the left vectors tell: weights, sensitivities and conditions.
+    fn read_left(&self, raw: &mut [Raw], problem: Problem) {
+        let n = self.stiffness.nrows();
+        for entry in raw {
+            let packed = |m| Packed::new(m, entry.packing);
+            let (state, whole) = (packed(&self.dense.right), packed(self.dense.left(problem)));
+            let [cx, slope_kx, slope_cx] = [1, 2, 3].map(|k| packed(&self.products[k]));
+            let product = whole.dot(state);
+            let condition =
+                if problem == Problem::Symmetric { 1.0 } else { whole.norm() * state.norm() / product.norm() };
+            entry.left = Some(if problem == Problem::Damped {
+                let (y, lambda) = (whole.rows(n..), entry.root.lambda);
+                let weight = 2.0 * lambda * y.dot(packed(&self.shapes)) + y.dot(cx);
+                let change = lambda * y.dot(slope_cx) + y.dot(slope_kx);
+                Left { weight, sensitivity: -2.0 * lambda * change / weight, condition }
+            } else {
+                Left { weight: product, sensitivity: -whole.dot(slope_kx) / product, condition }
+            });
+        }
+    }
+
+    /// Right and left vectors in the order of `raw`, scaled as [`Spectrum`] says.
+    fn vectors(&self, raw: &[Raw], problem: Problem) -> (Mat<c64>, Mat<c64>) {
+        let n = self.stiffness.nrows();
+        let known = raw.iter().filter(|entry| !entry.length.is_nan()).count();
+        let with_left = raw.iter().filter(|entry| entry.left.is_some()).count();
+        let (mut shapes, mut left) = (Mat::zeros(n, known), Mat::zeros(n, with_left));
+        for (j, entry) in raw.iter().enumerate().take(known) {
+            let x = Packed::new(&self.shapes, entry.packing);
+            let share = entry.length.recip();
+            shapes.col_as_slice_mut(j).iter_mut().enumerate().for_each(|(i, out)| *out = share * x.at(i));
+            let Some(Left { weight, .. }) = entry.left else { continue };
+            let whole = Packed::new(self.dense.left(problem), entry.packing);
+            let y = if problem == Problem::Damped { whole.rows(n..) } else { whole };
+            let share = entry.length / weight.conj();
+            left.col_as_slice_mut(j).iter_mut().enumerate().for_each(|(i, out)| *out = share * y.at(i));
+        }
+        (shapes, left)
     }
 }
 
 impl Dense {
-    /// Eigenvalues of `matrix`; its right (and left) vectors land in `self`.
-    fn eigen(&mut self, matrix: MatRef<'_, f64>, left_too: bool) -> Result<Vec<c64>, SolveError> {
-        let dimension = matrix.nrows();
-        let params: Spec<EvdParams, f64> = <EvdParams as Auto<f64>>::auto().into();
+    fn fit(&mut self, dimension: usize) {
         if self.right.nrows() != dimension {
             use ComputeEigenvectors::Yes;
-            self.memory = MemBuffer::new(evd_scratch::<f64>(dimension, Yes, Yes, Par::Seq, params));
+            let unsymmetric = evd_scratch::<f64>(dimension, Yes, Yes, Par::Seq, unsymmetric_params());
+            let symmetric = self_adjoint_evd_scratch::<f64>(dimension, Yes, Par::Seq, symmetric_params());
+            self.memory = MemBuffer::new(unsymmetric.or(symmetric));
             self.right = Mat::zeros(dimension, dimension);
             self.left = Mat::zeros(dimension, dimension);
         }
+        self.values.clear();
+    }
+
+    /// Eigenvalues of a symmetric `matrix`, and its vectors if asked for.
+    fn symmetric_eigen(&mut self, matrix: MatRef<'_, f64>, vectors: Vectors) -> Result<(), SolveError> {
+        let dimension = matrix.nrows();
+        self.fit(dimension);
+        let mut kappa = Col::<f64>::zeros(dimension);
+        // faer stops at an absolute tolerance near 1e-16: entries are brought near 1, by a power of two so that no
+        // digit changes.
+        let exponent = matrix.norm_max().log2().ceil();
+        let unit = if exponent.is_finite() { exponent.exp2() } else { 1.0 };
+        self_adjoint_evd(
+            (matrix * faer::Scale(unit.recip())).as_ref(),
+            kappa.as_mut().as_diagonal_mut(),
+            (vectors != Vectors::None).then(|| self.right.as_mut()),
+            Par::Seq,
+            MemStack::new(&mut self.memory),
+            symmetric_params(),
+        )
+        .map_err(|_| SolveError::NoConvergence { dimension })?;
+        self.values.extend(kappa.iter().map(|kappa| c64::new(kappa * unit, 0.0)));
+        Ok(())
+    }
+
+    /// Eigenvalues of `matrix`, whose Frobenius norm is `norm`, and the vectors that are asked for.
+    fn eigen(&mut self, matrix: MatRef<'_, f64>, norm: f64, vectors: Vectors) -> Result<(), SolveError> {
+        let dimension = matrix.nrows();
+        self.fit(dimension);
         let mut re = Col::<f64>::zeros(dimension);
         let mut im = Col::<f64>::zeros(dimension);
         evd_real(
             matrix,
             re.as_mut().as_diagonal_mut(),
             im.as_mut().as_diagonal_mut(),
-            left_too.then(|| self.left.as_mut()),
-            Some(self.right.as_mut()),
+            (vectors == Vectors::Both).then(|| self.left.as_mut()),
+            (vectors != Vectors::None).then(|| self.right.as_mut()),
             Par::Seq,
             MemStack::new(&mut self.memory),
-            params,
+            unsymmetric_params(),
         )
         .map_err(|_| SolveError::NoConvergence { dimension })?;
-        // faer does not report whether the iteration converged; the trace of what it left tells.
-        let expected: f64 = (0..dimension).map(|i| matrix[(i, i)]).sum();
-        let found: f64 = re.iter().sum();
-        let limit = 64.0 * dimension as f64 * f64::EPSILON * matrix.norm_l2();
-        if (found - expected).abs() > limit || !found.is_finite() {
-            return Err(SolveError::Trace { found, expected, limit });
+        self.values.extend(re.iter().zip(im.iter()).map(|(&re, &im)| c64::new(re, im)));
+        // faer does not report whether the iteration converged; the traces of what it left tell.
+        let rounding = 64.0 * dimension as f64 * f64::EPSILON;
+        let mut trace_of_square = 0.0;
+        for j in 0..dimension {
+            trace_of_square += matrix[(j, j)] * matrix[(j, j)];
+            trace_of_square += 2.0 * (0..j).map(|i| matrix[(i, j)] * matrix[(j, i)]).sum::<f64>();
         }
-        Ok((0..dimension).map(|k| c64::new(re[k], im[k])).collect())
+        let traces = [
+            (1, (0..dimension).map(|i| matrix[(i, i)]).sum(), re.iter().sum::<f64>(), rounding * norm),
+            (2, trace_of_square, self.values.iter().map(|z| (z * z).re).sum(), rounding * norm * norm),
+        ];
+        for (power, expected, found, limit) in traces {
+            if (found - expected).abs() > limit || !found.is_finite() {
+                return Err(SolveError::Trace { power, found, expected, limit });
+            }
+        }
+        Ok(())
     }
+
+    /// Left vectors, packed.
+    fn left(&self, problem: Problem) -> &Mat<f64> {
+        if problem == Problem::Symmetric { &self.right } else { &self.left }
+    }
+}
+
+fn unsymmetric_params() -> Spec<EvdParams, f64> {
+    <EvdParams as Auto<f64>>::auto().into()
+}
+
+fn symmetric_params() -> Spec<SelfAdjointEvdParams, f64> {
+    <SelfAdjointEvdParams as Auto<f64>>::auto().into()
+}
+
+/// Where LAPACK's packing keeps a vector: `re + i sign im`, real without `im`.
+#[derive(Clone, Copy)]
+struct Packing {
+    re: usize,
+    im: Option<usize>,
+    sign: f64,
+}
+
+/// Where the vector of each of `values` is: the first of a complex pair holds real and imaginary part of its own vector
+/// in its two columns; the second is its conjugate.
+fn packing(values: &[c64]) -> impl Iterator<Item = Packing> {
+    let mut second = false;
+    values.iter().enumerate().map(move |(k, value)| {
+        if value.im == 0.0 {
+            return Packing { re: k, im: None, sign: 0.0 };
+        }
+        second = !second;
+        if second {
+            Packing { re: k, im: Some(k + 1), sign: 1.0 }
+        } else {
+            Packing { re: k - 1, im: Some(k), sign: -1.0 }
+        }
+    })
+}
+
+/// A complex vector in LAPACK's packing.
+#[derive(Clone, Copy)]
+struct Packed<'a> {
+    re: &'a [f64],
+    /// Empty for a real vector.
+    im: &'a [f64],
+    sign: f64,
+}
+
+impl<'a> Packed<'a> {
+    fn new(matrix: &'a Mat<f64>, packing: Packing) -> Self {
+        let im = packing.im.map_or(&[][..], |k| matrix.col_as_slice(k));
+        Self { re: matrix.col_as_slice(packing.re), im, sign: packing.sign }
+    }
+
+    fn rows(self, rows: impl std::slice::SliceIndex<[f64], Output = [f64]> + Clone) -> Self {
+        let im = if self.im.is_empty() { self.im } else { &self.im[rows.clone()] };
+        Self { re: &self.re[rows], im, sign: self.sign }
+    }
+
+    fn at(self, i: usize) -> c64 {
+        c64::new(self.re[i], if self.im.is_empty() { 0.0 } else { self.sign * self.im[i] })
+    }
+
+    /// `selfᴴ other`.
+    fn dot(self, other: Self) -> c64 {
+        if self.im.is_empty() {
+            return c64::new(dot(self.re, other.re), 0.0);
+        }
+        let re = dot(self.re, other.re) + dot(self.im, other.im);
+        c64::new(re, self.sign * (dot(self.re, other.im) - dot(self.im, other.re)))
+    }
+
+    fn norm_sqr(self) -> f64 {
+        dot(self.re, self.re) + dot(self.im, self.im)
+    }
+
+    fn norm(self) -> f64 {
+        self.norm_sqr().sqrt()
+    }
+}
+
+/// `Σ aᵢ bᵢ`, in eight sums side by side.
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut sums = [0.0; 8];
+    let (mut a, mut b) = (a.chunks_exact(8), b.chunks_exact(8));
+    for (a, b) in (&mut a).zip(&mut b) {
+        for ((sum, a), b) in sums.iter_mut().zip(a).zip(b) {
+            *sum += a * b;
+        }
+    }
+    sums.iter().sum::<f64>() + a.remainder().iter().zip(b.remainder()).map(|(a, b)| a * b).sum::<f64>()
 }
 
 /// `S`: what each displacement is multiplied by, so that it weighs as much as its velocity, rad/s.
@@ -458,38 +653,45 @@ pub(super) fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
 
 /// Bounds every root's error from its condition and the distance of its nearest neighbour, where left vectors are known.
 ///
-/// A backward stable solver is exact for a matrix that is off by `E`; to first order a root is then off by `κ E`. Close
-/// to a merging point `κ` grows like one over the gap `g`, and what remains is `√(g κ E)`: half the digits.
-fn bound_errors(raw: &mut [Raw], damped: bool, backward_error: f64) {
-    let value = |raw: &Raw| if damped { raw.root.lambda } else { raw.root.square };
-    let values: Vec<c64> = raw.iter().map(value).collect();
+/// A backward stable solver is exact for a matrix that is off by `E`; to first order a root is then off by `κ E`. Where `m`
+/// roots come together, `κ` grows like one over the product of the gaps between them, and what remains is the `m`-th root
+/// of `κ E g₁ … g₍ₘ₋₁₎`: half the digits at a merging point, a third where three modes meet.
+fn bound_errors(raw: &mut [Raw], damped: bool, matrix_norm: f64) {
+    let backward_error = ROUNDING * f64::EPSILON * matrix_norm;
+    // Gaps below are no gaps to the solver, nor to the condition that is computed from its vectors.
+    let least_gap = f64::EPSILON * matrix_norm;
+    let values: Vec<c64> = raw.iter().map(|raw| if damped { raw.root.lambda } else { raw.root.square }).collect();
     for (k, entry) in raw.iter_mut().enumerate() {
         let Some(left) = entry.left else { continue };
         let z = values[k];
-        let others = || values.iter().enumerate().filter(|&(j, _)| j != k).map(|(_, other)| (other - z).norm());
         // In a damped model the conjugate is a neighbour too.
-        let mirror = if damped && z.im != 0.0 { 2.0 * z.im.abs() } else { f64::INFINITY };
-        let gap = others().fold(mirror, f64::min);
-        let first_order = 2.0 * left.condition * backward_error;
-        let error = if gap.is_finite() {
-            first_order.min(2.0 * (gap * first_order).sqrt()).max(backward_error)
-        } else {
-            first_order
-        };
-        // At a gap of nothing the condition is infinite and the product is not known: the scale of rounding remains.
-        let error = if error.is_finite() { error } else { (backward_error * (z.norm() + backward_error)).sqrt() };
+        let mirror = if damped && z.im != 0.0 { 4.0 * z.im * z.im } else { f64::INFINITY };
+        let mut gaps = [mirror, f64::INFINITY, f64::INFINITY];
+        for (j, other) in values.iter().enumerate() {
+            let mut gap = if j == k { f64::INFINITY } else { (other - z).norm_sqr() };
+            for kept in &mut gaps {
+                if gap < *kept {
+                    std::mem::swap(kept, &mut gap);
+                }
+            }
+        }
+        let gaps = gaps.map(|gap| gap.sqrt().max(least_gap));
+        let mut product = 2.0 * left.condition * backward_error;
+        let mut error = product;
+        for (together, gap) in (2..).zip(gaps) {
+            product *= gap;
+            let power = f64::from(together);
+            error = error.min(power * product.powf(power.recip()));
+        }
+        // Vectors that are orthogonal to rounding tell nothing but that roots have met.
+        let error = if error.is_finite() { error } else { 4.0 * matrix_norm * f64::EPSILON.powf(0.25) };
+        let error = error.max(backward_error);
         entry.root.error = if damped {
             RootError::from_lambda(entry.root.lambda, error)
         } else {
-            RootError::from_square(entry.root.lambda, error, z.im == 0.0 && 2.0 * error < gap)
+            RootError::from_square(entry.root.lambda, error, z.im == 0.0 && 2.0 * error < gaps[0])
         };
     }
-}
-
-/// The root of an undamped model from its square `λ² = -κ`, with what lies within `zero` of the origin put there.
-fn from_square(square: c64, zero: f64) -> Root {
-    let lambda = if square.norm() <= zero { c64::ZERO } else { square_root(square) };
-    Root { lambda, square, residual: f64::NAN, pad_participation: f64::NAN, error: RootError::UNKNOWN }
 }
 
 /// `λ` with `ω ≥ 0` from `λ²`. Both members of a complex pair of squares are modes: the one grows as fast as the other
@@ -514,37 +716,6 @@ pub(super) fn order(a: &Root, b: &Root) -> std::cmp::Ordering {
         (true, true) => a.lambda.im.total_cmp(&b.lambda.im).then(by_growth),
         (false, false) => by_growth,
     }
-}
-
-/// Rows `rows` of eigenvector `k` out of LAPACK's packing.
-fn column(packed: MatRef<'_, f64>, values: &[c64], k: usize, rows: std::ops::Range<usize>) -> Vec<c64> {
-    let value = values[k];
-    if value.im == 0.0 {
-        return rows.map(|i| c64::new(packed[(i, k)], 0.0)).collect();
-    }
-    // The first of a pair holds (re, im) of its own vector; the second is its conjugate.
-    let first = is_first_of_pair(values, k);
-    let (re, im, sign) = if first { (k, k + 1, 1.0) } else { (k - 1, k, -1.0) };
-    rows.map(|i| c64::new(packed[(i, re)], sign * packed[(i, im)])).collect()
-}
-
-/// Whether complex eigenvalue `k` is the first of its conjugate pair: an even number of complex ones stand before it.
-fn is_first_of_pair(values: &[c64], k: usize) -> bool {
-    values[..k].iter().rev().take_while(|v| v.im != 0.0).count() % 2 == 0
-}
-
-/// `aᴴ b`.
-fn inner(a: &[c64], b: &[c64]) -> c64 {
-    a.iter().zip(b).map(|(a, b)| a.conj() * b).sum()
-}
-
-fn norm(a: &[c64]) -> f64 {
-    a.iter().map(|a| a.norm_sqr()).sum::<f64>().sqrt()
-}
-
-/// `aᴴ M b`.
-fn bilinear(a: &[c64], m: MatRef<'_, f64>, b: &[c64]) -> c64 {
-    (0..b.len()).map(|j| b[j] * (0..a.len()).map(|i| a[i].conj() * m[(i, j)]).sum::<c64>()).sum()
 }
 
 #[cfg(test)]

@@ -1,0 +1,389 @@
+//! Run time against error of the routes from a condition to its roots, on synthetic rigs.
+//!
+//! Every route gets the same conditions, one after another, so that what else the machine does falls on all of them. Errors are
+//! those of `λ²` against roots to thirty digits ([`crate::physics::reference`]) of a seeded choice of modes; where rounding does not tell two
+//! roots apart, those of the mean of the pair and of its discriminant. Every answer is checked before it is timed.
+
+pub mod lapack;
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use faer::{Mat, c64};
+use serde::Serialize;
+
+use crate::physics::chart::Scratch;
+use crate::physics::chart::build::{ChartError, ChartOptions, build};
+use crate::physics::reference::{self, Refined};
+use crate::physics::synthetic::{Synthetic, Uniform, rig};
+use crate::physics::{
+    Chart, ContactLaw, MapOptions, Mode, Model, OperatingPoint, Root, Solver, Spectrum, StabilityMap, Summary, Traces,
+    Vectors,
+};
+use lapack::Lapack;
+
+/// Which rigs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Kind {
+    /// No damping, a linear contact: only the friction coefficient matters
+    Undamped,
+    /// No damping, a contact that stiffens with the cube root of the load
+    Hertzian,
+    /// Modal damping of 0.5 %, friction that falls with speed and damps across it, a stiffening contact: everything matters
+    Damped,
+}
+
+/// What to measure.
+#[derive(Clone, Copy, Debug)]
+pub struct Plan {
+    pub kind: Kind,
+    pub conditions: usize,
+    /// Modes compared with the reference per condition.
+    pub compared: usize,
+    pub pairs: usize,
+    pub seed: u64,
+    pub band_max_hz: f64,
+    pub tolerance: f64,
+    /// A chart that takes longer is given up.
+    pub chart_limit: Duration,
+    pub threads: usize,
+}
+
+/// What one route did on one rig.
+#[derive(Clone, Debug, Serialize)]
+pub struct Route {
+    pub modes: usize,
+    pub route: &'static str,
+    /// Conditions it answered.
+    pub conditions: usize,
+    pub median_us: f64,
+    pub p99_us: f64,
+    /// Median of the ratio to LAPACK's time for the same work, condition by condition.
+    pub to_lapack: Option<f64>,
+    /// Relative error of `λ²`.
+    pub median_error: f64,
+    pub largest_error: f64,
+    /// Relative error of the mean of merging pairs, and of their discriminant relative to the mean's square.
+    pub largest_pair_mean_error: Option<f64>,
+    pub largest_discriminant_error: Option<f64>,
+    /// Roots compared with their bounds, and how many were off by more.
+    pub bounds_checked: usize,
+    pub bounds_broken: usize,
+}
+
+/// What was prepared before the first condition.
+#[derive(Clone, Debug, Serialize)]
+pub struct Offline {
+    pub modes: usize,
+    pub merging_points: usize,
+    pub map_s: f64,
+    pub chart_s: f64,
+    /// False where the chart took longer than it was given.
+    pub chart_built: bool,
+    pub chart_solves: usize,
+    pub chart_leaves: usize,
+    pub chart_bytes: usize,
+    /// Share of the box that did not converge and is solved densely.
+    pub chart_dense_share: f64,
+    /// Dense solves that the chart made unnecessary, of as many conditions.
+    pub dense_solves_skipped: usize,
+    pub conditions: usize,
+    /// Merging pairs among what was compared, and roots that the reference did not find.
+    pub pairs_compared: usize,
+    pub not_refined: usize,
+}
+
+const ROUTES: [&str; 6] =
+    ["dense values", "dense both vectors", "chart", "chart + certificate", "LAPACK values", "LAPACK both vectors"];
+
+/// What a route collected.
+#[derive(Clone, Debug, Default)]
+struct Samples {
+    time_us: Vec<f64>,
+    ratio: Vec<f64>,
+    error: Vec<f64>,
+    pair_mean: Vec<f64>,
+    discriminant: Vec<f64>,
+    checked: usize,
+    broken: usize,
+}
+
+impl Samples {
+    fn summary(mut self, modes: usize, route: &'static str) -> Option<Route> {
+        if self.time_us.is_empty() {
+            return None;
+        }
+        let quantile = |values: &mut Vec<f64>, share: f64| {
+            values.sort_by(f64::total_cmp);
+            values.get(((values.len() as f64 - 1.0) * share).round() as usize).copied().unwrap_or(f64::NAN)
+        };
+        let largest = |values: &[f64]| values.iter().copied().reduce(f64::max);
+        Some(Route {
+            modes,
+            route,
+            conditions: self.time_us.len(),
+            median_us: quantile(&mut self.time_us, 0.5),
+            p99_us: quantile(&mut self.time_us, 0.99),
+            to_lapack: (!self.ratio.is_empty()).then(|| quantile(&mut self.ratio, 0.5)),
+            median_error: quantile(&mut self.error, 0.5),
+            largest_error: largest(&self.error).unwrap_or(f64::NAN),
+            largest_pair_mean_error: largest(&self.pair_mean),
+            largest_discriminant_error: largest(&self.discriminant),
+            bounds_checked: self.checked,
+            bounds_broken: self.broken,
+        })
+    }
+
+    /// Compares `roots`, by the number that was solved for, with what was refined. `mirrored`: a bound for each root is there.
+    fn compare(&mut self, spectrum: &Spectrum, refined: &Refined, roots: &[(c64, Option<f64>)]) {
+        // Relative errors of λ² are twice those of λ.
+        let factor = if spectrum.undamped { 1.0 } else { 2.0 };
+        let mut left: Vec<(c64, Option<f64>)> = roots.to_vec();
+        let mut found = vec![];
+        for (&j, &error) in refined.members.iter().zip(&refined.errors) {
+            let dense = reference::solved_for(spectrum, j);
+            let distance = |k: &usize| (left[*k].0 - dense - error).norm();
+            let Some(k) = (0..left.len()).min_by(|a, b| distance(a).total_cmp(&distance(b))) else { return };
+            let (value, bound) = left.swap_remove(k);
+            let off = (value - dense - error).norm();
+            found.push((value, dense, off));
+            if let Some(bound) = bound {
+                self.checked += 1;
+                self.broken += usize::from(off.is_nan() || off > bound);
+            }
+        }
+        let mean = |of: fn(&(c64, c64, f64)) -> c64| found.iter().map(of).sum::<c64>() / found.len() as f64;
+        match found.as_slice() {
+            [(_, dense, off)] => self.error.push(factor * off / dense.norm()),
+            _ => {
+                let size = mean(|f| f.1).norm();
+                let off = mean(|f| f.0 - f.1) - refined.mean_error;
+                self.pair_mean.push(factor * off.norm() / size);
+                if let [(a, ..), (b, ..)] = found.as_slice() {
+                    let half = 0.5 * (a - b);
+                    self.discriminant.push((half * half - refined.discriminant).norm() / (size * size));
+                }
+            }
+        }
+    }
+}
+
+/// Seeded conditions, one tenth of them within 1e-6 of merging points.
+fn conditions(plan: &Plan, merging: &[f64], reference: &OperatingPoint) -> Vec<OperatingPoint> {
+    let mut uniform = Uniform::new(plan.seed.wrapping_add(1000));
+    let mut share = move || 0.5 * (uniform.draw() + 1.0);
+    (0..plan.conditions)
+        .map(|k| {
+            let p = OperatingPoint {
+                normal_load_n: 50.0 * 40f64.powf(share()),
+                disc_speed_rad_s: 60f64.powf(share()),
+                friction_coefficient: share(),
+            };
+            let (which, off) = (share(), 1e-6 * (2.0 * share() - 1.0));
+            if k % 10 != 9 || merging.is_empty() {
+                return p;
+            }
+            // Where they merge depends on load and speed: these are kept.
+            let at = merging[((which * merging.len() as f64) as usize).min(merging.len() - 1)];
+            reference.with_friction((at + off).clamp(0.0, 1.0))
+        })
+        .collect()
+}
+
+fn model(modes: usize, plan: &Plan) -> anyhow::Result<Model> {
+    let contact_law = match plan.kind {
+        Kind::Undamped => ContactLaw::default(),
+        Kind::Hertzian => ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() },
+        Kind::Damped => {
+            ContactLaw { exponent: 1.0 / 3.0, reference_n: 500.0, slope_s_per_m: -0.02, lateral_damping: true }
+        }
+    };
+    let damping_ratio = if plan.kind == Kind::Damped { 5e-3 } else { 0.0 };
+    Ok(rig(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed: plan.seed })?)
+}
+
+/// Everything about rigs of `modes` modes; `say` is told how far it has come.
+///
+/// # Errors
+/// Where a rig cannot be solved, or an answer is wrong.
+pub fn measure(
+    modes: usize,
+    plan: &Plan,
+    mut lapack: Option<&mut Lapack>,
+    say: &dyn Fn(&str),
+) -> anyhow::Result<(Vec<Route>, Offline)> {
+    let model = model(modes, plan)?;
+    let traces = Traces::new(&model);
+    let mut solver = Solver::new(modes);
+    let reference = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.0 };
+
+    say("merging points");
+    let begun = Instant::now();
+    let map_options = MapOptions {
+        mu_min: 0.0,
+        mu_max: 1.0,
+        band_max_hz: Some(plan.band_max_hz),
+        instability_threshold: 1e-6,
+        windows: true,
+    };
+    let map = StabilityMap::build(&model, &mut solver, &reference, &map_options)?;
+    let map_s = begun.elapsed().as_secs_f64();
+    let merging: Vec<f64> = map.windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten().collect();
+    let points = conditions(plan, &merging, &reference);
+
+    let begun = Instant::now();
+    let chart = chart(&model, plan, say)?;
+    let chart_s = begun.elapsed().as_secs_f64();
+
+    let mut samples: [Samples; 6] = Default::default();
+    let (mut scratch, mut charted) = (Scratch::default(), vec![]);
+    let (mut pairs_compared, mut not_refined) = (0, 0);
+    let mut choice = Uniform::new(plan.seed.wrapping_add(2000));
+    for (done, p) in points.iter().enumerate() {
+        if done % 20 == 0 {
+            say(&format!("condition {done} of {}", points.len()));
+        }
+        // Answers first.
+        let values = solver.solve(&model, p, Vectors::None)?;
+        let spectrum = solver.solve(&model, p, Vectors::Both).with_context(|| format!("{p:?}"))?;
+        charted.clear();
+        let on_chart = chart
+            .as_ref()
+            .is_some_and(|chart| chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted).is_ok());
+        let theirs = lapack.as_deref_mut().map(|peer| peer.solve(solver.matrix(&spectrum), false)).transpose()?;
+        let theirs_both = lapack.as_deref_mut().map(|peer| peer.solve(solver.matrix(&spectrum), true)).transpose()?;
+        let refined = refined(&model, p, &spectrum, plan, &mut choice)?;
+        for refined in &refined {
+            let Some(refined) = refined else {
+                not_refined += 1;
+                continue;
+            };
+            pairs_compared += usize::from(refined.members.len() > 1);
+            let of_root = |root: &Root, bounded: bool| {
+                let (z, bound) =
+                    if spectrum.undamped { (root.square, root.error.square) } else { (root.lambda, root.error.omega) };
+                (z, bounded.then_some(bound))
+            };
+            let all = |roots: &[Root], bounded| roots.iter().map(|r| of_root(r, bounded)).collect::<Vec<_>>();
+            samples[0].compare(&spectrum, refined, &all(&values.roots, false));
+            samples[1].compare(&spectrum, refined, &all(&spectrum.roots, true));
+            if on_chart {
+                let roots: Vec<Root> = charted.iter().map(|mode: &Mode| mode.root).collect();
+                samples[2].compare(&spectrum, refined, &all(&roots, true));
+                samples[3].compare(&spectrum, refined, &all(&roots, true));
+            }
+            let sign = if spectrum.undamped { -1.0 } else { 1.0 };
+            for (route, theirs) in [(4, &theirs), (5, &theirs_both)] {
+                let Some((_, theirs)) = theirs else { continue };
+                let theirs: Vec<_> = theirs.iter().map(|z| (z * sign, None)).collect();
+                samples[route].compare(&spectrum, refined, &theirs);
+            }
+        }
+        // Then the clock, one route after another.
+        let mut time = |route: usize, seconds: f64| samples[route].time_us.push(1e6 * seconds);
+        let mut ours = [0.0; 2];
+        for (route, vectors) in [(0, Vectors::None), (1, Vectors::Both)] {
+            let begun = Instant::now();
+            std::hint::black_box(solver.solve(&model, p, vectors)?);
+            ours[route] = begun.elapsed().as_secs_f64();
+            time(route, ours[route]);
+            if let Some(peer) = lapack.as_deref_mut() {
+                time(4 + route, peer.solve(solver.matrix(&spectrum), route == 1)?.0);
+            }
+        }
+        if let Some(chart) = chart.as_ref().filter(|_| on_chart) {
+            let known = traces.at(&model, p);
+            charted.clear();
+            let begun = Instant::now();
+            chart.evaluate(p, known, &mut scratch, &mut charted)?;
+            time(2, begun.elapsed().as_secs_f64());
+            charted.clear();
+            let begun = Instant::now();
+            chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted)?;
+            std::hint::black_box(Summary::of_chart(&charted, Some(plan.band_max_hz), 1e-6));
+            time(3, begun.elapsed().as_secs_f64());
+        }
+        if lapack.is_some() {
+            // Charts are held against LAPACK's values.
+            for (route, theirs) in [(0, 4), (1, 5), (2, 4), (3, 4)] {
+                if route < 2 || on_chart {
+                    let last = |k: usize| samples[k].time_us.last().copied().unwrap_or(f64::NAN);
+                    let ratio = last(route) / last(theirs);
+                    samples[route].ratio.push(ratio);
+                }
+            }
+        }
+    }
+    let routes: Vec<Route> =
+        samples.into_iter().zip(ROUTES).filter_map(|(samples, route)| samples.summary(modes, route)).collect();
+    let skipped = routes.iter().find(|route| route.route == ROUTES[2]).map_or(0, |route| route.conditions);
+    let offline = Offline {
+        modes,
+        merging_points: merging.len(),
+        map_s,
+        chart_s,
+        chart_built: chart.is_some(),
+        chart_solves: chart.as_ref().map_or(0, Chart::solve_count),
+        chart_leaves: chart.as_ref().map_or(0, Chart::leaf_count),
+        chart_bytes: chart.as_ref().map_or(0, Chart::size_bytes),
+        chart_dense_share: chart.as_ref().map_or(1.0, Chart::dense_share),
+        dense_solves_skipped: skipped,
+        conditions: points.len(),
+        pairs_compared,
+        not_refined,
+    };
+    Ok((routes, offline))
+}
+
+/// The chart of the whole box of conditions; none where it takes too long.
+fn chart(model: &Model, plan: &Plan, say: &dyn Fn(&str)) -> anyhow::Result<Option<Chart>> {
+    let corner = |normal_load_n, disc_speed_rad_s, friction_coefficient| OperatingPoint {
+        normal_load_n,
+        disc_speed_rad_s,
+        friction_coefficient,
+    };
+    let options = ChartOptions {
+        low: corner(50.0, 1.0, 0.0),
+        high: corner(2000.0, 60.0, 1.0),
+        band_max_hz: Some(plan.band_max_hz),
+        tolerance: plan.tolerance,
+        max_depth: 24,
+        max_solves: usize::MAX,
+        threads: plan.threads,
+    };
+    let begun = Instant::now();
+    let go_on = |done: f64| {
+        say(&format!("chart {:.0} %", 100.0 * done));
+        begun.elapsed() < plan.chart_limit
+    };
+    match build(model, &options, &go_on) {
+        Ok(chart) => Ok(Some(chart)),
+        Err(ChartError::Stopped) => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// A few modes of the band to thirty digits, each with those that it merges with; `None` for one that was not found. The nearest pair
+/// is always among them.
+fn refined(
+    model: &Model,
+    p: &OperatingPoint,
+    spectrum: &Spectrum,
+    plan: &Plan,
+    choice: &mut Uniform,
+) -> anyhow::Result<Vec<Option<Refined>>> {
+    let n = model.dimension();
+    let (mut stiffness, mut damping) = (Mat::zeros(n, n), Mat::zeros(n, n));
+    model.assemble(p, &mut stiffness, &mut damping)?;
+    let mut clusters = reference::clusters(spectrum);
+    let in_band = |cluster: &Vec<usize>| cluster.iter().any(|&k| spectrum.roots[k].frequency_hz() <= plan.band_max_hz);
+    clusters.retain(in_band);
+    ensure!(!clusters.is_empty(), "no mode below {} Hz", plan.band_max_hz);
+    let (mut chosen, mut single): (Vec<_>, Vec<_>) = clusters.into_iter().partition(|cluster| cluster.len() > 1);
+    while chosen.len() < plan.compared && !single.is_empty() {
+        let k = (0.5 * (choice.draw() + 1.0) * single.len() as f64) as usize;
+        chosen.push(single.swap_remove(k.min(single.len() - 1)));
+    }
+    let refine = |cluster: &Vec<usize>| reference::refine(stiffness.as_ref(), damping.as_ref(), spectrum, cluster);
+    Ok(chosen.iter().map(refine).collect())
+}

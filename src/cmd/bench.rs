@@ -1,0 +1,212 @@
+use std::fmt::Write as _;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::{Outcome, positive, print, write_file};
+use crate::bench::lapack::Lapack;
+use crate::bench::{Kind, Offline, Plan, Route, measure};
+use crate::physics::stress;
+use crate::plot;
+
+/// Measure run time against error of every route to a prediction, on synthetic rigs
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Numbers of modes; 490 takes minutes more
+    #[arg(long, value_name = "N,N", value_delimiter = ',', default_value = "20,80,160", value_parser = clap::value_parser!(u16).range(4..=2000))]
+    modes: Vec<u16>,
+    /// What the rigs are like
+    #[arg(long, value_enum, default_value = "undamped")]
+    rig: Kind,
+    /// Conditions: friction 0 to 1, 50 to 2000 N, 1 to 60 rad/s, one in ten within 1e-6 of a merging point
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..))]
+    conditions: u32,
+    /// Modes of each condition that are compared with roots to thirty digits
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    compared: usize,
+    /// Contact pairs of the rigs
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(1..))]
+    pairs: u16,
+    /// The same seed gives the same rigs and conditions
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Modes up to this frequency are charted and compared
+    #[arg(long, value_name = "HZ", default_value_t = 5000.0, value_parser = positive)]
+    band_max_hz: f64,
+    /// Relative error of the squared eigenvalues that is asked of charts
+    #[arg(long, default_value_t = 1e-8, value_parser = positive)]
+    tolerance: f64,
+    /// A chart that takes longer to build is given up
+    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
+    chart_limit_s: f64,
+    /// Threads that build charts; single answers are always of one thread
+    #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..))]
+    threads: u16,
+    /// A Python with scipy, whose LAPACK solves the same matrices in turn
+    #[arg(long, value_name = "PYTHON")]
+    lapack: Option<PathBuf>,
+    /// Put the numerics to extremes instead, and say what came out
+    #[arg(long)]
+    stress: bool,
+    /// Write the results as JSON to this file
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Write the results as CSV to this file
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Draw error against run time to this file
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+}
+
+/// What `bench --json` writes.
+#[derive(Serialize)]
+struct Report {
+    machine: String,
+    lapack: Option<String>,
+    conditions: String,
+    routes: Vec<Route>,
+    offline: Vec<Offline>,
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        if self.stress {
+            return stress_table();
+        }
+        let plan = Plan {
+            kind: self.rig,
+            conditions: self.conditions as usize,
+            compared: self.compared,
+            pairs: usize::from(self.pairs),
+            seed: self.seed,
+            band_max_hz: self.band_max_hz,
+            tolerance: self.tolerance,
+            chart_limit: Duration::from_secs_f64(self.chart_limit_s),
+            threads: usize::from(self.threads),
+        };
+        let mut lapack = self.lapack.as_deref().map(Lapack::start).transpose()?;
+        let mut report = Report {
+            machine: machine(),
+            lapack: lapack.as_ref().map(|peer| format!("{}, one thread", peer.versions)),
+            conditions: format!(
+                "{:?} rigs, {} contact pairs, seed {}; {} conditions, friction 0 to 1, 50 to 2000 N, 1 to 60 rad/s, one in ten within 1e-6 of a merging point; up to {} Hz",
+                self.rig, self.pairs, self.seed, self.conditions, self.band_max_hz
+            ),
+            routes: vec![],
+            offline: vec![],
+        };
+        for &modes in &self.modes {
+            let say = |what: &str| eprintln!("n = {modes}: {what}");
+            let (routes, offline) = measure(usize::from(modes), &plan, lapack.as_mut(), &say)?;
+            report.routes.extend(routes);
+            report.offline.push(offline);
+        }
+        print(&table(&report))?;
+        if let Some(path) = &self.json {
+            write_file(path, (serde_json::to_string_pretty(&report)? + "\n").as_bytes())?;
+        }
+        if let Some(path) = &self.csv {
+            let mut writer = csv::Writer::from_writer(vec![]);
+            report.routes.iter().try_for_each(|route| writer.serialize(route))?;
+            write_file(path, &writer.into_inner()?)?;
+        }
+        if let Some(path) = &self.svg {
+            write_file(path, plot::front(&report.machine, &report.routes)?.as_bytes())?;
+        }
+        let broken = report.routes.iter().any(|route| route.bounds_broken > 0);
+        Ok(if broken { Outcome::Differences } else { Outcome::Done })
+    }
+}
+
+/// Processor, cores and load.
+fn machine() -> String {
+    let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
+    let name = name.map_or("unknown processor", |(_, name)| name);
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    format!("{name}, {cores} cores, load {}", load.split_whitespace().next().unwrap_or("unknown"))
+}
+
+fn table(report: &Report) -> String {
+    let mut text = format!("{}\n{}\n", report.machine, report.conditions);
+    if let Some(lapack) = &report.lapack {
+        let _ = writeln!(text, "LAPACK: {lapack}");
+    }
+    let _ = writeln!(
+        text,
+        "\n{:>4}  {:20}{:>10}{:>12}{:>12}{:>10}  {:>9}{:>9}  {:>9}{:>9}  {:>13}",
+        "n",
+        "route",
+        "conditions",
+        "median, us",
+        "p99, us",
+        "x LAPACK",
+        "error",
+        "largest",
+        "pair mean",
+        "discr.",
+        "bounds broken"
+    );
+    let optional = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1e}"));
+    for route in &report.routes {
+        let ratio = route.to_lapack.map_or("-".to_owned(), |ratio| super::format::significant(ratio, 3));
+        let broken = match route.bounds_checked {
+            0 => "-".to_owned(),
+            checked => format!("{} of {checked}", route.bounds_broken),
+        };
+        let _ = writeln!(
+            text,
+            "{:>4}  {:20}{:>10}{:>12.2}{:>12.2}{:>10}  {:>9.1e}{:>9.1e}  {:>9}{:>9}  {:>13}",
+            route.modes,
+            route.route,
+            route.conditions,
+            route.median_us,
+            route.p99_us,
+            ratio,
+            route.median_error,
+            route.largest_error,
+            optional(route.largest_pair_mean_error),
+            optional(route.largest_discriminant_error),
+            broken
+        );
+    }
+    let _ =
+        writeln!(text, "\nerrors: relative, of the squared eigenvalue; pairs near merging by mean and discriminant");
+    for offline in &report.offline {
+        let Offline { modes, merging_points, map_s, chart_s, chart_solves, chart_leaves, chart_bytes, .. } = offline;
+        let _ = write!(text, "n = {modes}: {merging_points} merging points mapped in {map_s:.1} s; ");
+        let _ = if offline.chart_built {
+            writeln!(
+                text,
+                "chart: {chart_s:.1} s, {chart_solves} solves, {chart_leaves} leaves, {chart_bytes} bytes, {:.1e} of the box dense; {} of {} dense solves skipped",
+                offline.chart_dense_share, offline.dense_solves_skipped, offline.conditions
+            )
+        } else {
+            writeln!(text, "no chart within {chart_s:.1} s, every condition solved")
+        };
+        let (pairs, lost) = (offline.pairs_compared, offline.not_refined);
+        let _ = writeln!(text, "         {pairs} merging pairs compared, {lost} roots without a reference");
+    }
+    text
+}
+
+/// Every extreme, what was done and what came out; differences where it is not as it should be.
+fn stress_table() -> anyhow::Result<Outcome> {
+    let mut outcome = Outcome::Done;
+    for case in stress::cases() {
+        let found = (case.run)();
+        let verdict = match &found {
+            Ok(said) => format!("ok    {said}"),
+            Err(said) => {
+                outcome = Outcome::Differences;
+                format!("WRONG {said}")
+            }
+        };
+        print(&format!("{:60} {verdict}\n", case.what))?;
+    }
+    Ok(outcome)
+}

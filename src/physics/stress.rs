@@ -1,0 +1,448 @@
+//! Extremes for the numerics, each with what must hold there. `tests/stress.rs` runs them all, `squealcast bench --stress` shows them.
+//!
+//! | extreme | what happens |
+//! |---|---|
+//! | at and near a merging point | each root of the pair has an error bound of up to the root of the rounding, `√ε`; the pair's mean and discriminant keep their digits |
+//! | three modes meet | the same with the cube root; the bounds grow with it |
+//! | doublets split by rounding alone | both modes are kept, each with its bound; their shapes are arbitrary within their plane |
+//! | free modes | `λ = 0` exactly, static, no growth |
+//! | static divergence | a static root grows; the window is found like any other |
+//! | contact far softer or stiffer than the rig | solved to rounding of the largest stiffness: bounds of low modes grow with it, and say so |
+//! | any scale of mass and frequency | nothing changes but the scale |
+//! | friction coefficients of any size and sign | solved like any other |
+//! | no load | the contact is open: neither springs nor friction |
+//! | speed towards zero | lateral damping grows as `μN/v` until sliding is taken to end at 0.01 rad/s: modes become static roots; below, friction is 0 |
+//! | matrices far from normal | bounds grow with the condition of the roots |
+//! | other order of nodes and modes, other signs, other units | the same roots within their bounds |
+//!
+//! Where rounding leaves nothing, a solve is an error (a residual or a trace out of its limit), never a number.
+
+use faer::{Mat, c64};
+
+use super::critical::Window;
+use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
+use super::operating_point::OperatingPoint;
+use super::reference::{self, MAX_TOGETHER};
+use super::spectrum::{Solver, Spectrum, Vectors};
+use super::stability_map::{MapOptions, StabilityMap};
+use super::synthetic::{Synthetic, Uniform, rig};
+
+/// One extreme.
+pub struct Case {
+    /// What is done.
+    pub what: &'static str,
+    /// Does it; says what came out, or what is wrong with it.
+    pub run: fn() -> Result<String, String>,
+}
+
+/// All of them.
+pub fn cases() -> Vec<Case> {
+    let case = |what, run| Case { what, run };
+    vec![
+        case("at, and 1e-16 to 1e-2 away from, every merging point", merging_points),
+        case("three modes meeting, 0 and 1e-16 to 1e-2 apart", three_modes),
+        case("disc doublets split by 1e-12", doublets),
+        case("free modes, contact closed and open", free_modes),
+        case("static divergence, damped and undamped", divergence),
+        case("contact stiffness 1e-6 to 1e12 times nominal", contact_stiffness),
+        case("frequencies scaled by 1e-10 to 1e10", scales),
+        case("friction coefficients from -20 to 20", friction),
+        case("load towards zero", vanishing_load),
+        case("speed towards zero, lateral friction without bound", vanishing_speed),
+        case("matrices far from normal, departures 1 to 1e8", non_normal),
+        case("nodes and modes permuted, modes sign-flipped", permuted),
+        case("a scan of 100 000 friction coefficients, 20 modes", scanned),
+    ]
+}
+
+const REFERENCE: OperatingPoint =
+    OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.35 };
+
+/// A root whose bound is more than this, relative to it, says that it is not known.
+const VAGUE: f64 = 0.1;
+
+/// What was checked of some spectra.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Checked {
+    roots: usize,
+    together: usize,
+    /// Roots that their own bounds call unknown, or more of them in one place than are refined together.
+    vague: usize,
+    /// The largest error, as a share of its bound.
+    share: f64,
+    /// The largest bound, relative to the root.
+    bound: f64,
+}
+
+impl Checked {
+    /// Solves `model` at `p`; every root must be finite, with a bound, and within its bound of the root to thirty digits.
+    ///
+    /// # Errors
+    /// What is wrong.
+    pub fn solve(&mut self, model: &Model, p: &OperatingPoint) -> Result<Spectrum, String> {
+        let n = model.dimension();
+        let failed = |what: String| format!("{p:?}: {what}");
+        let spectrum = Solver::new(n).solve(model, p, Vectors::Both).map_err(|error| failed(error.to_string()))?;
+        let (mut stiffness, mut damping) = (Mat::zeros(n, n), Mat::zeros(n, n));
+        model.assemble(p, &mut stiffness, &mut damping).map_err(|error| failed(error.to_string()))?;
+        for root in &spectrum.roots {
+            let numbers = [root.lambda.re, root.lambda.im, root.residual, root.error.square, root.error.sigma];
+            if numbers.iter().any(|number| !number.is_finite()) {
+                return Err(failed(format!("{root:?} is not finite")));
+            }
+        }
+        for cluster in reference::clusters(&spectrum) {
+            let is_vague =
+                |&j: &usize| reference::bound(&spectrum, j) > VAGUE * reference::solved_for(&spectrum, j).norm();
+            if cluster.len() > MAX_TOGETHER || cluster.iter().any(is_vague) {
+                self.vague += cluster.len();
+                continue;
+            }
+            let refined = reference::refine(stiffness.as_ref(), damping.as_ref(), &spectrum, &cluster)
+                .ok_or_else(|| failed(format!("no reference for roots {cluster:?}")))?;
+            self.together += usize::from(cluster.len() > 1);
+            for (&j, error) in refined.members.iter().zip(&refined.errors) {
+                let bound = reference::bound(&spectrum, j);
+                if error.norm() > bound {
+                    return Err(failed(format!("root {j} is off by {:e}, bound {bound:e}", error.norm())));
+                }
+                self.roots += 1;
+                self.share = self.share.max(if bound > 0.0 { error.norm() / bound } else { 0.0 });
+                self.bound = self.bound.max(bound / reference::solved_for(&spectrum, j).norm());
+            }
+        }
+        Ok(spectrum)
+    }
+
+    fn said(&self) -> String {
+        let Self { roots, together, share, bound } = self;
+        format!(
+            "{roots} roots, {together} clusters; errors up to {share:.1e} of their bounds, bounds up to {bound:.1e}"
+        )
+    }
+}
+
+fn text(error: impl std::fmt::Display) -> String {
+    error.to_string()
+}
+
+fn synthetic(modes: usize, damping_ratio: f64, contact_law: ContactLaw) -> Result<Model, String> {
+    rig(&Synthetic { modes, pairs: 12, damping_ratio, contact_law, seed: 5 }).map_err(text)
+}
+
+fn constant(stiffness: Mat<f64>, damping: Option<Mat<f64>>) -> Result<Model, ModelError> {
+    let term = |matrix| Term { matrix, law: Law::Constant };
+    let n = stiffness.nrows();
+    Model::new(n, vec![term(stiffness)], damping.into_iter().map(term).collect(), ContactLaw::default(), None)
+}
+
+fn map(model: &Model, mu_max: f64) -> Result<StabilityMap, String> {
+    let options = MapOptions { mu_min: 0.0, mu_max, band_max_hz: None, instability_threshold: 1e-6, windows: true };
+    StabilityMap::build(model, &mut Solver::new(model.dimension()), &REFERENCE, &options).map_err(text)
+}
+
+/// 0 and ±1e-16, ±1e-15, ... ±1e-2.
+fn distances() -> impl Iterator<Item = f64> {
+    let small = (2..=16).flat_map(|k| [1.0, -1.0].map(|sign| sign * 10f64.powi(-k)));
+    std::iter::once(0.0).chain(small)
+}
+
+/// The first synthetic rig of 20 modes with at least two windows.
+fn squealing() -> Result<(Model, Vec<Window>), String> {
+    for seed in 0..40 {
+        let contact_law = ContactLaw::default();
+        let model = rig(&Synthetic { modes: 20, pairs: 48, damping_ratio: 0.0, contact_law, seed }).map_err(text)?;
+        let windows = map(&model, 2.0)?.windows;
+        if windows.len() > 1 {
+            return Ok((model, windows));
+        }
+    }
+    Err("no synthetic rig has windows".to_owned())
+}
+
+fn merging_points() -> Result<String, String> {
+    let mut checked = Checked::default();
+    let (model, windows) = squealing()?;
+    let ends: Vec<f64> = windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten().collect();
+    for end in &ends {
+        for off in distances() {
+            checked.solve(&model, &REFERENCE.with_friction(end + off))?;
+        }
+    }
+    Ok(format!("{} points: {}", ends.len(), checked.said()))
+}
+
+/// `[[4, 1, 0], [0, 4, 1], [w, 0, 4]]`: `λ² = -4 + ∛(-w)`.
+fn three_modes() -> Result<String, String> {
+    let mut checked = Checked::default();
+    for w in distances() {
+        let stiffness = faer::mat![[4.0, 1.0, 0.0], [0.0, 4.0, 1.0], [w, 0.0, 4.0]];
+        let damping = Mat::<f64>::identity(3, 3) * faer::Scale(1e-3);
+        checked.solve(&constant(stiffness.clone(), None).map_err(text)?, &REFERENCE)?;
+        checked.solve(&constant(stiffness, Some(damping)).map_err(text)?, &REFERENCE)?;
+    }
+    Ok(checked.said())
+}
+
+/// Free-interface modes on contact pairs of random rows, the last two thirds doublets `split` apart.
+fn with_pairs(split: f64, pairs: &ContactPairs, order: &[usize], signs: &[f64]) -> Result<Model, ModelError> {
+    let n = order.len();
+    let omega = |k: usize| 1.0 + (k / 2) as f64 * 0.7 + if k % 2 == 1 { split } else { 0.0 };
+    let diagonal = Mat::from_fn(n, n, |i, j| if i == j { omega(order[i]).powi(2) } else { 0.0 });
+    let stiffness = vec![Term { matrix: diagonal, law: Law::Constant }];
+    let turned = |rows: &Mat<f64>| Mat::from_fn(rows.nrows(), n, |i, j| signs[j] * rows[(i, order[j])]);
+    let pairs = ContactPairs {
+        normal: turned(&pairs.normal),
+        sliding: turned(&pairs.sliding),
+        lateral: turned(&pairs.lateral),
+        ..pairs.clone()
+    };
+    Model::new(n, stiffness, vec![], ContactLaw::default(), None)?.with_contact(&pairs)
+}
+
+fn random_pairs(count: usize, n: usize, stiffness_n_per_m: f64) -> ContactPairs {
+    let mut uniform = Uniform::new(11);
+    let mut rows = || Mat::from_fn(count, n, |_, _| uniform.draw());
+    ContactPairs {
+        normal: rows(),
+        sliding: rows(),
+        lateral: rows(),
+        stiffness_n_per_m: vec![stiffness_n_per_m; count],
+        damping_n_s_per_m: vec![0.0; count],
+        radius_m: vec![0.1; count],
+    }
+}
+
+fn doublets() -> Result<String, String> {
+    let mut checked = Checked::default();
+    let order: Vec<usize> = (0..12).collect();
+    // From a contact that leaves the doublets alone to one that tears them apart.
+    for stiffness in [1e-14, 1e-12, 1e-10, 1e-6, 1e-2, 1.0] {
+        let model = with_pairs(1e-12, &random_pairs(2, 12, stiffness), &order, &[1.0; 12]).map_err(text)?;
+        for step in 0..5 {
+            checked.solve(&model, &REFERENCE.with_friction(0.25 * f64::from(step)))?;
+        }
+        map(&model, 1.0)?;
+    }
+    Ok(checked.said())
+}
+
+fn free_modes() -> Result<String, String> {
+    let mut checked = Checked::default();
+    let free = |n: usize| Mat::from_fn(n, n, |i, j| if i == j && i > 2 { 1e6 * i as f64 } else { 0.0 });
+    let pairs = random_pairs(6, 9, 1e6);
+    let term = Term { matrix: free(9), law: Law::Constant };
+    let model = Model::new(9, vec![term], vec![], ContactLaw::default(), None).and_then(|m| m.with_contact(&pairs));
+    let model = model.map_err(text)?;
+    checked.solve(&model, &REFERENCE)?;
+    let open = checked.solve(&model, &OperatingPoint { normal_load_n: 0.0, ..REFERENCE })?;
+    let statics = open.nonoscillatory_growth_per_s();
+    if statics != [0.0; 6] || open.mode_count != 6 {
+        return Err(format!("three free modes, open: static roots {statics:?}, {} modes", open.mode_count));
+    }
+    Ok(format!("open: three pairs of roots at 0 exactly; {}", checked.said()))
+}
+
+/// `k₁ = 1 - μ` beside a mode that does not care.
+fn divergence() -> Result<String, String> {
+    let mut ends = vec![];
+    for damping in [0.0, 1e-6, 0.3, 3.0] {
+        let term = |matrix, law| Term { matrix, law };
+        let stiffness = vec![
+            term(faer::mat![[1.0, 0.0], [0.0, 9.0]], Law::Constant),
+            term(faer::mat![[-1.0, 0.0], [0.0, 0.0]], Law::FrictionStiffness),
+        ];
+        let damping = term(Mat::<f64>::identity(2, 2) * faer::Scale(damping), Law::Constant);
+        let model = Model::new(2, stiffness, vec![damping], ContactLaw::default(), None).map_err(text)?;
+        for off in distances() {
+            Checked::default().solve(&model, &REFERENCE.with_friction(1.0 + off))?;
+        }
+        let windows = map(&model, 2.0)?.windows;
+        match windows.as_slice() {
+            [window] if (window.mu_from - 1.0).abs() < 1e-10 && window.mu_to.is_none() => ends.push(window.mu_from),
+            _ => return Err(format!("one window from 1 expected: {windows:?}")),
+        }
+    }
+    Ok(format!("windows from {ends:?}"))
+}
+
+/// A contact in proportion to its load, so that the load scales it.
+fn proportional(damping_ratio: f64) -> Result<Model, String> {
+    synthetic(20, damping_ratio, ContactLaw { exponent: 1.0, ..ContactLaw::default() })
+}
+
+fn contact_stiffness() -> Result<String, String> {
+    let mut checked = Checked::default();
+    for damping_ratio in [0.0, 1e-2] {
+        let model = proportional(damping_ratio)?;
+        for decade in -6..=12 {
+            let p = OperatingPoint { normal_load_n: 500.0 * 10f64.powi(decade), ..REFERENCE };
+            checked.solve(&model, &p)?;
+        }
+    }
+    Ok(checked.said())
+}
+
+fn scales() -> Result<String, String> {
+    let mut off: f64 = 0.0;
+    for damping_ratio in [0.0, 1e-2] {
+        let model = synthetic(20, damping_ratio, ContactLaw::default())?;
+        let (mut stiffness, mut damping) = (Mat::zeros(20, 20), Mat::zeros(20, 20));
+        model.assemble(&REFERENCE, &mut stiffness, &mut damping).map_err(text)?;
+        let as_it_is = Checked::default().solve(&model, &REFERENCE)?;
+        for decade in -10..=10 {
+            let s = 10f64.powi(decade);
+            let damping = (damping_ratio > 0.0).then(|| &damping * faer::Scale(s));
+            let scaled = constant(&stiffness * faer::Scale(s * s), damping).map_err(text)?;
+            let scaled = Checked::default().solve(&scaled, &REFERENCE)?;
+            for (a, b) in as_it_is.roots.iter().zip(&scaled.roots) {
+                let difference = (b.lambda / s - a.lambda).norm();
+                // The scaling itself rounds every entry.
+                let limit = a.error.omega + b.error.omega / s;
+                if difference > 2.0 * limit {
+                    return Err(format!(
+                        "scale {s:e}: {} differs from {} by more than {limit:e}",
+                        b.lambda / s,
+                        a.lambda
+                    ));
+                }
+                off = off.max(difference / a.lambda.norm());
+            }
+        }
+    }
+    Ok(format!("roots scale to {off:.1e}"))
+}
+
+fn friction() -> Result<String, String> {
+    let mut checked = Checked::default();
+    for damping_ratio in [0.0, 1e-2] {
+        let model = synthetic(20, damping_ratio, ContactLaw::default())?;
+        for step in -40..=40 {
+            checked.solve(&model, &REFERENCE.with_friction(0.5 * f64::from(step)))?;
+        }
+    }
+    Ok(checked.said())
+}
+
+/// Everything that depends on load and speed.
+fn slipping() -> ContactLaw {
+    ContactLaw { exponent: 1.0 / 3.0, reference_n: 500.0, slope_s_per_m: -0.02, lateral_damping: true }
+}
+
+fn vanishing_load() -> Result<String, String> {
+    let mut checked = Checked::default();
+    let model = synthetic(20, 5e-3, slipping())?;
+    for decade in -300..=3 {
+        if decade > -20 || decade % 40 == 0 {
+            checked.solve(&model, &OperatingPoint { normal_load_n: 10f64.powi(decade), ..REFERENCE })?;
+        }
+    }
+    checked.solve(&model, &OperatingPoint { normal_load_n: 0.0, ..REFERENCE })?;
+    Ok(checked.said())
+}
+
+fn vanishing_speed() -> Result<String, String> {
+    let mut checked = Checked::default();
+    let model = synthetic(20, 5e-3, slipping())?;
+    let mut statics = 0;
+    for speed in [60.0, 1.0, 0.1, 0.02, 0.0100001, 0.01, 0.009999, 1e-6, 1e-300, 0.0] {
+        for load in [1.0, 500.0, 1e5] {
+            for sign in [1.0, -1.0] {
+                let p = OperatingPoint { normal_load_n: load, disc_speed_rad_s: sign * speed, ..REFERENCE };
+                let spectrum = checked.solve(&model, &p)?;
+                statics = statics.max(spectrum.roots.len() - spectrum.mode_count);
+            }
+        }
+    }
+    Ok(format!("up to {statics} static roots; {}", checked.said()))
+}
+
+/// `[[1, b], [0, 1 + g]]` blocks turned by random reflections: condition `√(1 + b²/g²)`.
+fn non_normal() -> Result<String, String> {
+    let mut checked = Checked::default();
+    let mut uniform = Uniform::new(3);
+    for decade in 0..=8 {
+        for gap in [1.0, 1e-2, 1e-4] {
+            let b = 10f64.powi(decade);
+            let mut matrix = Mat::from_fn(8, 8, |i, j| match (i, j) {
+                _ if i == j => 1.0 + (i / 2) as f64 + if i % 2 == 1 { gap } else { 0.0 },
+                _ if j == i + 1 && i % 2 == 0 => b,
+                _ => 0.0,
+            });
+            for _ in 0..3 {
+                let v = Mat::from_fn(8, 1, |_, _| uniform.draw());
+                let twice = 2.0 / v.squared_norm_l2();
+                let reflection = Mat::<f64>::identity(8, 8) - &v * v.transpose() * faer::Scale(twice);
+                matrix = &reflection * &matrix * &reflection;
+            }
+            let solved = checked.solve(&constant(matrix, None).map_err(text)?, &REFERENCE);
+            if let Err(said) = solved {
+                return Err(format!("b {b:e}, gap {gap:e}: {said}"));
+            }
+        }
+    }
+    Ok(checked.said())
+}
+
+fn permuted() -> Result<String, String> {
+    let mut off: f64 = 0.0;
+    let n = 12;
+    let pairs = random_pairs(5, n, 0.4);
+    let plain: Vec<usize> = (0..n).collect();
+    let mut turned = plain.clone();
+    turned.rotate_left(5);
+    turned.swap(1, 8);
+    let signs: Vec<f64> = (0..n).map(|k| if k % 3 == 0 { -1.0 } else { 1.0 }).collect();
+    let mut other = pairs.clone();
+    let reversed = |rows: &Mat<f64>| Mat::from_fn(rows.nrows(), n, |i, j| rows[(rows.nrows() - 1 - i, j)]);
+    (other.normal, other.sliding) = (reversed(&pairs.normal), reversed(&pairs.sliding));
+    let a = with_pairs(1e-3, &pairs, &plain, &[1.0; 12]).map_err(text)?;
+    let b = with_pairs(1e-3, &other, &turned, &signs).map_err(text)?;
+    for step in 0..40 {
+        let p = REFERENCE.with_friction(0.05 * f64::from(step));
+        let (a, b) = (Checked::default().solve(&a, &p)?, Checked::default().solve(&b, &p)?);
+        for root in &a.roots {
+            let distance = |z: c64| (z - root.square).norm();
+            let nearest = b.roots.iter().min_by(|x, y| distance(x.square).total_cmp(&distance(y.square)));
+            let nearest = nearest.ok_or("no roots")?;
+            let limit = 2.0 * (root.error.square + nearest.error.square);
+            if distance(nearest.square) > limit {
+                return Err(format!("{p:?}: {} and {} differ by more than {limit:e}", nearest.square, root.square));
+            }
+            off = off.max(distance(nearest.square) / root.square.norm());
+        }
+    }
+    Ok(format!("the same to {off:.1e}"))
+}
+
+fn scanned() -> Result<String, String> {
+    let (model, _) = squealing()?;
+    scan(&model, &REFERENCE, 2.0, 100_000)
+}
+
+/// Every one of `points` friction coefficients up to `mu_max` at which something grows must lie in a window of the map, and well
+/// inside a window something must grow.
+///
+/// # Errors
+/// The first point that disagrees.
+pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> Result<String, String> {
+    let mut solver = Solver::new(model.dimension());
+    let options = MapOptions { mu_min: 0.0, mu_max, band_max_hz: None, instability_threshold: 1e-6, windows: true };
+    let map = StabilityMap::build(model, &mut solver, at, &options).map_err(text)?;
+    let mut growing = 0;
+    for k in 0..points {
+        let mu = mu_max * (k as f64 + 0.5) / points as f64;
+        let spectrum = solver.solve(model, &at.with_friction(mu), Vectors::None).map_err(text)?;
+        let grows = |threshold: f64| spectrum.roots.iter().any(|root| root.is_unstable(threshold));
+        let inside =
+            |slack: f64| map.windows.iter().any(|w| mu > w.mu_from + slack && w.mu_to.is_none_or(|to| mu < to - slack));
+        if grows(1e-6) && !inside(-1e-9) {
+            return Err(format!("{mu} grows in none of {:?}", map.windows));
+        }
+        if inside(1e-5) && !grows(1e-11) {
+            return Err(format!("{mu} does not grow in {:?}", map.windows));
+        }
+        growing += usize::from(grows(1e-6));
+    }
+    Ok(format!("{} windows, {growing} of {points} points grow, all of them inside", map.windows.len()))
+}
