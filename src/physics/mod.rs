@@ -4,6 +4,7 @@
 
 pub mod chart;
 pub mod critical;
+mod flexible_contact;
 pub mod model;
 pub mod operating_point;
 pub mod reference;
@@ -17,6 +18,7 @@ pub mod tracking;
 
 pub use chart::{Chart, NotCharted};
 pub use critical::{Window, WindowKind};
+pub use flexible_contact::ResidualFlexibility;
 pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Term, Traces};
 pub use operating_point::{ContactState, OperatingPoint};
 pub use spectrum::{Root, RootError, SolveError, Solver, Spectrum, Vectors};

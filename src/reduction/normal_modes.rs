@@ -43,6 +43,8 @@ pub enum Progress {
     Iterated { vectors: usize, converged: usize, wanted: usize },
     /// The inertia of `K - σ M` told how many modes lie below `ω² = σ`, rad²/s².
     Counted { modes: usize, below: f64 },
+    /// Static responses found so far, of those to unit loads at the contact.
+    Loaded { solved: usize, loads: usize },
 }
 
 /// Lowest modes of a symmetric system that need not be stable.
@@ -359,8 +361,7 @@ mod tests {
     fn more_memory_than_allowed_is_refused_before_the_work() {
         let (mass, stiffness, _) = membrane(30, 1e-7);
         let mut told = vec![];
-        let refused =
-            normal_modes("disc", &mass, &stiffness, Wanted::Lowest(40), Some(1 << 20), &mut |p| told.push(p));
+        let refused = normal_modes("disc", &mass, &stiffness, Wanted::Lowest(40), Some(1 << 20), &mut |p| told.push(p));
         let Err(ReductionError::Memory { bytes, limit, .. }) = refused else { panic!("{refused:?}") };
         // At least the basis of 3·40 + 48 vectors of 900 numbers.
         assert!(bytes > 168 * 900 * 8 && limit == 1 << 20, "{bytes} {limit}");

@@ -1,5 +1,8 @@
 //! Tensor Chebyshev interpolation on a box.
 
+/// Polynomials a smooth function of one variable is expanded in at most.
+pub const MOST_DEGREES: usize = 32;
+
 /// Nodes per axis by the number of axes: fewer where their number is a power.
 pub fn nodes_per_axis(axes: usize) -> usize {
     match axes {
@@ -23,6 +26,18 @@ pub fn polynomials(x: f64, out: &mut [f64]) {
             _ => 2.0 * x * out[k - 1] - out[k - 2],
         };
     }
+}
+
+/// `x T_k(x / range)`; not a number beyond the range, where the expansion it belongs to means nothing. Differences
+/// across the end are still taken.
+pub fn beside_zero(x: f64, degree: usize, range: f64) -> f64 {
+    let scaled = x / range;
+    if scaled.abs() > 1.0 + 1e-4 {
+        return f64::NAN;
+    }
+    let mut values = [0.0; MOST_DEGREES];
+    polynomials(scaled, &mut values[..=degree]);
+    x * values[degree]
 }
 
 /// Coefficients of the interpolant through `values` at the tensor nodes of `axes` axes with `m` nodes each, axis 0
