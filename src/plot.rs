@@ -280,31 +280,25 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
     let x = (x.0.floor(), x.1.ceil() + 1.0); // labels stand to the right of their points
     let y =
         padded(range(drawn().flat_map(|route| [at(route, route.median_error).1, at(route, route.largest_error).1])));
-    let mut svg = String::new();
-    {
-        let area = SVGBackend::with_string(&mut svg, (SIZE.0, 640)).into_drawing_area();
-        area.fill(&WHITE).map_err(failed)?;
-        let area = area.titled(title, ("sans-serif", 18)).map_err(failed)?;
+    figure(title, (1000, 640), |area| {
         let labels = ("run time per condition, log10 us", "relative error of the square, log10");
-        let mut chart = axes(&area, x, y, labels.0, labels.1)?;
+        let mut chart = axes(area, x, y, labels.0, labels.1)?;
         for (k, (modes, mut curve)) in curves.into_iter().enumerate() {
             let colour = COLOURS[k % COLOURS.len()];
             curve.sort_by(|a, b| a.median_us.total_cmp(&b.median_us));
             let line = curve.iter().map(|route| at(route, route.median_error));
-            chart.draw_series(LineSeries::new(line, colour.stroke_width(2))).map_err(failed)?;
+            chart.draw_series(LineSeries::new(line, colour.stroke_width(2 * FINE))).map_err(failed)?;
             for route in curve {
                 let (median, largest) = (at(route, route.median_error), at(route, route.largest_error));
-                chart
-                    .draw_series(LineSeries::new([median, largest], colour.mix(0.5).stroke_width(1)))
-                    .map_err(failed)?;
-                chart.draw_series([Circle::new(median, 4, colour.filled())]).map_err(failed)?;
+                let up = LineSeries::new([median, largest], colour.mix(0.5).stroke_width(FINE));
+                chart.draw_series(up).map_err(failed)?;
+                chart.draw_series([Circle::new(median, 4 * FINE, colour.filled())]).map_err(failed)?;
                 let label = format!("  {modes}: {}", route.route);
-                chart.draw_series([Text::new(label, median, ("sans-serif", 13))]).map_err(failed)?;
+                chart.draw_series([Text::new(label, median, ("sans-serif", 13 * FINE))]).map_err(failed)?;
             }
         }
-        area.present().map_err(failed)?;
-    }
-    Ok(svg)
+        Ok(())
+    })
 }
 
 /// Bins without a gap between them that all have something, with it.

@@ -67,6 +67,7 @@ fn prediction(seq: u64, log_time_ns: u64) -> Message {
         worst_frequency_hz: 2000.0,
         critical_friction: 0.31,
         friction_margin: -0.02,
+        friction_margin_error: 1e-10,
         reason: "ä reason".to_owned(),
         modes: (0..9).map(mode).collect(),
     };
@@ -598,6 +599,7 @@ fn others_read_our_recordings() {
                 Payload::RigInfo(m) => serde_json::to_value(m),
                 Payload::Sensitivity(m) => serde_json::to_value(m),
                 Payload::Diagnostics(m) => serde_json::to_value(m),
+                Payload::Vibration(m) => serde_json::to_value(m),
             };
             assert_eq!(theirs["message"], ours.unwrap(), "{reader}");
         }

@@ -44,7 +44,7 @@ pub fn answer(
     let chosen: Vec<usize> = (0..spectrum.mode_count).filter(|&k| question.ids.contains(&id(k))).collect();
     let found = of_roots(&rig.model, &spectrum, &chosen).map_err(|error| error.to_string())?;
     let known = |mut derivatives: [f64; 5]| {
-        if !rig.model.has_contact() {
+        if !rig.model.is_linear_in_contact() {
             derivatives[3..].fill(f64::NAN);
         }
         Derivatives::new(derivatives)
@@ -104,6 +104,6 @@ pub fn answer(
 /// How an end of a window moves, as the wire has it.
 pub fn end_derivatives(rig: &Rig, end: &End) -> Derivatives {
     let [load, speed, stiffness, damping] = end.slope;
-    let contact = |slope: f64| if rig.model.has_contact() { slope } else { f64::NAN };
+    let contact = |slope: f64| if rig.model.is_linear_in_contact() { slope } else { f64::NAN };
     Derivatives::new([0.0, load, speed, contact(stiffness), contact(damping)])
 }

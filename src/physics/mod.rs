@@ -5,6 +5,7 @@
 pub mod chart;
 pub mod critical;
 pub mod ends;
+mod flexible_contact;
 pub mod model;
 pub mod operating_point;
 pub mod reference;
@@ -21,6 +22,7 @@ pub mod tracking;
 pub use chart::{Chart, NotCharted};
 pub use critical::{Window, WindowKind};
 pub use ends::{Bounded, End, Ends};
+pub use flexible_contact::ResidualFlexibility;
 pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Parameter, Term, Traces};
 pub use operating_point::{ContactState, OperatingPoint};
 pub use spectrum::{Root, RootError, SolveError, Solver, Spectrum, Vectors};

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use faer::{Mat, MatRef};
 
+use super::chart::chebyshev;
 use super::operating_point::{ContactState, OperatingPoint};
 
 /// A matrix times a scalar law of the operating point.
@@ -36,6 +37,9 @@ pub enum Law {
     FrictionSlope,
     /// `μ N / |ω|` while it slides.
     LateralFriction,
+    /// `x T_k(x / r)`, `x = s μ`, while it slides: one of a sum that stands for a smooth function of `μ` less its value
+    /// at 0. It does not exist for `|μ|` above `r`.
+    FrictionChebyshev { degree: usize, range: f64 },
     /// Any other function, from a rig file's expression.
     Custom(CustomLaw),
 }
@@ -130,6 +134,21 @@ pub enum ModelError {
     LawNotFinite { what: String, value: f64, normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64 },
     #[error("{what} has {found} values, expected one for each of {expected} contact pairs")]
     PairCount { what: &'static str, found: usize, expected: usize },
+    #[error(
+        "residual flexibility with [load] exponent {exponent}, expected 0: the contact stiffness it stands beside must \
+         not depend on the load"
+    )]
+    FlexibleLoadExponent { exponent: f64 },
+    #[error(
+        "contact flexibility at friction coefficient {friction_coefficient} has condition number {condition:.1e}, \
+         limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient leave it out"
+    )]
+    IllConditioned { friction_coefficient: f64, condition: f64, limit: f64 },
+    #[error(
+        "contact flexibility over friction coefficients up to {range} leaves {value:.1e} to the highest of {degrees} \
+         Chebyshev polynomials, limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient help"
+    )]
+    FlexibilityFit { range: f64, degrees: usize, value: f64, limit: f64 },
     #[error("contact pair {pair}: radius_m is {radius_m}, expected more than 0 for lateral damping")]
     Radius { pair: usize, radius_m: f64 },
     #[error(
@@ -140,18 +159,18 @@ pub enum ModelError {
 
 /// A term with what its matrix is known to be.
 #[derive(Clone, Debug)]
-struct KnownTerm {
-    term: Term,
+pub(super) struct KnownTerm {
+    pub(super) term: Term,
     symmetric: bool,
 }
 
 /// The equation of motion of a rig in `n` mass-normalised coordinates.
 #[derive(Clone, Debug)]
 pub struct Model {
-    dimension: usize,
-    stiffness: Vec<KnownTerm>,
-    damping: Vec<KnownTerm>,
-    contact_law: ContactLaw,
+    pub(super) dimension: usize,
+    pub(super) stiffness: Vec<KnownTerm>,
+    pub(super) damping: Vec<KnownTerm>,
+    pub(super) contact_law: ContactLaw,
     has_contact: bool,
     pad_modes: Option<usize>,
 }
@@ -202,6 +221,18 @@ impl Model {
     /// # Errors
     /// [`ModelError::Shape`], [`ModelError::NotFinite`], [`ModelError::PairCount`], [`ModelError::Radius`].
     pub fn with_contact(mut self, pairs: &ContactPairs) -> Result<Self, ModelError> {
+        self.check_pairs(pairs)?;
+        let (n, t) = (pairs.normal.as_ref(), pairs.sliding.as_ref());
+        let (k, c) = (&pairs.stiffness_n_per_m, &pairs.damping_n_s_per_m);
+        self.add_stiffness("contact stiffness", congruence(n, k, n), Law::ContactStiffness)?;
+        self.add_stiffness("friction stiffness", congruence(t, k, n), Law::FrictionStiffness)?;
+        self.add_damping("contact damping", congruence(n, c, n), Law::ContactDamping)?;
+        self.add_damping("friction damping", congruence(t, c, n), Law::FrictionDamping)?;
+        self.with_friction_damping(pairs)
+    }
+
+    /// One matrix for each displacement of a pair, one value for each pair.
+    pub(super) fn check_pairs(&self, pairs: &ContactPairs) -> Result<(), ModelError> {
         let count = pairs.normal.nrows();
         for (what, rows) in [("sliding", &pairs.sliding), ("lateral", &pairs.lateral), ("normal", &pairs.normal)] {
             if rows.nrows() != count || rows.ncols() != self.dimension {
@@ -222,6 +253,12 @@ impl Model {
                 return Err(ModelError::PairCount { what, found: values.len(), expected: count });
             }
         }
+        Ok(())
+    }
+
+    /// Adds what friction does to motion along and across the direction of sliding, the same whatever the springs.
+    pub(super) fn with_friction_damping(mut self, pairs: &ContactPairs) -> Result<Self, ModelError> {
+        let count = pairs.normal.nrows();
         let each_n_0 = 1.0 / count.max(1) as f64;
         let mut inverse_radius = vec![0.0; count];
         if self.contact_law.lateral_damping {
@@ -233,28 +270,24 @@ impl Model {
             }
         }
         let slope = vec![each_n_0 * self.contact_law.slope_s_per_m; count];
-        let (n, t, b) = (pairs.normal.as_ref(), pairs.sliding.as_ref(), pairs.lateral.as_ref());
-        let stiffness = [
-            ("contact stiffness", congruence(n, &pairs.stiffness_n_per_m, n), Law::ContactStiffness),
-            ("friction stiffness", congruence(t, &pairs.stiffness_n_per_m, n), Law::FrictionStiffness),
-        ];
-        let damping = [
-            ("contact damping", congruence(n, &pairs.damping_n_s_per_m, n), Law::ContactDamping),
-            ("friction damping", congruence(t, &pairs.damping_n_s_per_m, n), Law::FrictionDamping),
-            ("friction slope", congruence(t, &slope, t), Law::FrictionSlope),
-            ("lateral friction", congruence(b, &inverse_radius, b), Law::LateralFriction),
-        ];
-        for (what, matrix, law) in stiffness {
-            let known = self.known(Term { matrix, law }, || what.to_owned())?;
-            self.stiffness.push(known);
-        }
-        for (what, matrix, law) in damping {
-            let known = self.known(Term { matrix, law }, || what.to_owned())?;
-            self.damping.push(known);
-        }
+        let (t, b) = (pairs.sliding.as_ref(), pairs.lateral.as_ref());
+        self.add_damping("friction slope", congruence(t, &slope, t), Law::FrictionSlope)?;
+        self.add_damping("lateral friction", congruence(b, &inverse_radius, b), Law::LateralFriction)?;
         self.has_contact = true;
         self.drop_zero_terms();
         Ok(self)
+    }
+
+    pub(super) fn add_stiffness(&mut self, what: &str, matrix: Mat<f64>, law: Law) -> Result<(), ModelError> {
+        let known = self.known(Term { matrix, law }, || what.to_owned())?;
+        self.stiffness.push(known);
+        Ok(())
+    }
+
+    pub(super) fn add_damping(&mut self, what: &str, matrix: Mat<f64>, law: Law) -> Result<(), ModelError> {
+        let known = self.known(Term { matrix, law }, || what.to_owned())?;
+        self.damping.push(known);
+        Ok(())
     }
 
     fn known(&self, term: Term, what: impl Fn() -> String) -> Result<KnownTerm, ModelError> {
@@ -297,6 +330,13 @@ impl Model {
         self.has_contact
     }
 
+    /// Whether `K` and `C` are proportional to stiffness and damping of the contact, so that their derivatives by these
+    /// are known: there is contact, and without residual flexibility.
+    pub fn is_linear_in_contact(&self) -> bool {
+        let mut terms = self.stiffness.iter().chain(&self.damping);
+        self.has_contact && !terms.any(|known| matches!(known.term.law, Law::FrictionChebyshev { .. }))
+    }
+
     /// The state of the contact, as far as this model knows contact: one without contact pairs never opens.
     pub fn contact_state(&self, p: &OperatingPoint) -> ContactState {
         match p.contact_state() {
@@ -324,6 +364,10 @@ impl Model {
             Law::FrictionDamping => when(sliding, p.disc_speed_rad_s.signum() * mu),
             Law::FrictionSlope => when(sliding, load),
             Law::LateralFriction => when(sliding, mu * load / p.disc_speed_rad_s.abs()),
+            Law::FrictionChebyshev { degree, range } => {
+                let x = p.disc_speed_rad_s.signum() * mu;
+                when(sliding, chebyshev::beside_zero(x, *degree, *range))
+            }
             Law::Custom(custom) => (custom.evaluate)(&if sliding { *p } else { p.with_friction(0.0) }),
         }
     }
@@ -385,6 +429,15 @@ impl Model {
             }
             (Load, Law::FrictionSlope | Law::LateralFriction) if value != 0.0 => value / p.normal_load_n,
             (Speed, Law::LateralFriction) if value != 0.0 => -value / p.disc_speed_rad_s,
+            (Friction, Law::FrictionChebyshev { degree, range }) if value.is_finite() => {
+                let sign = p.disc_speed_rad_s.signum();
+                let sliding = p.contact_state() == ContactState::Sliding;
+                if sliding {
+                    sign * chebyshev::beside_zero_slope(sign * p.friction_coefficient, *degree, *range)
+                } else {
+                    0.0
+                }
+            }
             (ContactStiffness, Law::ContactStiffness | Law::FrictionStiffness) => value,
             (ContactDamping, Law::ContactDamping | Law::FrictionDamping) => value,
             _ => 0.0,
@@ -422,7 +475,7 @@ impl Model {
         let (mut load, mut speed) = (false, false);
         for known in self.stiffness.iter().chain(&self.damping) {
             match &known.term.law {
-                Law::Constant | Law::ContactDamping | Law::FrictionDamping => {}
+                Law::Constant | Law::ContactDamping | Law::FrictionDamping | Law::FrictionChebyshev { .. } => {}
                 Law::ContactStiffness | Law::FrictionStiffness => load |= self.contact_law.exponent != 0.0,
                 Law::FrictionSlope => load = true,
                 Law::LateralFriction => (load, speed) = (true, true),
@@ -518,7 +571,7 @@ fn sum(
 }
 
 /// `Aᵀ diag(d) B`.
-fn congruence(a: MatRef<'_, f64>, d: &[f64], b: MatRef<'_, f64>) -> Mat<f64> {
+pub(super) fn congruence(a: MatRef<'_, f64>, d: &[f64], b: MatRef<'_, f64>) -> Mat<f64> {
     let scaled = Mat::from_fn(b.nrows(), b.ncols(), |row, column| d[row] * b[(row, column)]);
     let product = a.transpose() * &scaled;
     if std::ptr::eq(a.as_ptr(), b.as_ptr()) {

@@ -1,5 +1,8 @@
 //! Why a model could not be reduced.
 
+/// Bytes in a GiB.
+const GIB: f64 = (1_u64 << 30) as f64;
+
 /// What went wrong, where, with which value against which limit. Rows, columns and modes are counted from 0.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ReductionError {
@@ -29,6 +32,13 @@ pub enum ReductionError {
         "{what}: {found} modes found below {below:.6e} rad^2/s^2, but the inertia of K - shift M counts {counted} there"
     )]
     MissedModes { what: String, found: usize, counted: usize, below: f64 },
+    #[error("{what}: mode {mode} has |K phi - omega^2 M phi| = {value:.3e} of its parts, limit {limit:.1e}")]
+    Residual { what: String, mode: usize, value: f64, limit: f64 },
+    #[error(
+        "{what}: its modes need {:.2} GiB of memory, more than the {:.2} GiB allowed",
+        *bytes as f64 / GIB, *limit as f64 / GIB
+    )]
+    Memory { what: String, bytes: usize, limit: usize },
     #[error("{what}: {reason}")]
     Factorisation { what: String, reason: String },
 }

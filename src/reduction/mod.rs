@@ -7,21 +7,27 @@
 //! ```
 //!
 //! by [`free_interface_modes`]; [`whiten`] makes `M = I` of a whole system without leaving anything out. Sparse, for
-//! systems of finite-element matrices: [`lowest_modes`] by shift-invert block Lanczos, the count of modes proven by the
-//! inertia of `K - σ M`; [`project_sparse`] takes each term to the basis.
+//! systems of finite-element matrices: [`normal_modes`] by nested dissection, a supernodal `L Lᵀ` and shift-invert block
+//! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
+//! to the basis; [`residual()`] finds what the modes left out still do at the contact.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
 mod dense;
 mod error;
 mod lanczos;
+mod normal_modes;
+mod ordering;
+mod pencil;
 mod project;
+mod residual;
 mod sparse;
 
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::ReductionError;
-pub use lanczos::{SparseModes, lowest_modes};
+pub use normal_modes::{Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use project::{project_dense, project_sparse};
+pub use residual::{Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 
 /// Two mirrored entries of a symmetric matrix may differ by this times the largest entry: what printing with 13 digits

@@ -1,5 +1,8 @@
 //! Tensor Chebyshev interpolation on a box.
 
+/// Polynomials a smooth function of one variable is expanded in at most.
+pub const MOST_DEGREES: usize = 32;
+
 /// Nodes per axis by the number of axes: fewer where their number is a power.
 pub fn nodes_per_axis(axes: usize) -> usize {
     match axes {
@@ -23,6 +26,33 @@ pub fn polynomials(x: f64, out: &mut [f64]) {
             _ => 2.0 * x * out[k - 1] - out[k - 2],
         };
     }
+}
+
+/// `x T_k(x / range)`; not a number beyond the range, where the expansion it belongs to means nothing. Differences
+/// across the end are still taken.
+pub fn beside_zero(x: f64, degree: usize, range: f64) -> f64 {
+    let scaled = x / range;
+    if scaled.abs() > 1.0 + 1e-4 {
+        return f64::NAN;
+    }
+    let mut values = [0.0; MOST_DEGREES];
+    polynomials(scaled, &mut values[..=degree]);
+    x * values[degree]
+}
+
+/// Derivative of [`beside_zero`] with respect to `x`: `T_k(y) + k y U_{k-1}(y)`, `y = x / range`.
+pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
+    let y = x / range;
+    if y.abs() > 1.0 + 1e-4 {
+        return f64::NAN;
+    }
+    // T and U of the degrees so far: U_k = y U_{k-1} + T_k.
+    let (mut before, mut t, mut u) = (y, 1.0, 0.0);
+    for _ in 0..degree {
+        u = y * u + t;
+        (before, t) = (t, 2.0 * y * t - before);
+    }
+    t + degree as f64 * y * u
 }
 
 /// Coefficients of the interpolant through `values` at the tensor nodes of `axes` axes with `m` nodes each, axis 0
@@ -72,6 +102,18 @@ pub fn tail(coefficients: &[f64], m: usize, axes: usize) -> (f64, usize) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Central differences of step h err by h² f'''/6, below 1e-7 here.
+    #[test]
+    fn slopes_are_those_of_differences() {
+        for degree in 0..6 {
+            for x in [-1.7, -0.3, 0.0, 0.9, 1.99] {
+                let [up, down] = [x + 1e-5, x - 1e-5].map(|x| beside_zero(x, degree, 2.0));
+                let slope = beside_zero_slope(x, degree, 2.0);
+                assert!((slope - (up - down) / 2e-5).abs() < 1e-6, "{degree} {x}: {slope}");
+            }
+        }
+    }
 
     /// An analytic function of two variables, interpolated and evaluated elsewhere.
     #[test]

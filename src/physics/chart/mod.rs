@@ -7,7 +7,7 @@
 //! taken twice shows.
 
 pub mod build;
-mod chebyshev;
+pub(super) mod chebyshev;
 mod cluster;
 
 use faer::c64;

@@ -1,0 +1,212 @@
+//! Contact through what truncated modes leave out: residual flexibility and residual inertia.
+//!
+//! With the residual flexibility `R` of both sides between contact pairs, the contact forces satisfy `S(μ) N = -B_n q`:
+//!
+//! ```text
+//! S(μ) = K_c⁻¹ + R_nn + μ R_nt,   S⁻¹ = A K_c,   A = (I + K_c (R_nn + μ R_nt))⁻¹
+//! K(μ) = diag(Ω²) + (B_n + μ B_t)ᵀ S⁻¹ B_n
+//! C(μ) = diag(2ζΩ) + (B_n + μ B_t)ᵀ A C_c (I + (R_nn + μ R_nt) K_c)⁻¹ B_n
+//! M(μ) = I + (B_n + μ B_t)ᵀ S⁻¹ (Q_nn + μ Q_nt) S⁻¹ B_n
+//! ```
+//!
+//! `M⁻¹ K` and `M⁻¹ C` are smooth in `μ` and become sums of terms: their value at 0, and `x` times a Chebyshev expansion
+//! of the rest divided by `x = s μ`. Friction's own damping acts on modal velocities, without `M⁻¹`: what that leaves
+//! out is of second order in the residual.
+//!
+//! Source: MacNeal 1971 (residual flexibility); Rubin 1975 (its inertia); Craig and Chang 1977.
+
+use faer::linalg::solvers::Solve;
+use faer::{Mat, MatRef};
+
+use super::chart::chebyshev;
+use super::model::{ContactPairs, Law, Model, ModelError};
+
+/// Largest condition number of `I + K_c R(μ)` that is accepted.
+const CONDITION_LIMIT: f64 = 1e10;
+/// What the highest Chebyshev coefficients may be, relative to the largest entry of the matrix.
+const FIT_LIMIT: f64 = 1e-9;
+
+/// Residuals of truncated modes between `c` contact pairs, sum of both sides; of relative displacement, pad minus disc.
+#[derive(Clone, Debug)]
+pub struct ResidualFlexibility {
+    /// `R_nn`, `c×c`, m/N: displacement along `n` from forces along `n`.
+    pub normal: Mat<f64>,
+    /// `R_nt`, `c×c`, m/N: displacement along `n` from forces along `t`.
+    pub sliding: Mat<f64>,
+    /// `Q_nn` and `Q_nt`, `c×c`, s²·m/N; none where the inertia of the residual is left out.
+    pub inertia: Option<[Mat<f64>; 2]>,
+}
+
+impl Model {
+    /// Adds the terms of a contact with residual flexibility, for friction coefficients up to `range`.
+    ///
+    /// # Errors
+    /// Those of [`Model::with_contact`]; [`ModelError::FlexibleLoadExponent`], [`ModelError::IllConditioned`],
+    /// [`ModelError::FlexibilityFit`].
+    pub fn with_flexible_contact(
+        mut self,
+        pairs: &ContactPairs,
+        residual: &ResidualFlexibility,
+        range: f64,
+    ) -> Result<Self, ModelError> {
+        self.check_pairs(pairs)?;
+        let exponent = self.contact_law.exponent;
+        if exponent != 0.0 {
+            return Err(ModelError::FlexibleLoadExponent { exponent });
+        }
+        let count = pairs.normal.nrows();
+        let inertia = residual.inertia.iter().flatten();
+        for matrix in [&residual.normal, &residual.sliding].into_iter().chain(inertia) {
+            let (rows, columns) = matrix.shape();
+            if (rows, columns) != (count, count) {
+                let what = "residual flexibility".to_owned();
+                return Err(ModelError::Shape { what, rows, columns, expected: count });
+            }
+        }
+        let contact = FlexibleContact { pairs, residual, free: self.constant_terms() };
+        let at_rest = contact.at(0.0)?;
+        let expansion = contact.expansion(&at_rest, range)?;
+        let [stiffness, damping] = at_rest;
+        self.add_stiffness("contact stiffness", stiffness, Law::ContactStiffness)?;
+        self.add_damping("contact damping", damping, Law::ContactDamping)?;
+        for (degree, [stiffness, damping]) in expansion.into_iter().enumerate() {
+            let law = Law::FrictionChebyshev { degree, range };
+            self.add_stiffness("friction stiffness", stiffness, law.clone())?;
+            self.add_damping("friction damping", damping, law)?;
+        }
+        self.with_friction_damping(pairs)
+    }
+
+    /// `K` and `C` without contact.
+    fn constant_terms(&self) -> [Mat<f64>; 2] {
+        [&self.stiffness, &self.damping].map(|terms| {
+            let mut sum = Mat::zeros(self.dimension, self.dimension);
+            for known in terms.iter().filter(|known| matches!(known.term.law, Law::Constant)) {
+                sum += &known.term.matrix;
+            }
+            sum
+        })
+    }
+}
+
+struct FlexibleContact<'a> {
+    pairs: &'a ContactPairs,
+    residual: &'a ResidualFlexibility,
+    /// `diag(Ω²)` and `diag(2ζΩ)`.
+    free: [Mat<f64>; 2],
+}
+
+impl FlexibleContact<'_> {
+    /// What the contact adds to `K` and `C` at `x = s μ`.
+    fn at(&self, x: f64) -> Result<[Mat<f64>; 2], ModelError> {
+        let ContactPairs { normal, sliding, stiffness_n_per_m, damping_n_s_per_m, .. } = self.pairs;
+        let c = normal.nrows();
+        let flexibility = &self.residual.normal + faer::Scale(x) * &self.residual.sliding;
+        let coupled = |by_row: bool| {
+            Mat::from_fn(c, c, |i, j| {
+                let spring = stiffness_n_per_m[if by_row { i } else { j }];
+                spring * flexibility[(i, j)] + if i == j { 1.0 } else { 0.0 }
+            })
+        };
+        let (left, right) = (coupled(true), coupled(false));
+        let scaled = |values: &[f64], rows: MatRef<'_, f64>| {
+            Mat::from_fn(rows.nrows(), rows.ncols(), |i, j| values[i] * rows[(i, j)])
+        };
+        let solver = left.partial_piv_lu();
+        let inverse = solver.solve(Mat::<f64>::identity(c, c));
+        let condition = one_norm(&left) * one_norm(&inverse);
+        if condition.is_nan() || condition > CONDITION_LIMIT {
+            let limit = CONDITION_LIMIT;
+            return Err(ModelError::IllConditioned { friction_coefficient: x, condition, limit });
+        }
+        // Forces on the pads per displacement, K_c and C_c seen through the flexibility.
+        let springs = &inverse * scaled(stiffness_n_per_m, normal.as_ref());
+        let seen = right.partial_piv_lu().solve(normal);
+        let dampers = &inverse * scaled(damping_n_s_per_m, seen.as_ref());
+        let forces = normal + faer::Scale(x) * sliding;
+        let mut stiffness = forces.transpose() * &springs;
+        let mut damping = forces.transpose() * &dampers;
+        if x == 0.0 {
+            // Symmetric but for rounding: R is.
+            stiffness = symmetric_part(&stiffness);
+            damping = symmetric_part(&damping);
+        }
+        if let Some([inertia_n, inertia_t]) = &self.residual.inertia {
+            let inertia = inertia_n + faer::Scale(x) * inertia_t;
+            let response = &inverse * scaled(stiffness_n_per_m, (inertia * &springs).as_ref());
+            let n = normal.ncols();
+            let mass = Mat::<f64>::identity(n, n) + forces.transpose() * response;
+            let solver = mass.partial_piv_lu();
+            // M⁻¹ (K_free + K_contact) - K_free, and the same of C.
+            stiffness = solver.solve(stiffness + &self.free[0]) - &self.free[0];
+            damping = solver.solve(damping + &self.free[1]) - &self.free[1];
+        }
+        Ok([stiffness, damping])
+    }
+
+    /// Chebyshev coefficients over `[-range, range]` of what [`Self::at`] gives, less `at_rest`, divided by `x`.
+    fn expansion(&self, at_rest: &[Mat<f64>; 2], range: f64) -> Result<Vec<[Mat<f64>; 2]>, ModelError> {
+        // An even number of nodes: none of them is 0.
+        let mut m = 8;
+        loop {
+            let mut quotients = vec![];
+            for node in chebyshev::nodes(m) {
+                let x = node * range;
+                let [stiffness, damping] = self.at(x)?;
+                quotients.push([
+                    faer::Scale(1.0 / x) * (stiffness - &at_rest[0]),
+                    faer::Scale(1.0 / x) * (damping - &at_rest[1]),
+                ]);
+            }
+            let expansion = coefficients(&quotients);
+            let worst = [0, 1]
+                .map(|part| {
+                    let largest = at_rest[part].norm_max() + expansion[0][part].norm_max();
+                    let tail = expansion[m - 2][part].norm_max() + expansion[m - 1][part].norm_max();
+                    if largest > 0.0 { tail / largest } else { 0.0 }
+                })
+                .into_iter()
+                .fold(0.0, f64::max);
+            if worst < FIT_LIMIT {
+                let kept = expansion.iter().rposition(|coefficient| {
+                    (0..2).any(|part| coefficient[part].norm_max() > 0.01 * FIT_LIMIT * expansion[0][part].norm_max())
+                });
+                return Ok(expansion.into_iter().take(kept.map_or(0, |last| last + 1)).collect());
+            }
+            if m == chebyshev::MOST_DEGREES {
+                return Err(ModelError::FlexibilityFit { range, degrees: m, value: worst, limit: FIT_LIMIT });
+            }
+            m *= 2;
+        }
+    }
+}
+
+/// Coefficients of the interpolant through matrices at the nodes.
+fn coefficients(values: &[[Mat<f64>; 2]]) -> Vec<[Mat<f64>; 2]> {
+    let m = values.len();
+    let weights: Vec<Vec<f64>> = (0..m)
+        .map(|node| {
+            let mut unit = vec![0.0; m];
+            unit[node] = 1.0;
+            chebyshev::coefficients(&mut unit, m, 1);
+            unit
+        })
+        .collect();
+    let (rows, columns) = values[0][0].shape();
+    let sum = |degree: usize, part: usize| {
+        let mut sum = Mat::zeros(rows, columns);
+        for (value, weight) in values.iter().zip(&weights) {
+            sum += faer::Scale(weight[degree]) * &value[part];
+        }
+        sum
+    };
+    (0..m).map(|degree| [sum(degree, 0), sum(degree, 1)]).collect()
+}
+
+fn symmetric_part(matrix: &Mat<f64>) -> Mat<f64> {
+    Mat::from_fn(matrix.nrows(), matrix.ncols(), |i, j| 0.5 * (matrix[(i, j)] + matrix[(j, i)]))
+}
+
+fn one_norm(matrix: &Mat<f64>) -> f64 {
+    matrix.col_iter().map(|column| column.norm_l1()).fold(0.0, f64::max)
+}

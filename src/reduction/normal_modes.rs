@@ -1,0 +1,395 @@
+//! Lowest real modes of a large sparse system.
+//!
+//! With `A = K + s M = L Lᵀ` positive definite, `C = L⁻¹ M L⁻ᵀ` is symmetric and has the eigenvalues
+//! `θ = 1 / (ω² + s)`, largest for the lowest modes; `φ = L⁻ᵀ y / √θ`. A small `s` keeps bodies that float freely apart
+//! from singular. The inertia of `K - σ M` counts the modes below `σ` (Sylvester), so that a missed one is an error.
+
+use faer::Mat;
+
+use super::dense::{fix_signs, symmetric_eigen};
+use super::lanczos::{Iteration, capacity};
+use super::pencil::Pencil;
+use super::sparse::{entries, one_norm, times};
+use super::{ReductionError, SparseMatrix, whiten};
+
+/// Residual of `C` a mode may have, relative to its `θ`.
+const RESIDUAL_LIMIT: f64 = 1e-12;
+/// Residual `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` a mode may have, in 1-norms of the matrices.
+const BACKWARD_LIMIT: f64 = 1e-12;
+/// Two neighbouring `ω²` this far apart, relative to their size, leave room for a Sturm count between them.
+const GAP: f64 = 1e-7;
+/// Below this many degrees of freedom a dense solve is at least as fast.
+const DENSE_BELOW: usize = 400;
+/// Above this ratio of `θ` the shift is moved: small `θ` would drown in the rounding of the largest.
+const WIDEST_SPREAD: f64 = 1e6;
+
+/// Which modes are wanted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Wanted {
+    /// As many of lowest frequency.
+    Lowest(usize),
+    /// Every one with `ω` below this, rad/s.
+    Below(f64),
+}
+
+/// What a computation of modes is doing.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Progress {
+    /// Ordered and analysed: the numbers in a factor and the bytes that will be needed in all.
+    Analysed { factor_entries: usize, bytes: usize },
+    /// `K + s M` is factored, `s` in rad²/s².
+    Factored { shift: f64 },
+    /// Vectors built so far, and modes converged of those wanted.
+    Iterated { vectors: usize, converged: usize, wanted: usize },
+    /// The inertia of `K - σ M` told how many modes lie below `ω² = σ`, rad²/s².
+    Counted { modes: usize, below: f64 },
+    /// Static responses found so far, of those to unit loads at the contact.
+    Loaded { solved: usize, loads: usize },
+}
+
+/// Lowest modes of a symmetric system that need not be stable.
+#[derive(Clone, Debug)]
+pub struct SparseModes {
+    /// `ω²`, rad²/s², ascending; negative where the stiffness is not semidefinite.
+    pub omega_squared: Vec<f64>,
+    /// `Φ`, degrees of freedom by modes, kg^-1/2, `Φᵀ M Φ = I`.
+    pub phi: Mat<f64>,
+    /// `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of every mode, 2-norms of vectors and 1-norms of matrices.
+    pub residuals: Vec<f64>,
+}
+
+/// The `count` lowest modes of `K φ = ω² M φ`: [`normal_modes`] without a limit of memory.
+///
+/// # Errors
+/// As [`normal_modes`].
+pub fn lowest_modes(
+    what: &str,
+    mass: &SparseMatrix,
+    stiffness: &SparseMatrix,
+    count: usize,
+) -> Result<SparseModes, ReductionError> {
+    normal_modes(what, mass, stiffness, Wanted::Lowest(count), None, &mut |_| {})
+}
+
+/// The lowest modes of `K φ = ω² M φ`, both sparse, symmetric, `n×n`, `M` positive definite.
+///
+/// `what` is how errors name the system; `memory_limit_bytes` is compared with an estimate before the work starts;
+/// `progress` hears what is done.
+///
+/// # Errors
+/// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `ModeCount`, `Memory`, `NoShift`,
+/// `NotConverged`, `Residual`, `MissedModes`, `Factorisation`.
+pub fn normal_modes(
+    what: &str,
+    mass: &SparseMatrix,
+    stiffness: &SparseMatrix,
+    wanted: Wanted,
+    memory_limit_bytes: Option<usize>,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<SparseModes, ReductionError> {
+    let pencil = Pencil::new(what, mass, stiffness)?;
+    let n = pencil.dimension();
+    let told = |count: usize| {
+        let (factor, vectors) = (pencil.factor_bytes(), size_of::<f64>() * n * (capacity(n, count) + count));
+        Progress::Analysed { factor_entries: pencil.factor_entries(), bytes: pencil.held_bytes() + factor + vectors }
+    };
+    let check = |analysed: Progress| match (analysed, memory_limit_bytes) {
+        (Progress::Analysed { bytes, .. }, Some(limit)) if bytes > limit => {
+            Err(ReductionError::Memory { what: what.to_owned(), bytes, limit })
+        }
+        _ => Ok(()),
+    };
+    // Without a count, the factor alone tells whether counting is possible.
+    let analysed = told(if let Wanted::Lowest(count) = wanted { count } else { 0 });
+    progress(analysed);
+    check(analysed)?;
+    let count = match wanted {
+        Wanted::Lowest(count) => count,
+        Wanted::Below(omega_rad_s) => {
+            let below = omega_rad_s * omega_rad_s;
+            let modes = pencil.count_below(below)?;
+            progress(Progress::Counted { modes, below });
+            progress(told(modes));
+            check(told(modes))?;
+            modes
+        }
+    };
+    if count == 0 || count > n {
+        let value = match wanted {
+            Wanted::Lowest(count) => format!("{count} modes"),
+            Wanted::Below(omega_rad_s) => format!("modes below {omega_rad_s} rad/s (there is none)"),
+        };
+        let limit = format!("1 to {n} modes");
+        return Err(ReductionError::ModeCount { what: format!("{what}.modes"), value, limit });
+    }
+    let cutoff = match wanted {
+        Wanted::Lowest(_) => None,
+        Wanted::Below(omega_rad_s) => Some(omega_rad_s * omega_rad_s),
+    };
+    if n < DENSE_BELOW || 3 * count > n {
+        return finish(&pencil, dense(&pencil, count)?);
+    }
+    let mut shift = positive_definite_shift(&pencil)?;
+    for attempt in 0.. {
+        let found = shifted(&pencil, shift, count, cutoff, attempt as u64, progress)?;
+        let squares = &found.omega_squared;
+        let spread = (squares[count - 1] + shift) / (squares[0] + shift);
+        if spread > WIDEST_SPREAD && attempt == 0 {
+            shift = squares[count - 1] / WIDEST_SPREAD.sqrt();
+            continue;
+        }
+        let counted = match cutoff {
+            Some(below) => complete_below_cutoff(&pencil, squares, count, below),
+            None => complete_below_gap(&pencil, squares, count, progress),
+        };
+        match counted {
+            Ok(()) => return finish(&pencil, found.first(count)),
+            // Another start vector, before giving up.
+            Err(ReductionError::MissedModes { .. }) if attempt < 3 => {}
+            Err(error) => return Err(error),
+        }
+    }
+    unreachable!("the loop ends by returning");
+}
+
+/// Modes before their residuals are known.
+struct Found {
+    omega_squared: Vec<f64>,
+    phi: Mat<f64>,
+}
+
+impl Found {
+    fn first(self, count: usize) -> Self {
+        Self { omega_squared: self.omega_squared[..count].to_vec(), phi: self.phi.subcols(0, count).to_owned() }
+    }
+}
+
+/// The smallest of a few shifts that make `K + s M` positive definite, rad²/s².
+fn positive_definite_shift(pencil: &Pencil<'_>) -> Result<f64, ReductionError> {
+    let trace = |matrix: &SparseMatrix| entries(matrix).filter(|e| e.0 == e.1).map(|e| e.2.abs()).sum::<f64>();
+    let typical = (trace(pencil.stiffness) / trace(pencil.mass)).max(f64::MIN_POSITIVE);
+    let mut shift = typical * 1e-8;
+    while shift < typical * 1e5 {
+        if pencil.llt(shift)?.is_some() {
+            return Ok(shift);
+        }
+        shift *= 100.0;
+    }
+    Err(ReductionError::NoShift { what: pencil.what.to_owned(), value: shift })
+}
+
+/// All modes by a dense solve, for small systems.
+fn dense(pencil: &Pencil<'_>, count: usize) -> Result<Found, ReductionError> {
+    let whitening = whiten(&format!("{}.mass", pencil.what), pencil.mass.to_dense().as_ref())?;
+    let stiffness = pencil.stiffness.to_dense();
+    let (squares, vectors) = symmetric_eigen(pencil.what, whitening.congruence(stiffness.as_ref(), true).as_ref())?;
+    let mut phi = vectors.subcols(0, count).to_owned();
+    whitening.back(&mut phi);
+    Ok(Found { omega_squared: squares[..count].to_vec(), phi })
+}
+
+/// Converged modes by Lanczos on `L⁻¹ M L⁻ᵀ`: `count` of them, and some more up to a gap where no cut-off is given.
+fn shifted(
+    pencil: &Pencil<'_>,
+    shift: f64,
+    count: usize,
+    cutoff: Option<f64>,
+    seed: u64,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<Found, ReductionError> {
+    let n = pencil.dimension();
+    let no_shift = || ReductionError::NoShift { what: pencil.what.to_owned(), value: shift };
+    let factor = pencil.llt(shift)?.ok_or_else(no_shift)?;
+    progress(Progress::Factored { shift });
+    let square = |theta: f64| 1.0 / theta - shift;
+    let iteration = Iteration {
+        what: pencil.what,
+        dimension: n,
+        count,
+        capacity: capacity(n, count),
+        residual_limit: RESIDUAL_LIMIT,
+        seed,
+    };
+    let enough = |theta: &[f64]| match cutoff {
+        Some(_) => theta.len() >= count,
+        None => {
+            let squares: Vec<f64> = theta.iter().map(|&theta| square(theta)).collect();
+            gap_after(&squares, count).is_some()
+        }
+    };
+    let largest = iteration.run(
+        &|y| factor.whiten(&times(pencil.mass, factor.unwhiten(y).as_ref())),
+        &enough,
+        &mut |vectors, converged| progress(Progress::Iterated { vectors, converged, wanted: count }),
+    )?;
+    let mut phi = factor.unwhiten(largest.vectors);
+    for (k, theta) in largest.theta.iter().enumerate() {
+        phi.col_mut(k).iter_mut().for_each(|value| *value /= theta.sqrt());
+    }
+    Ok(Found { omega_squared: largest.theta.into_iter().map(square).collect(), phi })
+}
+
+/// Compares the modes found below a gap with the inertia of `K - σ M` there.
+fn complete_below_gap(
+    pencil: &Pencil<'_>,
+    squares: &[f64],
+    count: usize,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<(), ReductionError> {
+    let missed = |found, counted, below| {
+        Err(ReductionError::MissedModes { what: pencil.what.to_owned(), found, counted, below })
+    };
+    let Some(found) = gap_after(squares, count) else { return missed(squares.len(), 0, f64::NAN) };
+    let below = 0.5 * (squares[found - 1] + squares[found]);
+    let counted = pencil.count_below(below)?;
+    progress(Progress::Counted { modes: counted, below });
+    if counted == found { Ok(()) } else { missed(found, counted, below) }
+}
+
+/// That the `count` lowest modes found are those which the inertia of `K - σ M` counted below the cut-off `σ`: one
+/// missed below would let one from above in.
+fn complete_below_cutoff(pencil: &Pencil<'_>, squares: &[f64], count: usize, below: f64) -> Result<(), ReductionError> {
+    let found = squares.iter().filter(|square| **square < below + GAP * below.abs()).count();
+    if found >= count {
+        return Ok(());
+    }
+    Err(ReductionError::MissedModes { what: pencil.what.to_owned(), found, counted: count, below })
+}
+
+/// The smallest number of values, at least `count`, after which a gap follows.
+fn gap_after(squares: &[f64], count: usize) -> Option<usize> {
+    let largest = squares.iter().fold(0.0, |largest: f64, square| largest.max(square.abs()));
+    (count..squares.len()).find(|&k| squares[k] - squares[k - 1] > GAP * squares[k].abs().max(1e-6 * largest))
+}
+
+/// Signs, and the residual of every mode in explicit arithmetic.
+fn finish(pencil: &Pencil<'_>, found: Found) -> Result<SparseModes, ReductionError> {
+    let Found { omega_squared, mut phi } = found;
+    fix_signs(&mut phi);
+    let (stiffness, mass) = (one_norm(pencil.stiffness), one_norm(pencil.mass));
+    let mut residual = times(pencil.stiffness, phi.as_ref());
+    let inertia = times(pencil.mass, phi.as_ref());
+    let mut residuals = vec![];
+    for (mode, &square) in omega_squared.iter().enumerate() {
+        let mut column = residual.col_mut(mode);
+        column -= faer::Scale(square) * inertia.col(mode);
+        let value = column.norm_l2() / ((stiffness + square.abs() * mass) * phi.col(mode).norm_l2());
+        if value.is_nan() || value > BACKWARD_LIMIT {
+            return Err(ReductionError::Residual { what: pencil.what.to_owned(), mode, value, limit: BACKWARD_LIMIT });
+        }
+        residuals.push(value);
+    }
+    Ok(SparseModes { omega_squared, phi, residuals })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sparse::{times, weighted_sum};
+    use super::*;
+    use faer::sparse::Triplet;
+
+    /// A square membrane of `side × side` points: `ω² = 4 - 2 cos(pπ/(s+1)) - 2 cos(qπ/(s+1))`, nearly all double.
+    fn membrane(side: usize, mass_of: f64) -> (SparseMatrix, SparseMatrix, Vec<f64>) {
+        let at = |x: usize, y: usize| x * side + y;
+        let (mut stiffness, mut mass, mut expected) = (vec![], vec![], vec![]);
+        for x in 0..side {
+            for y in 0..side {
+                stiffness.push(Triplet::new(at(x, y), at(x, y), 4.0));
+                mass.push(Triplet::new(at(x, y), at(x, y), mass_of));
+                for (x2, y2) in [(x + 1, y), (x, y + 1)] {
+                    if x2 < side && y2 < side {
+                        stiffness.push(Triplet::new(at(x, y), at(x2, y2), -1.0));
+                        stiffness.push(Triplet::new(at(x2, y2), at(x, y), -1.0));
+                    }
+                }
+                let half = |k: usize| 2.0 - 2.0 * ((k + 1) as f64 * std::f64::consts::PI / (side + 1) as f64).cos();
+                expected.push((half(x) + half(y)) / mass_of);
+            }
+        }
+        expected.sort_by(f64::total_cmp);
+        let n = side * side;
+        let build = |t: &[_]| SparseMatrix::try_new_from_triplets(n, n, t).unwrap();
+        (build(&mass), build(&stiffness), expected)
+    }
+
+    #[test]
+    fn double_frequencies_of_a_square_membrane() {
+        let (mass, stiffness, expected) = membrane(30, 1e-7);
+        let modes = lowest_modes("system", &mass, &stiffness, 40).unwrap();
+        for (found, expected) in modes.omega_squared.iter().zip(&expected) {
+            assert!((found / expected - 1.0).abs() < 1e-11, "{found} {expected}");
+        }
+        let gram = modes.phi.transpose() * times(&mass, modes.phi.as_ref());
+        assert!((gram - Mat::<f64>::identity(40, 40)).norm_max() < 1e-12);
+        let inertia = times(&mass, modes.phi.as_ref());
+        let stiff = times(&stiffness, modes.phi.as_ref());
+        let residual = Mat::from_fn(900, 40, |i, k| stiff[(i, k)] - modes.omega_squared[k] * inertia[(i, k)]);
+        // `A r` grows by the norm of K, 8, over what the iteration tolerates.
+        assert!(residual.norm_max() < 8.0 * 1e-10 * modes.phi.norm_max(), "{:e}", residual.norm_max());
+    }
+
+    #[test]
+    fn a_free_and_an_unstable_membrane() {
+        let (mass, stiffness, expected) = membrane(25, 2.0);
+        // Lowered by a multiple of the mass: the first modes become negative, one of them zero.
+        let lowered = weighted_sum(625, &[(1.0, &stiffness), (-expected[3], &mass)]).unwrap();
+        let modes = lowest_modes("system", &mass, &lowered, 12).unwrap();
+        for (found, expected_here) in modes.omega_squared.iter().zip(&expected) {
+            assert!((found - (expected_here - expected[3])).abs() < 1e-11, "{found}");
+        }
+    }
+
+    #[test]
+    fn modes_below_a_cut_off_are_counted_first() {
+        let (mass, stiffness, expected) = membrane(30, 1e-7);
+        // Between the 17th and the 18th, which are one pair apart from the rest; rad/s.
+        let cutoff = (0.5 * (expected[16] + expected[17])).sqrt();
+        let below = expected.iter().filter(|square| **square < cutoff * cutoff).count();
+        let mut told = vec![];
+        let modes = normal_modes("pad", &mass, &stiffness, Wanted::Below(cutoff), None, &mut |p| told.push(p)).unwrap();
+        assert_eq!(modes.omega_squared.len(), below);
+        assert!(modes.residuals.iter().all(|residual| *residual < 1e-12));
+        assert!(told.contains(&Progress::Counted { modes: below, below: cutoff * cutoff }), "{told:?}");
+        let none = normal_modes("pad", &mass, &stiffness, Wanted::Below(1.0), None, &mut |_| {}).unwrap_err();
+        assert_eq!(
+            none.to_string(),
+            "pad.modes: modes below 1 rad/s (there is none) asked for, expected 1 to 900 modes"
+        );
+    }
+
+    #[test]
+    fn more_memory_than_allowed_is_refused_before_the_work() {
+        let (mass, stiffness, _) = membrane(30, 1e-7);
+        let mut told = vec![];
+        let refused = normal_modes("disc", &mass, &stiffness, Wanted::Lowest(40), Some(1 << 20), &mut |p| told.push(p));
+        let Err(ReductionError::Memory { bytes, limit, .. }) = refused else { panic!("{refused:?}") };
+        // At least the basis of 3·40 + 48 vectors of 900 numbers.
+        assert!(bytes > 168 * 900 * 8 && limit == 1 << 20, "{bytes} {limit}");
+        assert!(matches!(told[..], [Progress::Analysed { .. }]), "{told:?}");
+    }
+
+    #[test]
+    fn small_systems_go_the_dense_way() {
+        let (mass, stiffness, expected) = membrane(5, 0.5);
+        let modes = lowest_modes("system", &mass, &stiffness, 25).unwrap();
+        for (found, expected) in modes.omega_squared.iter().zip(&expected) {
+            assert!((found / expected - 1.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn an_indefinite_or_unsymmetric_matrix_is_named() {
+        let (mut mass, stiffness, _) = membrane(25, 2.0);
+        mass.val_mut()[7] = -1.0;
+        assert_eq!(
+            lowest_modes("system", &mass, &stiffness, 12).unwrap_err(),
+            ReductionError::Indefinite { what: "system.mass".into(), row: 7, value: -1.0, limit: 0.0 }
+        );
+        let (mass, mut stiffness, _) = membrane(25, 2.0);
+        stiffness.val_mut()[1] = -1.5;
+        assert!(matches!(
+            lowest_modes("system", &mass, &stiffness, 12).unwrap_err(),
+            ReductionError::Unsymmetric { what, row: 1, column: 0, value, .. } if what == "system.stiffness" && value == -1.5
+        ));
+    }
+}

@@ -1,0 +1,341 @@
+//! `K - σ M` of a sparse symmetric system: analysed once, factored at many shifts.
+
+use faer::dyn_stack::{MemBuffer, MemStack};
+use faer::linalg::cholesky::llt::factor::LltError;
+use faer::sparse::linalg::SupernodalThreshold;
+use faer::sparse::linalg::cholesky::supernodal::{SupernodalLdltRef, SupernodalLltRef, SymbolicSupernodalCholesky};
+use faer::sparse::linalg::cholesky::{
+    CholeskySymbolicParams, LltRef, SymbolicCholesky, SymbolicCholeskyRaw, SymmetricOrdering,
+    factorize_symbolic_cholesky,
+};
+use faer::sparse::{SparseColMat, SparseColMatRef, SymbolicSparseColMat};
+use faer::{Conj, Mat, MatMut, Par, Side};
+
+use super::ordering::nested_dissection;
+use super::sparse::{entries, worst_asymmetry};
+use super::{DEFINITE_TOLERANCE, ReductionError, SparseMatrix};
+
+/// Steps of the Lanczos recurrence that looks for the smallest eigenvalue of a scaled mass matrix.
+const MASS_STEPS: usize = 40;
+/// A scaled mass matrix whose smallest eigenvalue is found above this needs no factorisation to be told definite.
+const CLEARLY_DEFINITE: f64 = 1e-3;
+
+/// A symmetric pencil `K - σ M`: lower triangles on one pattern, ordered and analysed.
+pub(super) struct Pencil<'a> {
+    pub what: &'a str,
+    pub mass: &'a SparseMatrix,
+    pub stiffness: &'a SparseMatrix,
+    pattern: SymbolicSparseColMat<usize>,
+    lower_mass: Vec<f64>,
+    lower_stiffness: Vec<f64>,
+    symbolic: SymbolicCholesky<usize>,
+}
+
+impl<'a> Pencil<'a> {
+    /// Checks both matrices, orders their common pattern by nested dissection and analyses it.
+    pub(super) fn new(
+        what: &'a str,
+        mass: &'a SparseMatrix,
+        stiffness: &'a SparseMatrix,
+    ) -> Result<Self, ReductionError> {
+        let n = mass.nrows();
+        check("mass", what, mass, n)?;
+        check("stiffness", what, stiffness, n)?;
+        let (mut starts, mut rows) = (vec![0], vec![]);
+        let (mut lower_mass, mut lower_stiffness) = (vec![], vec![]);
+        for column in 0..n {
+            merge(mass, stiffness, column, |row, m, k| {
+                if row >= column {
+                    rows.push(row);
+                    lower_mass.push(m);
+                    lower_stiffness.push(k);
+                }
+            });
+            starts.push(rows.len());
+        }
+        let pattern = SymbolicSparseColMat::new_checked(n, n, starts, None, rows);
+        let failed = |reason| ReductionError::Factorisation { what: what.to_owned(), reason };
+        let order = nested_dissection(n, &|row, out: &mut Vec<usize>| {
+            out.clear();
+            merge(mass, stiffness, row, |other, _, _| out.push(other));
+        })
+        .map_err(failed)?;
+        let symbolic = factorize_symbolic_cholesky(
+            pattern.as_ref(),
+            Side::Lower,
+            SymmetricOrdering::Custom(order.as_ref()),
+            CholeskySymbolicParams {
+                supernodal_flop_ratio_threshold: SupernodalThreshold::FORCE_SUPERNODAL,
+                ..Default::default()
+            },
+        )
+        .map_err(|error| failed(format!("symbolic analysis failed: {error:?}")))?;
+        let pencil = Self { what, mass, stiffness, pattern, lower_mass, lower_stiffness, symbolic };
+        pencil.check_mass()?;
+        Ok(pencil)
+    }
+
+    pub(super) fn dimension(&self) -> usize {
+        self.mass.nrows()
+    }
+
+    /// Numbers the factor holds.
+    pub(super) fn factor_entries(&self) -> usize {
+        self.symbolic.len_val()
+    }
+
+    /// Bytes a factorisation needs: the factor, the shifted matrix, and what faer works in.
+    pub(super) fn factor_bytes(&self) -> usize {
+        let float = size_of::<f64>();
+        let llt = self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default());
+        let ldlt = self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default());
+        float * (self.factor_entries() + self.lower_mass.len()) + llt.size_bytes().max(ldlt.size_bytes())
+    }
+
+    /// Bytes held already: both matrices as they came, and their lower triangles here.
+    pub(super) fn held_bytes(&self) -> usize {
+        let entry = size_of::<usize>() + size_of::<f64>();
+        entry * (self.mass.compute_nnz() + self.stiffness.compute_nnz())
+            + (entry + size_of::<f64>()) * self.lower_mass.len()
+    }
+
+    /// The lower triangle of `k K + m M`.
+    fn sum(&self, k: f64, m: f64) -> Vec<f64> {
+        self.lower_stiffness.iter().zip(&self.lower_mass).map(|(stiffness, mass)| k * stiffness + m * mass).collect()
+    }
+
+    /// `K + s M = L Lᵀ`; `None` where that is not positive definite.
+    pub(super) fn llt(&self, shift: f64) -> Result<Option<Llt<'_>>, ReductionError> {
+        let lower = self.sum(1.0, shift);
+        let mut values = self.room(self.symbolic.len_val())?;
+        let mut memory =
+            MemBuffer::new(self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default()));
+        let result = self.symbolic.factorize_numeric_llt(
+            &mut values,
+            SparseColMatRef::new(self.pattern.as_ref(), &lower),
+            Side::Lower,
+            Default::default(),
+            Par::Seq,
+            MemStack::new(&mut memory),
+            Default::default(),
+        );
+        match result.map(|_| ()) {
+            Ok(()) => Ok(Some(Llt { symbolic: &self.symbolic, values })),
+            Err(LltError::NonPositivePivot { .. }) => Ok(None),
+        }
+    }
+
+    /// How many `ω²` lie below `square`: negative pivots of `K - σ M = L D Lᵀ` (Sylvester's law of inertia).
+    pub(super) fn count_below(&self, square: f64) -> Result<usize, ReductionError> {
+        let pivots = self.pivots(&self.sum(1.0, -square))?;
+        match pivots.iter().find(|(_, pivot)| !pivot.is_finite()) {
+            Some((row, pivot)) => Err(self.failed(format!("L D Lᵀ gave the pivot {pivot} at row {row}"))),
+            None => Ok(pivots.iter().filter(|(_, pivot)| *pivot < 0.0).count()),
+        }
+    }
+
+    /// The pivots of `L D Lᵀ`, each with the row it belongs to.
+    fn pivots(&self, lower: &[f64]) -> Result<Vec<(usize, f64)>, ReductionError> {
+        let mut values = self.room(self.symbolic.len_val())?;
+        let mut memory =
+            MemBuffer::new(self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default()));
+        self.symbolic
+            .factorize_numeric_ldlt(
+                &mut values,
+                SparseColMatRef::new(self.pattern.as_ref(), lower),
+                Side::Lower,
+                Default::default(),
+                Par::Seq,
+                MemStack::new(&mut memory),
+                Default::default(),
+            )
+            .map_err(|error| self.failed(format!("L D Lᵀ met a zero pivot: {error:?}")))?;
+        let forward = forward(&self.symbolic);
+        let supernodes = supernodal(&self.symbolic);
+        let factor = SupernodalLdltRef::new(supernodes, &values);
+        let mut pivots = Vec::with_capacity(self.dimension());
+        for s in 0..supernodes.n_supernodes() {
+            let (start, block) = (factor.supernode(s).start(), factor.supernode(s).val());
+            pivots.extend((0..block.ncols()).map(|k| (forward[start + k], block[(k, k)])));
+        }
+        Ok(pivots)
+    }
+
+    /// That `M` is positive definite. A mesh's mass matrix, scaled to a unit diagonal, has eigenvalues well away from
+    /// zero, which a short Lanczos recurrence shows; only where it does not, `M` is factored.
+    fn check_mass(&self) -> Result<(), ReductionError> {
+        let what = format!("{}.mass", self.what);
+        let diagonal: Vec<f64> =
+            (0..self.dimension()).map(|row| self.mass.as_ref().get(row, row).copied().unwrap_or(0.0)).collect();
+        if let Some((row, &value)) = diagonal.iter().enumerate().find(|(_, value)| **value <= 0.0) {
+            return Err(ReductionError::Indefinite { what, row, value, limit: 0.0 });
+        }
+        if smallest_scaled(self.mass, &diagonal).is_some_and(|smallest| smallest > CLEARLY_DEFINITE) {
+            return Ok(());
+        }
+        for (row, value) in self.pivots(&self.sum(0.0, 1.0))? {
+            let limit = DEFINITE_TOLERANCE * diagonal[row];
+            if value.is_nan() || value <= limit {
+                return Err(ReductionError::Indefinite { what, row, value, limit });
+            }
+        }
+        Ok(())
+    }
+
+    /// Zeros, if there is memory for them.
+    fn room(&self, length: usize) -> Result<Vec<f64>, ReductionError> {
+        let mut values = vec![];
+        values
+            .try_reserve_exact(length)
+            .map_err(|_| self.failed(format!("no memory for a factor of {length} numbers")))?;
+        values.resize(length, 0.0);
+        Ok(values)
+    }
+
+    fn failed(&self, reason: String) -> ReductionError {
+        ReductionError::Factorisation { what: self.what.to_owned(), reason }
+    }
+}
+
+/// `P (K + s M) Pᵀ = L Lᵀ`.
+pub(super) struct Llt<'a> {
+    symbolic: &'a SymbolicCholesky<usize>,
+    values: Vec<f64>,
+}
+
+impl Llt<'_> {
+    fn supernodal(&self) -> SupernodalLltRef<'_, usize, f64> {
+        SupernodalLltRef::new(supernodal(self.symbolic), &self.values)
+    }
+
+    fn memory(&self, columns: usize) -> MemBuffer {
+        MemBuffer::new(self.symbolic.solve_in_place_scratch::<f64>(columns, Par::Seq))
+    }
+
+    /// `A⁻¹ B` in place.
+    pub(super) fn solve(&self, rhs: MatMut<'_, f64>) {
+        let mut memory = self.memory(rhs.ncols());
+        LltRef::new(self.symbolic, &self.values).solve_in_place_with_conj(
+            Conj::No,
+            rhs,
+            Par::Seq,
+            MemStack::new(&mut memory),
+        );
+    }
+
+    /// `L⁻¹ P X`.
+    pub(super) fn whiten(&self, x: &Mat<f64>) -> Mat<f64> {
+        let forward = forward(self.symbolic);
+        let mut y = Mat::from_fn(x.nrows(), x.ncols(), |i, j| x[(forward[i], j)]);
+        let mut memory = self.memory(y.ncols());
+        self.supernodal().l_solve_with_conj(Conj::No, y.as_mut(), Par::Seq, MemStack::new(&mut memory));
+        y
+    }
+
+    /// `Pᵀ L⁻ᵀ Y`.
+    pub(super) fn unwhiten(&self, mut y: Mat<f64>) -> Mat<f64> {
+        let mut memory = self.memory(y.ncols());
+        self.supernodal().l_transpose_solve_with_conj(Conj::No, y.as_mut(), Par::Seq, MemStack::new(&mut memory));
+        let mut x = Mat::zeros(y.nrows(), y.ncols());
+        for (position, &row) in forward(self.symbolic).iter().enumerate() {
+            for column in 0..y.ncols() {
+                x[(row, column)] = y[(position, column)];
+            }
+        }
+        x
+    }
+}
+
+/// The row that is eliminated at each position.
+fn forward(symbolic: &SymbolicCholesky<usize>) -> &[usize] {
+    symbolic.perm().expect("a permutation was given").arrays().0
+}
+
+fn supernodal(symbolic: &SymbolicCholesky<usize>) -> &SymbolicSupernodalCholesky<usize> {
+    match symbolic.raw() {
+        SymbolicCholeskyRaw::Supernodal(symbolic) => symbolic,
+        SymbolicCholeskyRaw::Simplicial(_) => unreachable!("supernodes were asked for"),
+    }
+}
+
+fn check(field: &str, what: &str, matrix: &SparseMatrix, n: usize) -> Result<(), ReductionError> {
+    let what = format!("{what}.{field}");
+    let (rows, columns) = matrix.shape();
+    if rows != n || columns != n || n == 0 {
+        return Err(ReductionError::Shape { what, rows, columns, expected: n.max(1) });
+    }
+    if let Some((row, column, value)) = entries(matrix).find(|(_, _, value)| !value.is_finite()) {
+        return Err(ReductionError::NotFinite { what, row, column, value });
+    }
+    match worst_asymmetry(matrix) {
+        None => Ok(()),
+        Some((row, column, value, mirrored, limit)) => {
+            Err(ReductionError::Unsymmetric { what, row, column, value, mirrored, limit })
+        }
+    }
+}
+
+/// Every place of a column where either matrix has an entry, ascending: row, entry of `a`, entry of `b`.
+fn merge(
+    a: &SparseColMat<usize, f64>,
+    b: &SparseColMat<usize, f64>,
+    column: usize,
+    mut each: impl FnMut(usize, f64, f64),
+) {
+    let (a, b) = (a.as_ref(), b.as_ref());
+    let mut left = a.row_idx_of_col(column).zip(a.val_of_col(column)).peekable();
+    let mut right = b.row_idx_of_col(column).zip(b.val_of_col(column)).peekable();
+    loop {
+        match (left.peek().copied(), right.peek().copied()) {
+            (Some((i, x)), Some((j, y))) if i == j => {
+                each(i, *x, *y);
+                left.next();
+                right.next();
+            }
+            (Some((i, x)), other) if other.is_none_or(|(j, _)| i < j) => {
+                each(i, *x, 0.0);
+                left.next();
+            }
+            (_, Some((j, y))) => {
+                each(j, 0.0, *y);
+                right.next();
+            }
+            (_, None) => return,
+        }
+    }
+}
+
+/// A lower estimate of the smallest eigenvalue of `D^-1/2 A D^-1/2`, `D` the diagonal of `A`: the smallest Ritz value
+/// less its residual. `None` where the recurrence found no positive one.
+fn smallest_scaled(matrix: &SparseMatrix, diagonal: &[f64]) -> Option<f64> {
+    let n = diagonal.len();
+    let scale: Vec<f64> = diagonal.iter().map(|value| value.sqrt().recip()).collect();
+    let mut vector = super::lanczos::random_block(n, 1, 1);
+    let norm = vector.norm_l2();
+    vector *= faer::Scale(1.0 / norm);
+    let (mut previous, mut beta) = (Mat::<f64>::zeros(n, 1), 0.0);
+    let mut tridiagonal = Mat::<f64>::zeros(0, 0);
+    for step in 0..MASS_STEPS.min(n) {
+        let mut next = super::sparse::times(matrix, Mat::from_fn(n, 1, |i, _| scale[i] * vector[(i, 0)]).as_ref());
+        for i in 0..n {
+            next[(i, 0)] = scale[i] * next[(i, 0)] - beta * previous[(i, 0)];
+        }
+        let alpha = (vector.transpose() * &next)[(0, 0)];
+        next -= faer::Scale(alpha) * &vector;
+        tridiagonal.resize_with(step + 1, step + 1, |_, _| 0.0);
+        tridiagonal[(step, step)] = alpha;
+        if step > 0 {
+            tridiagonal[(step, step - 1)] = beta;
+            tridiagonal[(step - 1, step)] = beta;
+        }
+        beta = next.norm_l2();
+        if beta < 1e-12 {
+            beta = 0.0;
+            break;
+        }
+        previous = std::mem::replace(&mut vector, faer::Scale(1.0 / beta) * next);
+    }
+    let (values, vectors) = super::dense::symmetric_eigen("mass", tridiagonal.as_ref()).ok()?;
+    let last = tridiagonal.nrows() - 1;
+    (values[0] > 0.0).then(|| values[0] - beta * vectors[(last, 0)].abs())
+}
