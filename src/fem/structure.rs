@@ -77,12 +77,10 @@ impl Structure {
             row_of[node][direction] = Some(row);
         }
         let neighbours = self.neighbours()?;
-        let mut stiffness = Symmetric::new(&rows, |(node, _)| {
+        let pattern = |(node, _): (usize, usize)| -> Vec<usize> {
             neighbours[node].iter().flat_map(|&other| row_of[other]).flatten().collect()
-        });
-        let mut mass = Symmetric::new(&rows, |(node, direction)| {
-            neighbours[node].iter().filter_map(|&other| row_of[other][direction]).collect()
-        });
+        };
+        let (mut stiffness, mut mass) = (Symmetric::new(&rows, pattern), Symmetric::new(&rows, pattern));
         for (index, element) in self.mesh.bricks.iter().enumerate() {
             let component = &self.mesh.components[element.component];
             let matrices = brick(&self.mesh.corners_m(element), &component.material)
@@ -101,9 +99,7 @@ impl Structure {
                         for (e, column) in row_of[other].into_iter().enumerate() {
                             let Some(column) = column.filter(|&column| column <= row) else { continue };
                             stiffness.add(row, column, weight * share * matrices.stiffness[3 * a + d][3 * b + e]);
-                            if d == e {
-                                mass.add(row, column, weight * share * matrices.mass[a][b]);
-                            }
+                            mass.add(row, column, weight * share * matrices.mass[3 * a + d][3 * b + e]);
                         }
                     }
                 }
@@ -210,5 +206,164 @@ impl Symmetric {
         }
         let pattern = SymbolicSparseColMat::new_checked(n, n, self.starts, None, self.rows);
         SparseMatrix::new(pattern, self.values)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{PI, TAU};
+
+    use faer::Mat;
+
+    use super::*;
+    use crate::fem::{Extent, Material, SOLID, stations};
+    use crate::reduction::lowest_modes;
+
+    const STEEL: Material = Material { density_kg_per_m3: 7800.0, young_pa: 210e9, poisson: 0.27 };
+
+    /// A coarse box with a finer one on it, whose lower nodes hang, every inner node pushed aside.
+    fn two_boxes() -> Structure {
+        let mut mesh = Mesh::default();
+        let steel = mesh.add_component("steel", STEEL);
+        let push = |[x, y, z]: [f64; 3]| {
+            let bump = 0.05 * (PI * x).sin() * (PI * z).sin() * (PI * (y + 1.0) / 2.0).sin();
+            [x + bump, y - 0.7 * bump, z + 0.4 * bump]
+        };
+        let coarse = stations(&[0.0, 1.0], 0.5);
+        let lines = [coarse.clone(), stations(&[-1.0, 0.0], 0.5), coarse];
+        let below = mesh.add_block(steel, lines, SOLID, &[], push);
+        let fine = stations(&[0.0, 1.0], 0.25);
+        mesh.add_block(steel, [fine.clone(), stations(&[0.0, 1.0], 0.5), fine], SOLID, &[&below], push);
+        assert!(!mesh.hanging.is_empty());
+        Structure { mesh, ..Structure::default() }
+    }
+
+    /// A displacement at every row.
+    fn field(structure: &Structure, rows: &[(usize, usize)], u: impl Fn([f64; 3]) -> [f64; 3]) -> Mat<f64> {
+        Mat::from_fn(rows.len(), 1, |row, _| u(structure.mesh.nodes_m[rows[row].0])[rows[row].1])
+    }
+
+    #[test]
+    fn constant_strain_is_exact_across_hanging_nodes_and_distorted_bricks() {
+        let structure = two_boxes();
+        let Assembled { stiffness, rows, .. } = structure.assemble().unwrap();
+        let gradient = [[1e-3, 2e-4, -3e-4], [5e-4, -8e-4, 1e-4], [2e-4, 6e-4, 4e-4]];
+        let u = field(&structure, &rows, |at| gradient.map(|row| row.iter().zip(at).map(|(g, x)| g * x).sum()));
+        let forces = &stiffness * &u;
+        let largest = forces.norm_max();
+        for (row, &(node, direction)) in rows.iter().enumerate() {
+            let [x, y, z] = structure.mesh.nodes_m[node];
+            let inside = |value: f64, low: f64| value > low + 1e-9 && value < 1.0 - 1e-9;
+            if inside(x, 0.0) && inside(y, -1.0) && inside(z, 0.0) {
+                // Equilibrium within: forces of neighbouring bricks cancel to rounding.
+                assert!(forces[(row, 0)].abs() < 1e-12 * largest, "{node} {direction}: {}", forces[(row, 0)]);
+            }
+        }
+        // ½ ε : D : ε over the volume of 1x2x1.
+        let (lambda, shear) = STEEL.lame_pa();
+        let strain = |i: usize, j: usize| 0.5 * (gradient[i][j] + gradient[j][i]);
+        let trace: f64 = (0..3).map(|i| strain(i, i)).sum();
+        let squares: f64 = (0..9).map(|k| strain(k / 3, k % 3).powi(2)).sum();
+        let expected = (0.5 * lambda * trace * trace + shear * squares) * 2.0;
+        let energy = 0.5 * (u.transpose() * &forces)[(0, 0)];
+        assert!((energy / expected - 1.0).abs() < 1e-12, "{energy} {expected}");
+    }
+
+    #[test]
+    fn a_free_body_has_its_mass_and_six_rigid_motions() {
+        let structure = two_boxes();
+        let Assembled { stiffness, mass, rows } = structure.assemble().unwrap();
+        for direction in 0..3 {
+            let shift = field(&structure, &rows, |_| std::array::from_fn(|d| if d == direction { 1.0 } else { 0.0 }));
+            let total = (shift.transpose() * &mass * &shift)[(0, 0)];
+            assert!((total / (7800.0 * 2.0) - 1.0).abs() < 1e-13, "{total}");
+        }
+        let squares = lowest_modes("boxes", &mass, &stiffness, 7).unwrap().omega_squared;
+        assert!(squares[..6].iter().all(|square| square.abs() < 1e-9 * squares[6]), "{squares:?}");
+    }
+
+    #[test]
+    fn springs_and_supports_hold() {
+        let mut structure = two_boxes();
+        let spring = |node, other, direction| Spring { node, other, direction, stiffness_n_per_m: 3e6 };
+        // A hanging node to the ground, and two corners with each other.
+        let hangs = *structure.mesh.hanging.keys().next().unwrap();
+        structure.springs = vec![spring(hangs, None, 1), spring(0, Some(2), 0)];
+        let before = two_boxes().assemble().unwrap();
+        let Assembled { stiffness, rows, .. } = structure.assemble().unwrap();
+        let u = field(&structure, &rows, |[x, y, z]| [x * x, y + z, 0.0]);
+        let energy = |k: &SparseMatrix| 0.5 * (u.transpose() * k * &u)[(0, 0)];
+        let nodes = &structure.mesh.nodes_m;
+        let [_, y, z] = nodes[hangs];
+        let elongation = nodes[0][0].powi(2) - nodes[2][0].powi(2);
+        let expected = 0.5 * 3e6 * ((y + z).powi(2) + elongation.powi(2));
+        let added = energy(&stiffness) - energy(&before.stiffness);
+        // A difference of energies near 1e11 J, 16 digits each.
+        assert!((added - expected).abs() < 1e-3 && expected > 1e4, "{added} {expected}");
+
+        structure.fixed.insert((1, 2));
+        let held = structure.assemble().unwrap();
+        assert_eq!(held.rows.len(), structure.dof());
+        assert!(!held.rows.contains(&(1, 2)));
+        structure.springs[0].stiffness_n_per_m = -1.0;
+        assert_eq!(structure.assemble().unwrap_err(), FemError::Spring { spring: 0, value: -1.0 });
+        structure.springs.clear();
+        structure.mesh.nodes_m.push([9.0; 3]);
+        let node = structure.mesh.nodes_m.len() - 1;
+        assert_eq!(structure.assemble().unwrap_err(), FemError::Loose { node });
+    }
+
+    /// A strip in plane strain, `length` by `2 half`, held along x at both ends, `pieces` bricks along it and a
+    /// `1/8` of that across: its frequencies, Hz.
+    fn strip_hz(material: Material, length: f64, half: f64, pieces: usize, count: usize) -> Vec<f64> {
+        let mut mesh = Mesh::default();
+        let component = mesh.add_component("strip", material);
+        let lines = [
+            stations(&[0.0, length], length / pieces as f64),
+            stations(&[-half, half], 16.0 * half / pieces as f64),
+            vec![0.0, half],
+        ];
+        let extent = Extent { filled: &|_| true, closed: false };
+        mesh.add_block(component, lines, extent, &[], |at| at);
+        let mut structure = Structure { mesh, ..Structure::default() };
+        for (node, [x, _, _]) in structure.mesh.nodes_m.iter().enumerate() {
+            structure.fixed.insert((node, 2));
+            if *x < 1e-12 || *x > length - 1e-12 {
+                structure.fixed.insert((node, 0));
+            }
+        }
+        let Assembled { stiffness, mass, .. } = structure.assemble().unwrap();
+        let modes = lowest_modes("strip", &mass, &stiffness, count).unwrap();
+        modes.omega_squared.iter().map(|square| square.max(0.0).sqrt() / TAU).collect()
+    }
+
+    #[test]
+    fn frequencies_converge_with_the_square_of_the_spacing() {
+        // Bending of a strip between planes of symmetry: the lowest antisymmetric wave of Rayleigh and Lamb with half a
+        // wavelength in the length, 4 k² P Q tanh(Q h) = (Q² + k²)² tanh(P h), P² = k² - ω²/c_L², Q² = k² - ω²/c_T².
+        let (length, half) = (0.4, 0.025);
+        let (lambda, shear) = STEEL.lame_pa();
+        let k = PI / length;
+        let [longitudinal, transverse] =
+            [lambda + 2.0 * shear, shear].map(|modulus| (modulus / STEEL.density_kg_per_m3).sqrt());
+        let dispersion = |omega: f64| {
+            let [p, q] = [longitudinal, transverse].map(|speed| (k * k - (omega / speed).powi(2)).sqrt());
+            4.0 * k * k * p * q * (q * half).tanh() - (q * q + k * k).powi(2) * (p * half).tanh()
+        };
+        let (mut low, mut high) = (0.01 * k * transverse, 0.99 * k * transverse);
+        assert!(dispersion(low) * dispersion(high) < 0.0);
+        for _ in 0..200 {
+            let middle = 0.5 * (low + high);
+            if dispersion(low) * dispersion(middle) <= 0.0 { high = middle } else { low = middle }
+        }
+        let exact = low / TAU;
+        // The strip also moves up and down as a whole: the second frequency.
+        let errors = [32, 64, 128].map(|pieces| strip_hz(STEEL, length, half, pieces, 2)[1] / exact - 1.0);
+        eprintln!("bending: {exact} Hz, errors {errors:?}");
+        for pair in errors.windows(2) {
+            let order = (pair[0] / pair[1]).log2();
+            assert!((order - 2.0).abs() < 0.1, "order {order}");
+        }
+        assert!(errors[2].abs() < 1e-4, "{errors:?}");
     }
 }

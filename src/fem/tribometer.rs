@@ -92,21 +92,21 @@ impl Default for Dimensions {
             pad_half_z: 0.020,
             pad_height: 0.012,
             pad_holder_half: [0.018, 0.024],
-            pad_holder_height: 0.025,
-            column_half: [0.012, 0.012],
-            sensor_height: 0.030,
-            shank_height: 0.110,
-            bearing_height: 0.050,
-            collar_height: 0.015,
+            pad_holder_height: 0.034,
+            column_half: [0.012, 0.010],
+            sensor_height: 0.024,
+            shank_height: 0.0997,
+            bearing_height: 0.056,
+            collar_height: 0.0085,
             bearing_half_x: 0.018,
-            bearing_depth: 0.018,
-            plate_depth: 0.015,
+            bearing_depth: 0.0343,
+            plate_depth: 0.0094,
             cylinder_half: [0.024, 0.024],
-            cylinder_height: 0.090,
+            cylinder_height: 0.076,
             spring_holder_half: [0.034, 0.034],
             spring_holder_height: 0.015,
             disc_radius: 0.140,
-            disc_thickness: 0.013,
+            disc_thickness: 0.013_48,
             bore_radius: 0.020,
             disc_holder_radius: 0.050,
             disc_holder_height: 0.030,
@@ -131,9 +131,10 @@ pub struct Tribometer {
 }
 
 impl Tribometer {
-    /// The rig in bricks of about `spacing_m` away from the patch.
+    /// The rig in bricks of about `spacing_m` away from the patch; those of the upper part are smaller, for its column is
+    /// thinner than the disc is wide.
     pub fn with_spacing(dimensions: &Dimensions, spacing_m: f64) -> Self {
-        Self { pad: upper_part(dimensions, spacing_m), disc: lower_part(dimensions, spacing_m) }
+        Self { pad: upper_part(dimensions, 0.6 * spacing_m), disc: lower_part(dimensions, spacing_m) }
     }
 
     /// The coarsest rig found with at least `dof` degrees of freedom, both parts together.
@@ -141,7 +142,7 @@ impl Tribometer {
     /// # Errors
     /// [`FemError::Size`] below what the coarsest mesh has.
     pub fn with_dof(dimensions: &Dimensions, dof: usize) -> Result<Self, FemError> {
-        let (mut coarse, mut fine) = (0.06, 0.06);
+        let (mut coarse, mut fine) = (0.1, 0.1);
         let mut found = Self::with_spacing(dimensions, fine);
         let least = found.dof() / 1000 * 1000;
         if dof < least {
@@ -255,14 +256,15 @@ fn upper_part(d: &Dimensions, spacing: f64) -> Part {
 
     let mut mesh = Mesh::default();
     // A box of half widths along x, between two levels and two depths, on the ones before it.
-    let mut add = |name: &str, material, half_x: f64, [low, high]: [usize; 2], [front, back]: [f64; 2], on: &[&Block]| {
-        let component = mesh.add_component(name, material);
-        let lines = match name {
-            "pad" => [pad_x.clone(), between(&y, levels[low], levels[high]), pad_z.clone()],
-            _ => [between(&x, -half_x, half_x), between(&y, levels[low], levels[high]), between(&z, front, back)],
+    let mut add =
+        |name: &str, material, half_x: f64, [low, high]: [usize; 2], [front, back]: [f64; 2], on: &[&Block]| {
+            let component = mesh.add_component(name, material);
+            let lines = match name {
+                "pad" => [pad_x.clone(), between(&y, levels[low], levels[high]), pad_z.clone()],
+                _ => [between(&x, -half_x, half_x), between(&y, levels[low], levels[high]), between(&z, front, back)],
+            };
+            mesh.add_block(component, lines, SOLID, on, |[x, y, z]| [MEAN_RADIUS_M + x, y, z])
         };
-        mesh.add_block(component, lines, SOLID, on, |[x, y, z]| [MEAN_RADIUS_M + x, y, z])
-    };
     let around = |half: [f64; 2]| [-half[1], half[1]];
     let [column_x, column_z] = d.column_half;
     let pad_holder = add("pad-holder", PAD_HOLDER, d.pad_holder_half[0], [1, 2], around(d.pad_holder_half), &[]);
@@ -299,9 +301,12 @@ fn join_cylinder(structure: &mut Structure, cylinder: &Block, holder: &Block, he
             let middle = x == 0.0 && z == 0.0;
             let stiffness = if middle { [0.0, MIDDLE_SPRING_N_PER_M, 0.0] } else { EDGE_SPRING_N_PER_M };
             let along = stiffness.into_iter().enumerate().filter(|(_, stiffness)| *stiffness > 0.0);
-            structure.springs.extend(
-                along.map(|(direction, stiffness_n_per_m)| Spring { node, other, direction, stiffness_n_per_m }),
-            );
+            structure.springs.extend(along.map(|(direction, stiffness_n_per_m)| Spring {
+                node,
+                other,
+                direction,
+                stiffness_n_per_m,
+            }));
         }
     }
 }
@@ -328,9 +333,12 @@ fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], h
                 let node = plate.node([i, j, back]);
                 structure.fixed.insert((node, 1));
                 let stiffness_n_per_m = GROUND_SPRING_N_PER_M * width * height / area;
-                structure.springs.extend(
-                    [0, 2].map(|direction| Spring { node, other: None, direction, stiffness_n_per_m }),
-                );
+                structure.springs.extend([0, 2].map(|direction| Spring {
+                    node,
+                    other: None,
+                    direction,
+                    stiffness_n_per_m,
+                }));
             }
         }
     }
@@ -349,8 +357,7 @@ fn lower_part(d: &Dimensions, spacing: f64) -> Part {
         lines.extend(divided(last, last + margin, cells));
         lines.iter().map(|line| line * scale).collect::<Vec<f64>>()
     };
-    let fine_r: Vec<f64> =
-        with_margins(&patch_x, d.margin[0], 1.0).iter().map(|line| MEAN_RADIUS_M + line).collect();
+    let fine_r: Vec<f64> = with_margins(&patch_x, d.margin[0], 1.0).iter().map(|line| MEAN_RADIUS_M + line).collect();
     let fine_angle = with_margins(&patch_z, d.margin[1], 1.0 / MEAN_RADIUS_M);
     let ([inner, outer], [start, end]) = (ends(&fine_r), ends(&fine_angle));
 
@@ -425,9 +432,97 @@ mod tests {
     use super::*;
     use crate::reduction::lowest_modes;
 
+    /// The `count` lowest natural frequencies, Hz, by this crate's own modes.
     fn frequencies_hz(structure: &Structure, count: usize) -> Vec<f64> {
         let assembled = structure.assemble().unwrap();
-        let modes = lowest_modes("part", &assembled.mass, &assembled.stiffness, count).unwrap();
+        let modes = lowest_modes("structure", &assembled.mass, &assembled.stiffness, count).unwrap();
         modes.omega_squared.iter().map(|square| square.sqrt() / TAU).collect()
+    }
+
+    #[test]
+    fn the_first_frequencies_of_the_default_size_are_the_published_ones() {
+        // Table 3 of the paper, within the 1 % that the dimensions were tuned for.
+        let tribometer = Tribometer::with_dof(&Dimensions::default(), 20_000).unwrap();
+        let whole = tribometer.at_rest(CONTACT_STIFFNESS_N_PER_M);
+        for (what, structure, published_hz) in [
+            ("upper part", &tribometer.pad.structure, 331.44),
+            ("lower part", &tribometer.disc.structure, 1300.6),
+            ("whole at rest", &whole, 510.91),
+        ] {
+            let found = frequencies_hz(structure, 3);
+            eprintln!("{what}: {found:.2?} Hz, published {published_hz}");
+            assert!((found[0] / published_hz - 1.0).abs() < 0.01, "{what}: {} Hz, not {published_hz}", found[0]);
+        }
+    }
+
+    #[test]
+    fn the_same_294_pairs_coincide_at_any_size() {
+        let dimensions = Dimensions::default();
+        let mut places: Option<Vec<[f64; 3]>> = None;
+        for dof in [5_000, 20_000, 100_000] {
+            let tribometer = Tribometer::with_dof(&dimensions, dof).unwrap();
+            assert!((dof..dof + dof / 4).contains(&tribometer.dof()), "{} for {dof}", tribometer.dof());
+            let at = |part: &Part| -> Vec<[f64; 3]> {
+                let mesh = &part.structure.mesh;
+                assert!(part.interface.iter().all(|node| !mesh.hanging.contains_key(node)));
+                part.interface.iter().map(|&node| mesh.nodes_m[node]).collect()
+            };
+            let (pad, disc) = (at(&tribometer.pad), at(&tribometer.disc));
+            assert_eq!(pad.len(), 294);
+            for (a, b) in pad.iter().zip(&disc) {
+                assert!((0..3).all(|axis| (a[axis] - b[axis]).abs() < 1e-12), "{a:?} {b:?}");
+            }
+            let first = places.get_or_insert_with(|| pad.clone());
+            assert!(pad.iter().flatten().zip(first.iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-12));
+        }
+    }
+
+    #[test]
+    fn the_mass_is_that_of_boxes_and_rings() {
+        // Density times volume of each component, by hand; the polar mesh cuts the corners of its rings.
+        let d = Dimensions::default();
+        let tribometer = Tribometer::with_dof(&d, 20_000).unwrap();
+        let mass_kg = |part: &Part, name: &str| -> f64 {
+            let mesh = &part.structure.mesh;
+            let of_it = |brick: &&super::super::Brick| mesh.components[brick.component].name == name;
+            mesh.bricks
+                .iter()
+                .filter(of_it)
+                .map(|brick| {
+                    let material = &mesh.components[brick.component].material;
+                    let matrices = super::super::brick(&mesh.corners_m(brick), material).unwrap();
+                    // Moved as a whole along x, y and z.
+                    (0..24)
+                        .flat_map(|i| (i % 3..24).step_by(3).map(move |j| (i, j)))
+                        .map(|(i, j)| matrices.mass[i][j])
+                        .sum::<f64>()
+                        / 3.0
+                })
+                .sum()
+        };
+        let box_of = |[x, z]: [f64; 2], height: f64| 4.0 * x * z * height;
+        let column_height = d.shank_height + d.bearing_height + d.collar_height;
+        for (name, expected) in [
+            ("pad", 4500.0 * 0.026 * 0.040 * d.pad_height),
+            ("pad-holder", 7000.0 * box_of(d.pad_holder_half, d.pad_holder_height)),
+            ("force-sensor", 7700.0 * box_of(d.column_half, d.sensor_height)),
+            ("sensor-holder", 7800.0 * box_of(d.column_half, column_height)),
+            ("cylinder", 7800.0 * box_of(d.cylinder_half, d.cylinder_height)),
+            ("spring-holder", 7800.0 * box_of(d.spring_holder_half, d.spring_holder_height)),
+        ] {
+            let found = mass_kg(&tribometer.pad, name);
+            assert!((found / expected - 1.0).abs() < 1e-10, "{name}: {found} kg, not {expected}");
+        }
+        let ring = |outer: f64, height: f64| TAU / 2.0 * (outer.powi(2) - d.bore_radius.powi(2)) * height;
+        let disc = mass_kg(&tribometer.disc, "disc") / (7800.0 * ring(d.disc_radius, d.disc_thickness));
+        let holders = mass_kg(&tribometer.disc, "disc-holder")
+            / (2.0 * 7700.0 * ring(d.disc_holder_radius, d.disc_holder_height));
+        assert!(disc < 1.0 && disc > 0.98 && holders < 1.0 && holders > 0.98, "{disc} {holders}");
+    }
+
+    #[test]
+    fn a_size_below_the_coarsest_mesh_is_refused() {
+        let refused = Tribometer::with_dof(&Dimensions::default(), 1_000).unwrap_err();
+        assert!(matches!(refused, FemError::Size { value: 1_000, limit: 1_001..=5_000 }), "{refused}");
     }
 }
