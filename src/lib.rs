@@ -7,6 +7,9 @@ pub mod cmd;
 #[cfg(feature = "node")]
 pub mod display;
 #[cfg(feature = "node")]
+pub mod export;
+pub mod fem;
+#[cfg(feature = "node")]
 pub mod io;
 #[cfg(feature = "node")]
 pub mod node;

@@ -18,6 +18,7 @@ mod run;
 mod signals;
 mod simulate;
 mod sweep;
+mod tribometer;
 mod view;
 
 use std::io::Write;
@@ -26,6 +27,7 @@ use std::process::ExitCode;
 use clap::{Args, Parser, Subcommand};
 
 use crate::io::ros_args::RosArgs;
+use crate::io::whole_file::write_whole;
 use crate::physics::OperatingPoint;
 use crate::rig::Rig;
 
@@ -52,6 +54,7 @@ enum Command {
     Recover(recover::Options),
     Check(check::Options),
     Bench(bench::Options),
+    Tribometer(tribometer::Options),
     Completions(completions::Options),
 }
 
@@ -88,6 +91,7 @@ pub fn main() -> ExitCode {
         Command::Critical(options) => options.run(),
         Command::Check(options) => options.run(),
         Command::Bench(options) => options.run(),
+        Command::Tribometer(options) => options.run(),
         Command::Completions(options) => options.run(),
     };
     match result {
@@ -179,11 +183,7 @@ fn print(text: &str) -> anyhow::Result<()> {
     }
 }
 
-/// Writes a file beside its final name, then renames it: never half a file under the name asked for.
+/// Writes a file, whole or not at all.
 fn write_file(path: &std::path::Path, bytes: &[u8]) -> anyhow::Result<()> {
-    use anyhow::Context;
-    let name = path.file_name().with_context(|| format!("{}: not the name of a file", path.display()))?;
-    let beside = path.with_file_name(format!(".{}.part", name.to_string_lossy()));
-    std::fs::write(&beside, bytes).with_context(|| format!("{}: cannot write", beside.display()))?;
-    std::fs::rename(&beside, path).with_context(|| format!("{}: cannot write", path.display()))
+    write_whole(path, |out| out.write_all(bytes))
 }

@@ -16,5 +16,6 @@ pub mod ros2;
 pub mod ros_args;
 pub mod shm;
 pub mod tribometer_log;
+pub mod whole_file;
 
 pub use heard::{Bus, Heard};

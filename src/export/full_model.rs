@@ -1,0 +1,78 @@
+//! The full model of the tribometer: a TOML file that names matrices, nodes and the contact patch.
+
+use std::io::Write;
+use std::path::Path;
+
+use anyhow::Context;
+
+use super::{write_deck, write_mesh, write_symmetric};
+use crate::fem::tribometer::{CONTACT_STIFFNESS_N_PER_M, Part, Tribometer};
+use crate::io::whole_file::write_whole;
+
+/// Frequencies that a deck asks for.
+const DECK_MODES: usize = 20;
+
+/// Writes into `folder`, made where it is missing: of each part the matrices, nodes, map from rows to nodes and a CalculiX
+/// deck; the mesh of both as VTK; and last `tribometer.toml`, which is thus there when all of it is. `say` hears the name
+/// of each file that is there.
+///
+/// # Errors
+/// A part that cannot be assembled, a file that cannot be written.
+pub fn write_full_model(tribometer: &Tribometer, folder: &Path, mut say: impl FnMut(&str)) -> anyhow::Result<()> {
+    std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot make the folder", folder.display()))?;
+    let mut toml = format!(
+        "# A pad-on-disc tribometer of the paper's kind, with dimensions of this project: {} degrees of freedom.\n\
+         name = \"tribometer\"\n",
+        tribometer.dof()
+    );
+    for (name, part) in [("pad", &tribometer.pad), ("disc", &tribometer.disc)] {
+        toml += &write_part(name, part, folder, &mut say)?;
+    }
+    let mesh = "tribometer.vtk";
+    let meshes = [&tribometer.pad.structure.mesh, &tribometer.disc.structure.mesh];
+    write_whole(&folder.join(mesh), |out| write_mesh(&meshes, "squealcast tribometer", out))?;
+    say(mesh);
+    toml += &format!(
+        "\n[[contact_patch]]\naxis_point_m = [0.0, 0.0, 0.0]\naxis_direction = [0.0, 1.0, 0.0]\n\
+         normal = [0.0, 1.0, 0.0]\nstiffness_n_per_m = {CONTACT_STIFFNESS_N_PER_M:e}\n"
+    );
+    write_whole(&folder.join("tribometer.toml"), |out| out.write_all(toml.as_bytes()))?;
+    say("tribometer.toml");
+    Ok(())
+}
+
+/// The files of one part; returns its table of the full model.
+fn write_part(name: &str, part: &Part, folder: &Path, say: &mut impl FnMut(&str)) -> anyhow::Result<String> {
+    let structure = &part.structure;
+    let file = |what: &str| format!("{name}-{what}");
+    let deck = format!("{name}.inp");
+    write_whole(&folder.join(&deck), |out| write_deck(structure, &format!("{name} of a tribometer"), DECK_MODES, out))?;
+    say(&deck);
+    let assembled = structure.assemble().with_context(|| name.to_owned())?;
+    for (what, matrix, unit) in [("stiffness", &assembled.stiffness, "N/m"), ("mass", &assembled.mass, "kg")] {
+        let file = file(&format!("{what}.mtx"));
+        let comment = format!("{what} of the {name}, {unit}, interface free; rows as in {name}-rows.csv");
+        write_whole(&folder.join(&file), |out| write_symmetric(matrix, &comment, out))?;
+        say(&file);
+    }
+    let nodes = file("nodes.csv");
+    write_whole(&folder.join(&nodes), |out| {
+        writeln!(out, "x_m,y_m,z_m")?;
+        structure.mesh.nodes_m.iter().try_for_each(|[x, y, z]| writeln!(out, "{x:e},{y:e},{z:e}"))
+    })?;
+    say(&nodes);
+    let rows = file("rows.csv");
+    write_whole(&folder.join(&rows), |out| {
+        writeln!(out, "node,direction")?;
+        assembled.rows.iter().try_for_each(|&(node, direction)| writeln!(out, "{node},{}", ["x", "y", "z"][direction]))
+    })?;
+    say(&rows);
+    let interface: Vec<String> = part.interface.iter().map(ToString::to_string).collect();
+    Ok(format!(
+        "\n[{name}]\nstiffness = \"{}\"\nmass = \"{}\"\nnodes = \"{nodes}\"\nrows = \"{rows}\"\n\
+         interface_nodes = [{}]\n",
+        file("stiffness.mtx"),
+        file("mass.mtx"),
+        interface.join(", ")
+    ))
+}

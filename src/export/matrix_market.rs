@@ -1,0 +1,22 @@
+//! Matrix Market files of symmetric matrices.
+//!
+//! Source: Boisvert, Pozo, Remington, "The Matrix Market exchange formats", NISTIR 5935 (1996).
+
+use std::io::{self, Write};
+
+use crate::reduction::SparseMatrix;
+
+/// Writes the lower triangle of a symmetric matrix in coordinate form, every value with the digits that give it back.
+///
+/// # Errors
+/// What the writer reports.
+pub fn write_symmetric(matrix: &SparseMatrix, comment: &str, out: &mut impl Write) -> io::Result<()> {
+    let lower = || matrix.as_ref().triplet_iter().filter(|entry| entry.row >= entry.col && *entry.val != 0.0);
+    writeln!(out, "%%MatrixMarket matrix coordinate real symmetric")?;
+    writeln!(out, "% {comment}")?;
+    writeln!(out, "{} {} {}", matrix.nrows(), matrix.ncols(), lower().count())?;
+    for entry in lower() {
+        writeln!(out, "{} {} {:e}", entry.row + 1, entry.col + 1, entry.val)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,11 @@
+//! Finite-element models to files: matrices, the full model that names them, decks and pictures for other programs.
+
+mod calculix;
+mod full_model;
+mod matrix_market;
+mod vtk;
+
+pub use calculix::write_deck;
+pub use full_model::write_full_model;
+pub use matrix_market::write_symmetric;
+pub use vtk::write_mesh;

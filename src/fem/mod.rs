@@ -1,0 +1,68 @@
+//! Finite elements of linear elasticity: 8-node bricks on structured meshes, assembled to sparse matrices.
+//!
+//! ```text
+//! K = Σ_e ∫ Bᵀ D B dV + Σ springs      stiffness, N/m
+//! M = Σ_e ∫ ρ Nᵀ N dV                  consistent mass, kg
+//! ```
+//!
+//! [`brick`] is the element, with the incompatible modes of Wilson and Taylor; [`Mesh`] holds nodes, bricks and hanging
+//! nodes; [`Block`] is a structured piece of it; [`Structure`] adds supports and springs and assembles; [`tribometer`] is
+//! the reference rig.
+//!
+//! Pure: no clock, file, bus, log or serialisation.
+
+mod brick;
+mod mesh;
+mod structure;
+pub mod tribometer;
+
+pub use brick::{BrickMatrices, brick};
+pub use mesh::{Block, Brick, Component, Extent, Mesh, SOLID, stations};
+pub use structure::{Assembled, Spring, Structure};
+
+/// An isotropic, linearly elastic material.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Material {
+    pub density_kg_per_m3: f64,
+    pub young_pa: f64,
+    pub poisson: f64,
+}
+
+/// What was wrong with a model, where, with which value. Nodes and bricks are counted from 0.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum FemError {
+    #[error("{component}: {field} is {value}, expected {limit}")]
+    Material { component: String, field: &'static str, value: f64, limit: &'static str },
+    #[error("brick {brick} of {component}: the Jacobian is {value:.3e} m^3, expected more than 0")]
+    Inverted { brick: usize, component: String, value: f64 },
+    #[error("node {node} is in no brick")]
+    Loose { node: usize },
+    #[error("spring {spring}: the stiffness is {value} N/m, expected a finite number above 0")]
+    Spring { spring: usize, value: f64 },
+    #[error("{value} degrees of freedom asked for, expected at least {limit}")]
+    Size { value: usize, limit: usize },
+}
+
+impl Material {
+    /// Lamé's constants `λ = E ν / ((1 + ν)(1 - 2ν))`, `G = E / (2 (1 + ν))`, Pa.
+    pub fn lame_pa(&self) -> (f64, f64) {
+        let shear = self.young_pa / (2.0 * (1.0 + self.poisson));
+        (2.0 * shear * self.poisson / (1.0 - 2.0 * self.poisson), shear)
+    }
+
+    fn check(&self, component: &str) -> Result<(), FemError> {
+        let refuse =
+            |field, value, limit| Err(FemError::Material { component: component.to_owned(), field, value, limit });
+        let positive = |value: f64| value.is_finite() && value > 0.0;
+        if !positive(self.density_kg_per_m3) {
+            return refuse("density_kg_per_m3", self.density_kg_per_m3, "a finite number above 0");
+        }
+        if !positive(self.young_pa) {
+            return refuse("young_pa", self.young_pa, "a finite number above 0");
+        }
+        if !(self.poisson > -1.0 && self.poisson < 0.5) {
+            return refuse("poisson", self.poisson, "more than -1 and less than 0.5");
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,528 @@
+//! The reference rig: a pad-on-disc tribometer of the kind that a published model reduction was tried on.
+//!
+//! ```text
+//!            spring holder        held along x and z at its top, free along y
+//!              : : :              nine springs
+//!            cylinder
+//!            sensor holder == linear bearing == bracket plate    y held, x and z sprung at its back
+//!            force sensor
+//!            pad holder
+//!            pad
+//!   ======== disc ========        clamped between two disc holders
+//! ```
+//!
+//! Components, materials, supports and springs are the published ones, the dimensions are this project's own, tuned so
+//! that the first frequencies agree (upper part 331.44 Hz, lower part 1300.6 Hz, whole at rest 510.91 Hz). It is a model
+//! of that kind, not its mesh, which cannot be known: it is said to have 904 968 degrees of freedom in 121 864 eight-node
+//! bricks, more than such bricks can have. `y` points up, `y = 0` is the disc's upper face and the disc turns about the
+//! `y` axis; the pad lies around `x = ` [`MEAN_RADIUS_M`].
+//!
+//! # Source
+//! Table 2, Table 3 and section 4 of the paper this project implements; see `README.md`.
+
+use std::f64::consts::TAU;
+
+use super::mesh::{divided, pieces};
+use super::{Block, Extent, FemError, Material, Mesh, SOLID, Spring, Structure, stations};
+
+/// Where the middle of the cylinder stands, m from the disc's axis.
+pub const MEAN_RADIUS_M: f64 = 0.1;
+/// Contact pairs along the radius and along the sliding direction.
+pub const PATCH: [usize; 2] = [14, 21];
+/// Normal stiffness of each contact pair, N/m.
+pub const CONTACT_STIFFNESS_N_PER_M: f64 = 1.251e7;
+
+const PAD: Material = material(4500.0, 20e9, 0.29);
+const PAD_HOLDER: Material = material(7000.0, 180e9, 0.3);
+const FORCE_SENSOR: Material = material(7700.0, 190e9, 0.28);
+const SENSOR_HOLDER: Material = material(7800.0, 196e9, 0.3);
+const LINEAR_BEARING: Material = material(7850.0, 210e9, 0.28);
+const CYLINDER: Material = material(7800.0, 196e9, 0.3);
+const SPRING_HOLDER: Material = material(7800.0, 196e9, 0.3);
+const DISC: Material = material(7800.0, 210e9, 0.27);
+const DISC_HOLDER: Material = material(7700.0, 200e9, 0.27);
+
+/// In all, along x and along z, spread over the held part of the bracket plate's back, N/m.
+const GROUND_SPRING_N_PER_M: f64 = 1e10;
+/// Along y, between the middles of spring holder and cylinder, N/m.
+const MIDDLE_SPRING_N_PER_M: f64 = 1e9;
+/// Along x, y and z, between the corners and the middles of the edges of spring holder and cylinder, N/m.
+const EDGE_SPRING_N_PER_M: [f64; 3] = [1e10, 1e6, 1e10];
+
+const fn material(density_kg_per_m3: f64, young_pa: f64, poisson: f64) -> Material {
+    Material { density_kg_per_m3, young_pa, poisson }
+}
+
+/// Lengths of the rig, m. Of the upper part, `x` counts from [`MEAN_RADIUS_M`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Dimensions {
+    pub pad_x: [f64; 2],
+    pub pad_half_z: f64,
+    pub pad_height: f64,
+    /// Half widths along x and z.
+    pub pad_holder_half: [f64; 2],
+    pub pad_holder_height: f64,
+    /// Half widths along x and z of force sensor and sensor holder: lines of the pad.
+    pub column_half: [f64; 2],
+    pub sensor_height: f64,
+    /// The sensor holder below the bearing, beside it, and above it.
+    pub shank_height: f64,
+    pub bearing_height: f64,
+    pub collar_height: f64,
+    pub bearing_half_x: f64,
+    pub bearing_depth: f64,
+    pub plate_depth: f64,
+    pub cylinder_half: [f64; 2],
+    pub cylinder_height: f64,
+    pub spring_holder_half: [f64; 2],
+    pub spring_holder_height: f64,
+    pub disc_radius: f64,
+    pub disc_thickness: f64,
+    pub bore_radius: f64,
+    pub disc_holder_radius: f64,
+    pub disc_holder_height: f64,
+    /// From the patch to the edge of the finely meshed part of the disc, along the radius and along the circumference.
+    pub margin: [f64; 2],
+}
+
+impl Default for Dimensions {
+    fn default() -> Self {
+        Self {
+            pad_x: [-0.012, 0.014],
+            pad_half_z: 0.020,
+            pad_height: 0.012,
+            pad_holder_half: [0.018, 0.024],
+            pad_holder_height: 0.034,
+            column_half: [0.012, 0.010],
+            sensor_height: 0.024,
+            shank_height: 0.0997,
+            bearing_height: 0.056,
+            collar_height: 0.0085,
+            bearing_half_x: 0.018,
+            bearing_depth: 0.0343,
+            plate_depth: 0.0094,
+            cylinder_half: [0.024, 0.024],
+            cylinder_height: 0.076,
+            spring_holder_half: [0.034, 0.034],
+            spring_holder_height: 0.015,
+            disc_radius: 0.140,
+            disc_thickness: 0.013_48,
+            bore_radius: 0.020,
+            disc_holder_radius: 0.050,
+            disc_holder_height: 0.030,
+            margin: [0.011, 0.010],
+        }
+    }
+}
+
+/// One of the two substructures, its contact interface free.
+#[derive(Clone, Debug)]
+pub struct Part {
+    pub structure: Structure,
+    /// Nodes of the contact patch, along x fastest.
+    pub interface: Vec<usize>,
+}
+
+/// The rig: what is above the contact, and the disc with its holders. `pad.interface[k]` and `disc.interface[k]` coincide.
+#[derive(Clone, Debug)]
+pub struct Tribometer {
+    pub pad: Part,
+    pub disc: Part,
+}
+
+impl Tribometer {
+    /// The rig in bricks of about `spacing_m` away from the patch; those of the upper part are smaller, for its column is
+    /// thinner than the disc is wide.
+    pub fn with_spacing(dimensions: &Dimensions, spacing_m: f64) -> Self {
+        Self { pad: upper_part(dimensions, 0.6 * spacing_m), disc: lower_part(dimensions, spacing_m) }
+    }
+
+    /// The coarsest rig found with at least `dof` degrees of freedom, both parts together.
+    ///
+    /// # Errors
+    /// [`FemError::Size`] below what the coarsest mesh has.
+    pub fn with_dof(dimensions: &Dimensions, dof: usize) -> Result<Self, FemError> {
+        let (mut coarse, mut fine) = (0.1, 0.1);
+        let mut found = Self::with_spacing(dimensions, fine);
+        let least = found.dof() / 1000 * 1000;
+        if dof < least {
+            return Err(FemError::Size { value: dof, limit: least });
+        }
+        while found.dof() < dof {
+            (coarse, fine) = (fine, 0.85 * fine);
+            found = Self::with_spacing(dimensions, fine);
+        }
+        while coarse / fine > 1.002 {
+            let spacing_m = (coarse * fine).sqrt();
+            let between = Self::with_spacing(dimensions, spacing_m);
+            if between.dof() < dof {
+                coarse = spacing_m;
+            } else {
+                (fine, found) = (spacing_m, between);
+            }
+        }
+        Ok(found)
+    }
+
+    /// Both parts at rest, joined along the normal by a spring per contact pair.
+    pub fn at_rest(&self, contact_stiffness_n_per_m: f64) -> Structure {
+        let mut whole = self.pad.structure.clone();
+        let first = whole.append(&self.disc.structure);
+        whole.springs.extend(self.pad.interface.iter().zip(&self.disc.interface).map(|(&node, &other)| Spring {
+            node,
+            other: Some(first + other),
+            direction: 1,
+            stiffness_n_per_m: contact_stiffness_n_per_m,
+        }));
+        whole
+    }
+
+    /// Degrees of freedom of both parts, without those that are held.
+    pub fn dof(&self) -> usize {
+        self.pad.structure.dof() + self.disc.structure.dof()
+    }
+}
+
+/// Lines of the patch along x, from [`MEAN_RADIUS_M`], and along z.
+fn patch_lines(dimensions: &Dimensions) -> [Vec<f64>; 2] {
+    let lines = |from: f64, to: f64, nodes: usize| [from].into_iter().chain(divided(from, to, nodes - 1)).collect();
+    let ([inner, outer], half_z) = (dimensions.pad_x, dimensions.pad_half_z);
+    [lines(inner, outer, PATCH[0]), lines(-half_z, half_z, PATCH[1])]
+}
+
+/// About every `spacing`-th of some lines, both ends included: coarser lines that the finer ones refine.
+fn thinned(lines: &[f64], spacing: f64) -> Vec<f64> {
+    let last = lines.len() - 1;
+    let count = pieces(lines[last] - lines[0], spacing).min(last);
+    (0..=count).map(|piece| lines[(piece * last + count / 2) / count]).collect()
+}
+
+/// Lines of the upper part along x or z: through 0 and `edges` of components; between the edges of the pad they are lines
+/// of its own, so that the pad's mesh refines them.
+fn lines_above(edges: &[f64], pad_lines: &[f64], spacing: f64) -> Vec<f64> {
+    let [first, last] = ends(pad_lines);
+    let mut edges: Vec<f64> = edges.iter().copied().chain([first, 0.0, last]).collect();
+    edges.sort_by(f64::total_cmp);
+    edges.dedup_by(|a, b| same(*a, *b));
+    let mut lines = vec![edges[0]];
+    for pair in edges.windows(2) {
+        let (from, to) = (pair[0], pair[1]);
+        let within = between(pad_lines, from, to);
+        if from > first - NEAR && to < last + NEAR {
+            lines.extend_from_slice(&thinned(&within, spacing)[1..]);
+        } else {
+            lines.extend(divided(from, to, pieces(to - from, spacing)));
+        }
+    }
+    lines
+}
+
+/// Lengths closer than this are the same, m.
+const NEAR: f64 = 1e-9;
+
+fn same(a: f64, b: f64) -> bool {
+    (a - b).abs() < NEAR
+}
+
+/// The lines from one value to another, both included.
+fn between(lines: &[f64], from: f64, to: f64) -> Vec<f64> {
+    lines.iter().copied().filter(|&line| line > from - NEAR && line < to + NEAR).collect()
+}
+
+/// What is above the contact.
+fn upper_part(d: &Dimensions, spacing: f64) -> Part {
+    let [pad_x, pad_z] = patch_lines(d);
+    let (bearing_z, plate_z) = (d.column_half[1] + d.bearing_depth, d.column_half[1] + d.bearing_depth + d.plate_depth);
+    let halves = [d.pad_holder_half, d.column_half, d.cylinder_half, d.spring_holder_half];
+    let edges = |axis: usize| halves.iter().flat_map(move |half| [-half[axis], half[axis]]);
+    let edges_x: Vec<f64> = edges(0).chain([-d.bearing_half_x, d.bearing_half_x]).collect();
+    let edges_z: Vec<f64> = edges(1).chain([bearing_z, plate_z]).collect();
+    let (x, z) = (lines_above(&edges_x, &pad_x, spacing), lines_above(&edges_z, &pad_z, spacing));
+    let heights = [
+        d.pad_height,
+        d.pad_holder_height,
+        d.sensor_height,
+        d.shank_height,
+        d.bearing_height,
+        d.collar_height,
+        d.cylinder_height,
+        d.spring_holder_height,
+    ];
+    let mut levels = vec![0.0];
+    for height in heights {
+        levels.push(levels[levels.len() - 1] + height);
+    }
+    let y = stations(&levels, spacing);
+
+    let mut mesh = Mesh::default();
+    // A box of half widths along x, between two levels and two depths, on the ones before it.
+    let mut add =
+        |name: &str, material, half_x: f64, [low, high]: [usize; 2], [front, back]: [f64; 2], on: &[&Block]| {
+            let component = mesh.add_component(name, material);
+            let lines = match name {
+                "pad" => [pad_x.clone(), between(&y, levels[low], levels[high]), pad_z.clone()],
+                _ => [between(&x, -half_x, half_x), between(&y, levels[low], levels[high]), between(&z, front, back)],
+            };
+            mesh.add_block(component, lines, SOLID, on, |[x, y, z]| [MEAN_RADIUS_M + x, y, z])
+        };
+    let around = |half: [f64; 2]| [-half[1], half[1]];
+    let [column_x, column_z] = d.column_half;
+    let pad_holder = add("pad-holder", PAD_HOLDER, d.pad_holder_half[0], [1, 2], around(d.pad_holder_half), &[]);
+    let pad = add("pad", PAD, d.pad_x[1], [0, 1], [-d.pad_half_z, d.pad_half_z], &[&pad_holder]);
+    let sensor = add("force-sensor", FORCE_SENSOR, column_x, [2, 3], around(d.column_half), &[&pad_holder]);
+    let sensor_holder = add("sensor-holder", SENSOR_HOLDER, column_x, [3, 6], around(d.column_half), &[&sensor]);
+    let bearing =
+        add("linear-bearing", LINEAR_BEARING, d.bearing_half_x, [4, 5], [column_z, bearing_z], &[&sensor_holder]);
+    let plate =
+        add("bracket-plate", LINEAR_BEARING, d.spring_holder_half[0], [4, 7], [bearing_z, plate_z], &[&bearing]);
+    let cylinder = add("cylinder", CYLINDER, d.cylinder_half[0], [6, 7], around(d.cylinder_half), &[&sensor_holder]);
+    let spring_holder =
+        add("spring-holder", SPRING_HOLDER, d.spring_holder_half[0], [7, 8], around(d.spring_holder_half), &[]);
+
+    let interface = level(&pad, 0).collect();
+    let mut structure = Structure { mesh, ..Structure::default() };
+    let top = level(&spring_holder, spring_holder.counts()[1] - 1);
+    structure.fixed.extend(top.flat_map(|node| [(node, 0), (node, 2)]));
+    hold_plate(&mut structure, &plate, [levels[4], levels[5]], d.bearing_half_x);
+    join_cylinder(&mut structure, &cylinder, &spring_holder, levels[7], d.cylinder_half);
+    Part { structure, interface }
+}
+
+/// Springs between the top of the cylinder and the spring holder above it: in the middle, at corners, at middles of edges.
+fn join_cylinder(structure: &mut Structure, cylinder: &Block, holder: &Block, height: f64, half: [f64; 2]) {
+    let at = |block: &Block, x: f64, z: f64| {
+        let weights = block.locate([x, height, z]).expect("a place on both faces");
+        assert_eq!(weights.len(), 1, "springs join nodes");
+        weights[0].0
+    };
+    for x in [-half[0], 0.0, half[0]] {
+        for z in [-half[1], 0.0, half[1]] {
+            let (node, other) = (at(cylinder, x, z), Some(at(holder, x, z)));
+            let middle = x == 0.0 && z == 0.0;
+            let stiffness = if middle { [0.0, MIDDLE_SPRING_N_PER_M, 0.0] } else { EDGE_SPRING_N_PER_M };
+            let along = stiffness.into_iter().enumerate().filter(|(_, stiffness)| *stiffness > 0.0);
+            structure.springs.extend(along.map(|(direction, stiffness_n_per_m)| Spring {
+                node,
+                other,
+                direction,
+                stiffness_n_per_m,
+            }));
+        }
+    }
+}
+
+/// Holds the back of the bracket plate where the bearing sits: `y` fixed, `x` and `z` on springs spread over the area.
+fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], half_x: f64) {
+    let back = plate.counts()[2] - 1;
+    // The length of the held part that belongs to each line.
+    let shares = |lines: &[f64], low: f64, high: f64| -> Vec<f64> {
+        let clipped = |line: f64| line.clamp(low, high);
+        (0..lines.len())
+            .map(|k| {
+                let before = clipped(lines[k.saturating_sub(1)]);
+                let after = clipped(lines[(k + 1).min(lines.len() - 1)]);
+                0.5 * (after - before)
+            })
+            .collect()
+    };
+    let (x, y) = (shares(plate.lines(0), -half_x, half_x), shares(plate.lines(1), low, high));
+    let area = 2.0 * half_x * (high - low);
+    for (j, height) in y.iter().enumerate() {
+        for (i, width) in x.iter().enumerate() {
+            if width * height > NEAR * NEAR {
+                let node = plate.node([i, j, back]);
+                structure.fixed.insert((node, 1));
+                let stiffness_n_per_m = GROUND_SPRING_N_PER_M * width * height / area;
+                structure.springs.extend([0, 2].map(|direction| Spring {
+                    node,
+                    other: None,
+                    direction,
+                    stiffness_n_per_m,
+                }));
+            }
+        }
+    }
+}
+
+/// The disc between its holders.
+fn lower_part(d: &Dimensions, spacing: f64) -> Part {
+    let [patch_x, patch_z] = patch_lines(d);
+    // The finely meshed part around the patch: lines of radius and of angle, the outer ones within its margins.
+    let with_margins = |patch: &[f64], margin: f64, scale: f64| {
+        let (first, last) = (patch[0], patch[patch.len() - 1]);
+        let cells = pieces(margin, spacing).min(5);
+        let mut lines = vec![first - margin];
+        lines.extend(divided(first - margin, first, cells));
+        lines.extend_from_slice(&patch[1..]);
+        lines.extend(divided(last, last + margin, cells));
+        lines.iter().map(|line| line * scale).collect::<Vec<f64>>()
+    };
+    let fine_r: Vec<f64> = with_margins(&patch_x, d.margin[0], 1.0).iter().map(|line| MEAN_RADIUS_M + line).collect();
+    let fine_angle = with_margins(&patch_z, d.margin[1], 1.0 / MEAN_RADIUS_M);
+    let ([inner, outer], [start, end]) = (ends(&fine_r), ends(&fine_angle));
+
+    let mut r = stations(&[d.bore_radius, d.disc_holder_radius, inner], spacing);
+    r.extend_from_slice(&thinned(&fine_r, spacing)[1..]);
+    r.extend_from_slice(&stations(&[outer, d.disc_radius], spacing)[1..]);
+    let mut angle = thinned(&fine_angle, spacing / MEAN_RADIUS_M);
+    let rest = TAU - (end - start);
+    angle.extend(divided(end, start + TAU, pieces(rest * MEAN_RADIUS_M, spacing).max(16)));
+    let y = stations(&[-d.disc_thickness, 0.0], spacing.min(d.disc_thickness));
+    let top = y.len() - 1;
+
+    let mut mesh = Mesh::default();
+    let polar = |[r, y, angle]: [f64; 3]| [r * angle.cos(), y, r * angle.sin()];
+    let disc = mesh.add_component("disc", DISC);
+    let hole = |[i, _, k]: [usize; 3]| {
+        let (r, angle) = (0.5 * (r[i] + r[i + 1]), 0.5 * (angle[k] + angle[k + 1]));
+        r > inner && r < outer && angle > start && angle < end
+    };
+    let around = Extent { filled: &|cell| !hole(cell), closed: true };
+    let ring = mesh.add_block(disc, [r.clone(), y.clone(), angle.clone()], around, &[], polar);
+    // A rectangle within, polar at the edge, blended across the margins.
+    let blended = |at: [f64; 3]| {
+        let (x, z) = (at[0] - MEAN_RADIUS_M, at[2] * MEAN_RADIUS_M);
+        let beyond = |value: f64, lines: &[f64], margin: f64| {
+            let [first, last] = ends(lines);
+            ((first - value).max(value - last) / margin).max(0.0)
+        };
+        let share = beyond(x, &patch_x, d.margin[0]).max(beyond(z, &patch_z, d.margin[1]));
+        let (round, straight) = (polar(at), [at[0], at[1], z]);
+        [0, 1, 2].map(|axis| share * round[axis] + (1.0 - share) * straight[axis])
+    };
+    let fine = mesh.add_block(disc, [fine_r.clone(), y, fine_angle.clone()], SOLID, &[&ring], blended);
+
+    let holder = mesh.add_component("disc-holder", DISC_HOLDER);
+    let clamped: Vec<f64> = r.iter().copied().filter(|&line| line < d.disc_holder_radius + 1e-9).collect();
+    for (from, to) in [(0.0, d.disc_holder_height), (-d.disc_thickness - d.disc_holder_height, -d.disc_thickness)] {
+        let lines = [clamped.clone(), stations(&[from, to], spacing), angle.clone()];
+        mesh.add_block(holder, lines, Extent { filled: &|_| true, closed: true }, &[&ring], polar);
+    }
+
+    let mut structure = Structure { mesh, ..Structure::default() };
+    for level in [0, top] {
+        for i in 0..clamped.len() {
+            for k in 0..angle.len() - 1 {
+                let node = ring.node([i, level, k]);
+                structure.fixed.extend([0, 1, 2].map(|direction| (node, direction)));
+            }
+        }
+    }
+    let cells = (fine.counts()[0] - PATCH[0]) / 2;
+    let cells_z = (fine.counts()[2] - PATCH[1]) / 2;
+    let interface = (0..PATCH[1])
+        .flat_map(|k| (0..PATCH[0]).map(move |i| [cells + i, top, cells_z + k]))
+        .map(|point| fine.node(point))
+        .collect();
+    Part { structure, interface }
+}
+
+/// Nodes of a block on its `j`-th level, along x fastest.
+fn level(block: &Block, j: usize) -> impl Iterator<Item = usize> {
+    let [x, _, z] = block.counts();
+    (0..z).flat_map(move |k| (0..x).map(move |i| block.node([i, j, k])))
+}
+
+fn ends(lines: &[f64]) -> [f64; 2] {
+    [lines[0], lines[lines.len() - 1]]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reduction::lowest_modes;
+
+    /// The `count` lowest natural frequencies, Hz, by this crate's own modes.
+    fn frequencies_hz(structure: &Structure, count: usize) -> Vec<f64> {
+        let assembled = structure.assemble().unwrap();
+        let modes = lowest_modes("structure", &assembled.mass, &assembled.stiffness, count).unwrap();
+        modes.omega_squared.iter().map(|square| square.sqrt() / TAU).collect()
+    }
+
+    #[test]
+    fn the_first_frequencies_of_the_default_size_are_the_published_ones() {
+        // Table 3 of the paper, within the 1 % that the dimensions were tuned for.
+        let tribometer = Tribometer::with_dof(&Dimensions::default(), 20_000).unwrap();
+        let whole = tribometer.at_rest(CONTACT_STIFFNESS_N_PER_M);
+        for (what, structure, published_hz) in [
+            ("upper part", &tribometer.pad.structure, 331.44),
+            ("lower part", &tribometer.disc.structure, 1300.6),
+            ("whole at rest", &whole, 510.91),
+        ] {
+            let found = frequencies_hz(structure, 3);
+            eprintln!("{what}: {found:.2?} Hz, published {published_hz}");
+            assert!((found[0] / published_hz - 1.0).abs() < 0.01, "{what}: {} Hz, not {published_hz}", found[0]);
+        }
+    }
+
+    #[test]
+    fn the_same_294_pairs_coincide_at_any_size() {
+        let dimensions = Dimensions::default();
+        let mut places: Option<Vec<[f64; 3]>> = None;
+        for dof in [5_000, 20_000, 100_000] {
+            let tribometer = Tribometer::with_dof(&dimensions, dof).unwrap();
+            assert!((dof..dof + dof / 4).contains(&tribometer.dof()), "{} for {dof}", tribometer.dof());
+            let at = |part: &Part| -> Vec<[f64; 3]> {
+                let mesh = &part.structure.mesh;
+                assert!(part.interface.iter().all(|node| !mesh.hanging.contains_key(node)));
+                part.interface.iter().map(|&node| mesh.nodes_m[node]).collect()
+            };
+            let (pad, disc) = (at(&tribometer.pad), at(&tribometer.disc));
+            assert_eq!(pad.len(), 294);
+            for (a, b) in pad.iter().zip(&disc) {
+                assert!((0..3).all(|axis| (a[axis] - b[axis]).abs() < 1e-12), "{a:?} {b:?}");
+            }
+            let first = places.get_or_insert_with(|| pad.clone());
+            assert!(pad.iter().flatten().zip(first.iter().flatten()).all(|(a, b)| (a - b).abs() < 1e-12));
+        }
+    }
+
+    #[test]
+    fn the_mass_is_that_of_boxes_and_rings() {
+        // Density times volume of each component, by hand; the polar mesh cuts the corners of its rings.
+        let d = Dimensions::default();
+        let tribometer = Tribometer::with_dof(&d, 20_000).unwrap();
+        let mass_kg = |part: &Part, name: &str| -> f64 {
+            let mesh = &part.structure.mesh;
+            let of_it = |brick: &&super::super::Brick| mesh.components[brick.component].name == name;
+            mesh.bricks
+                .iter()
+                .filter(of_it)
+                .map(|brick| {
+                    let material = &mesh.components[brick.component].material;
+                    let matrices = super::super::brick(&mesh.corners_m(brick), material).unwrap();
+                    // Moved as a whole along x, y and z.
+                    (0..24)
+                        .flat_map(|i| (i % 3..24).step_by(3).map(move |j| (i, j)))
+                        .map(|(i, j)| matrices.mass[i][j])
+                        .sum::<f64>()
+                        / 3.0
+                })
+                .sum()
+        };
+        let box_of = |[x, z]: [f64; 2], height: f64| 4.0 * x * z * height;
+        let column_height = d.shank_height + d.bearing_height + d.collar_height;
+        for (name, expected) in [
+            ("pad", 4500.0 * 0.026 * 0.040 * d.pad_height),
+            ("pad-holder", 7000.0 * box_of(d.pad_holder_half, d.pad_holder_height)),
+            ("force-sensor", 7700.0 * box_of(d.column_half, d.sensor_height)),
+            ("sensor-holder", 7800.0 * box_of(d.column_half, column_height)),
+            ("cylinder", 7800.0 * box_of(d.cylinder_half, d.cylinder_height)),
+            ("spring-holder", 7800.0 * box_of(d.spring_holder_half, d.spring_holder_height)),
+        ] {
+            let found = mass_kg(&tribometer.pad, name);
+            assert!((found / expected - 1.0).abs() < 1e-10, "{name}: {found} kg, not {expected}");
+        }
+        let ring = |outer: f64, height: f64| TAU / 2.0 * (outer.powi(2) - d.bore_radius.powi(2)) * height;
+        let disc = mass_kg(&tribometer.disc, "disc") / (7800.0 * ring(d.disc_radius, d.disc_thickness));
+        let holders = mass_kg(&tribometer.disc, "disc-holder")
+            / (2.0 * 7700.0 * ring(d.disc_holder_radius, d.disc_holder_height));
+        assert!(disc < 1.0 && disc > 0.98 && holders < 1.0 && holders > 0.98, "{disc} {holders}");
+    }
+
+    #[test]
+    fn a_size_below_the_coarsest_mesh_is_refused() {
+        let refused = Tribometer::with_dof(&Dimensions::default(), 1_000).unwrap_err();
+        assert!(matches!(refused, FemError::Size { value: 1_000, limit: 1_001..=5_000 }), "{refused}");
+    }
+}
