@@ -52,9 +52,12 @@ pub fn write_deck(structure: &Structure, heading: &str, modes: usize, out: &mut 
     writeln!(out, "*STEP\n*FREQUENCY\n{modes}\n*NODE FILE\nU\n*END STEP")
 }
 
+/// What makes springs alike: whether they join two nodes, their direction, the bits of their stiffness.
+type Kind = (bool, usize, u64);
+
 /// Springs that are alike share a set and a stiffness; elements count on after the `bricks`.
 fn write_springs(springs: &[Spring], bricks: usize, out: &mut impl Write) -> io::Result<()> {
-    let mut alike: BTreeMap<(bool, usize, u64), Vec<(usize, &Spring)>> = BTreeMap::new();
+    let mut alike: BTreeMap<Kind, Vec<(usize, &Spring)>> = BTreeMap::new();
     for (index, spring) in springs.iter().enumerate() {
         let key = (spring.other.is_some(), spring.direction, spring.stiffness_n_per_m.to_bits());
         alike.entry(key).or_default().push((index, spring));

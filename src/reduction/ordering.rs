@@ -47,7 +47,7 @@ fn groups(n: usize, neighbours: &Neighbours<'_>) -> (Vec<usize>, Vec<Vec<usize>>
     let (mut group_of, mut members) = (vec![0; n], Vec::<Vec<usize>>::new());
     let mut by_hash: HashMap<u64, Vec<usize>> = HashMap::new();
     let (mut row_neighbours, mut other) = (vec![], vec![]);
-    for row in 0..n {
+    for (row, group_of) in group_of.iter_mut().enumerate() {
         neighbours(row, &mut row_neighbours);
         let hash = row_neighbours.iter().fold(0xcbf2_9ce4_8422_2325_u64, |hash, &index| {
             (hash ^ index as u64).wrapping_mul(0x0100_0000_01b3).rotate_left(23)
@@ -57,7 +57,7 @@ fn groups(n: usize, neighbours: &Neighbours<'_>) -> (Vec<usize>, Vec<Vec<usize>>
             neighbours(members[group][0], &mut other);
             other == row_neighbours
         });
-        group_of[row] = equal.unwrap_or(members.len());
+        *group_of = equal.unwrap_or(members.len());
         match equal {
             Some(group) => members[group].push(row),
             None => {
