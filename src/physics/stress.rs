@@ -117,7 +117,7 @@ impl Checked {
     fn said(&self) -> String {
         let Self { roots, together, vague, share, bound } = self;
         format!(
-            "{roots} roots, {together} clusters, {vague} not known; errors up to {share:.1e} of their bounds, bounds up to {bound:.1e}"
+            "{roots} roots, {together} clusters; errors up to {share:.1e} of their bounds, bounds up to {bound:.1e}; {vague} roots unknown by their bounds"
         )
     }
 }
