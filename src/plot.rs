@@ -279,7 +279,7 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
         padded(range(drawn().flat_map(|route| [at(route, route.median_error).1, at(route, route.largest_error).1])));
     let mut svg = String::new();
     {
-        let area = SVGBackend::with_string(&mut svg, (SIZE.0, 640)).into_drawing_area();
+        let area = SVGBackend::with_string(&mut svg, (1000, 640)).into_drawing_area();
         area.fill(&WHITE).map_err(failed)?;
         let area = area.titled(title, ("sans-serif", 18)).map_err(failed)?;
         let labels = ("run time per condition, log10 us", "relative error of the square, log10");
