@@ -130,10 +130,17 @@ pub fn chart_options(rig: &Rig) -> ChartOptions {
         high: point(rig.mu_max, load_high, speed_high),
         band_max_hz: rig.band_max_hz,
         tolerance: rig.chart.tolerance,
-        max_depth: 16,
-        max_solves: 200_000,
+        smallest_share: 1e-4,
+        max_solves: max_solves(rig.model.dimension()),
         threads: 1,
     }
+}
+
+/// Dense solves that the chart of a model of `dimension` coordinates may take: a quarter of an hour of one core, but for
+/// large models enough for one axis.
+fn max_solves(dimension: usize) -> usize {
+    let size = dimension.max(20) as f64 / 160.0;
+    (12_000.0 / size.powi(3)).clamp(2_000.0, 200_000.0) as usize
 }
 
 impl Session {

@@ -348,7 +348,7 @@ fn chart(model: &Model, plan: &Plan, say: &dyn Fn(&str)) -> anyhow::Result<Optio
         high: corner(2000.0, 60.0, 1.0),
         band_max_hz: Some(plan.band_max_hz),
         tolerance: plan.tolerance,
-        max_depth: 24,
+        smallest_share: 1e-4,
         max_solves: usize::MAX,
         threads: plan.threads,
     };

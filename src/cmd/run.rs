@@ -10,6 +10,7 @@ use crossbeam_channel::{Receiver, Sender};
 use super::buses::BusOptions;
 use super::display::{self, DisplayOptions, ThresholdOption};
 use super::{Outcome, live, signals};
+use crate::io::chart_file::ChartFile;
 use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig};
 use crate::io::ros_args::RosArgs;
@@ -40,6 +41,9 @@ pub struct NodeOptions {
     /// Solve every condition anew instead of charting the rig in the background
     #[arg(long)]
     no_chart: bool,
+    /// Neither use nor keep a chart on disk
+    #[arg(long)]
+    no_chart_cache: bool,
     /// Print log lines instead of a live table, on a terminal too
     #[arg(long)]
     plain: bool,
@@ -122,7 +126,9 @@ pub fn serve(
     let display = display::of_node(&addresses, rig, &watch, options.threshold);
     let shown = live::show(frame(rig, sender.clone()), watch.clone(), options.plain);
     let node = Node::new(rig.clone(), initial, outputs, sender.clone(), watch);
-    let node = if options.no_chart { node } else { node.with_chart(sender) };
+    let kept = || ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);
+    let kept = if options.no_chart_cache { None } else { kept() };
+    let node = if options.no_chart { node } else { node.with_chart(kept, sender) };
     let outputs = node.run(&receiver);
     // The recording first: whoever shows the session may be held up by a reader that does not read.
     let outcome = recorder.map_or(Ok(Outcome::Done), finish);

@@ -1,6 +1,7 @@
 //! Adapters between the node and the outside: buses, clocks and recordings. No physics and no session logic lives here.
 
 pub mod bag;
+pub mod chart_file;
 pub mod clock;
 pub mod heard;
 pub mod import;

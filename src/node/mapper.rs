@@ -3,16 +3,21 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Sender, bounded};
 use sha2::{Digest, Sha256};
 
 use super::Incoming;
 use super::sensitivity::{self, Question};
-use crate::physics::chart::build::{ChartOptions, build};
+use crate::io::chart_file::ChartFile;
+use crate::physics::chart::build::{ChartOptions, build, resume};
 use crate::physics::{Chart, Ends, OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
 use crate::session::{chart_options, map_options};
+
+/// A chart on the way is kept this often.
+const SAVE_EVERY: Duration = Duration::from_secs(20);
 
 /// The map a session uses at the load and speed of `point`.
 ///
@@ -35,13 +40,40 @@ pub fn session_ends(
     Ends::carried(&rig.model, solver, map, point).map_err(|error| error.to_string())
 }
 
-/// The chart a session uses, the same whatever the number of threads; `go_on` stops the work by saying no.
+/// The chart a session uses, the same whatever the number of threads.
 ///
 /// # Errors
 /// Why there is none, in words.
-pub fn session_chart(rig: &Rig, threads: usize, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
+pub fn session_chart(rig: &Rig, threads: usize) -> Result<Chart, String> {
     let options = ChartOptions { threads, ..chart_options(rig) };
-    build(&rig.model, &options, &|_| go_on()).map_err(|error| error.to_string())
+    build(&rig.model, &options, &|_| true).map_err(|error| error.to_string())
+}
+
+/// The chart a session uses, from where it is `kept`, or built on from what is; `go_on` stops the work by saying no.
+fn kept_chart(rig: &Rig, kept: &ChartFile, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
+    let begun = kept.load().unwrap_or_else(|error| {
+        eprintln!("{error}: the rig is charted anew");
+        None
+    });
+    if let Some(chart) = begun.as_ref().filter(|chart| chart.is_complete()) {
+        return Ok(chart.clone());
+    }
+    let mut saved = Instant::now();
+    let save = |chart: &Chart| {
+        if let Err(error) = kept.save(chart) {
+            eprintln!("the chart is not kept: {error}");
+        }
+    };
+    let chart = resume(&rig.model, &chart_options(rig), begun, &mut |progress| {
+        if progress.unit_finished && saved.elapsed() >= SAVE_EVERY {
+            save(progress.chart);
+            saved = Instant::now();
+        }
+        go_on()
+    });
+    let chart = chart.map_err(|error| error.to_string())?;
+    save(&chart);
+    Ok(chart)
 }
 
 /// SHA-256 of every number of a map that a prediction can depend on, hexadecimal.
@@ -56,7 +88,7 @@ pub fn ends_hash(ends: &Ends) -> String {
 
 /// SHA-256 of every number of a chart that a prediction can depend on, hexadecimal.
 pub fn chart_hash(chart: &Chart) -> String {
-    hash(chart.words())
+    hash(chart.words().into_iter())
 }
 
 fn hash(words: impl Iterator<Item = u64>) -> String {
@@ -68,13 +100,16 @@ fn hash(words: impl Iterator<Item = u64>) -> String {
 }
 
 /// Builds the chart on a thread of its own, of the lowest priority: predictions come first. It ends early when nobody
-/// listens any more.
-pub fn spawn_chart(rig: Arc<Rig>, done: Sender<Incoming>, stopped: Arc<AtomicBool>) {
+/// listens any more; with `kept` it is built only once.
+pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming>, stopped: Arc<AtomicBool>) {
     std::thread::spawn(move || {
         // Where the system does not allow it, the chart competes like any thread.
         let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
         let go_on = || !stopped.load(Ordering::Relaxed);
-        let built = catch_unwind(AssertUnwindSafe(|| session_chart(&rig, 1, &go_on)));
+        let built = catch_unwind(AssertUnwindSafe(|| match &kept {
+            Some(kept) => kept_chart(&rig, kept, &go_on),
+            None => build(&rig.model, &chart_options(&rig), &|_| go_on()).map_err(|error| error.to_string()),
+        }));
         let chart = built.unwrap_or_else(|_| Err("internal error while the rig was charted".to_owned()));
         if go_on() {
             let _ = done.send(Incoming::Chart(chart.map(Arc::new)));

@@ -21,6 +21,7 @@ pub use outputs::Outputs;
 pub use sensitivity::end_derivatives;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
+use crate::io::chart_file::ChartFile;
 use crate::io::clock;
 use crate::io::heard::{Bus, Heard};
 use crate::io::message::Payload;
@@ -113,9 +114,10 @@ impl Node {
         }
     }
 
-    /// Charts the rig in the background; predictions are read off the chart once it is there.
-    pub fn with_chart(self, sender: Sender<Incoming>) -> Self {
-        mapper::spawn_chart(self.rig.clone(), sender, self.stopped.clone());
+    /// Charts the rig in the background, or takes the chart that is `kept`; predictions are read off the chart once it is
+    /// there.
+    pub fn with_chart(self, kept: Option<ChartFile>, sender: Sender<Incoming>) -> Self {
+        mapper::spawn_chart(self.rig.clone(), kept, sender, self.stopped.clone());
         self
     }
 

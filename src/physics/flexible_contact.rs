@@ -188,8 +188,7 @@ fn coefficients(values: &[[Mat<f64>; 2]]) -> Vec<[Mat<f64>; 2]> {
         .map(|node| {
             let mut unit = vec![0.0; m];
             unit[node] = 1.0;
-            chebyshev::coefficients(&mut unit, m, 1);
-            unit
+            chebyshev::coefficients(&unit)
         })
         .collect();
     let (rows, columns) = values[0][0].shape();

@@ -470,6 +470,25 @@ impl Model {
         self.stiffness.iter().chain(&self.damping).filter(|known| self.coefficient(&known.term.law, p) == 0.0).count()
     }
 
+    /// Writes `(K(above) - K(below)) per` and the same of `C`, both `n×n`, from the differences of the laws: terms that
+    /// are constant leave no rounding. Says whether anything changes at all.
+    ///
+    /// # Errors
+    /// [`ModelError::LawNotFinite`].
+    pub fn assemble_difference(
+        &self,
+        below: &OperatingPoint,
+        above: &OperatingPoint,
+        per: f64,
+        stiffness: &mut Mat<f64>,
+        damping: &mut Mat<f64>,
+    ) -> Result<[bool; 2], ModelError> {
+        let difference = |law: &Law| (self.coefficient(law, above) - self.coefficient(law, below)) * per;
+        let (stiffness_changes, _) = sum(&self.stiffness, difference, above, stiffness)?;
+        let (damping_changes, _) = sum(&self.damping, difference, above, damping)?;
+        Ok([stiffness_changes, damping_changes])
+    }
+
     /// Whether any term's coefficient changes with load or with speed beyond opening, stopping and reversing.
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
         let (mut load, mut speed) = (false, false);
@@ -486,6 +505,19 @@ impl Model {
             }
         }
         (load, speed)
+    }
+
+    /// Whether load and speed matter by their ratio alone.
+    pub fn depends_on_load_over_speed_only(&self) -> bool {
+        let exponent = self.contact_law.exponent;
+        let constant = |law: &Law| match law {
+            Law::Constant | Law::ContactDamping | Law::FrictionDamping | Law::FrictionChebyshev { .. } => true,
+            Law::ContactStiffness | Law::FrictionStiffness => exponent == 0.0,
+            Law::FrictionSlope | Law::LateralFriction => false,
+            Law::Custom(custom) => !custom.depends_on_load && !custom.depends_on_speed,
+        };
+        let rest = || self.stiffness.iter().chain(&self.damping).filter(|known| !constant(&known.term.law));
+        rest().count() > 0 && rest().all(|known| matches!(known.term.law, Law::LateralFriction))
     }
 }
 

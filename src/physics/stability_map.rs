@@ -12,6 +12,8 @@ use super::tracking::{Continuation, continue_roots, tracked};
 
 /// Intervals the range of friction coefficients is cut into before refinement.
 const FIRST_INTERVALS: usize = 32;
+/// The same where no windows are looked for.
+const FIRST_INTERVALS_OF_IDENTITIES: usize = 4;
 /// Times the range may be halved: the resolution is `range / 2^20`.
 const HALVINGS: i32 = 20;
 /// More nodes than this are not made; the map then says that it is not complete.
@@ -99,8 +101,9 @@ impl StabilityMap {
             result.map_err(|source| MapError::Solve { mu, source })
         };
         let resolution = (mu_max - mu_min) * 0.5f64.powi(HALVINGS);
+        let intervals = if options.windows { FIRST_INTERVALS } else { FIRST_INTERVALS_OF_IDENTITIES };
         let mut ahead: Vec<Spectrum> =
-            first_grid(mu_min, mu_max).into_iter().rev().map(&mut solve).collect::<Result<_, _>>()?;
+            first_grid(mu_min, mu_max, intervals).into_iter().rev().map(&mut solve).collect::<Result<_, _>>()?;
         let mut spectra = Vec::with_capacity(ahead.len());
         let mut links: Vec<Continuation> = vec![];
         let mut complete = true;
@@ -165,10 +168,10 @@ impl StabilityMap {
 }
 
 /// The friction coefficients solved first, ascending: an even grid that contains 0.
-fn first_grid(mu_min: f64, mu_max: f64) -> Vec<f64> {
-    let step = (mu_max - mu_min) / FIRST_INTERVALS as f64;
-    let mut grid: Vec<f64> = (0..=FIRST_INTERVALS).map(|k| mu_min + step * k as f64).collect();
-    grid[FIRST_INTERVALS] = mu_max;
+fn first_grid(mu_min: f64, mu_max: f64, intervals: usize) -> Vec<f64> {
+    let step = (mu_max - mu_min) / intervals as f64;
+    let mut grid: Vec<f64> = (0..=intervals).map(|k| mu_min + step * k as f64).collect();
+    grid[intervals] = mu_max;
     grid.push(0.0);
     grid.sort_by(f64::total_cmp);
     grid.dedup_by(|a, b| (*a - *b).abs() < 1e-9 * step);

@@ -49,6 +49,8 @@ pub struct Rig {
     pub warning: Warning,
     /// `[chart]`: conditions for which predictions are prepared.
     pub chart: ChartRange,
+    /// Where the rig file was read; `None` for a rig from memory.
+    pub path: Option<std::path::PathBuf>,
     /// SHA-256 of the rig file and everything it refers to, hexadecimal.
     pub content_hash: String,
     /// The rig file (first) and everything it refers to, by the names it refers to them with.
@@ -127,11 +129,12 @@ impl Rig {
         })?;
         let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         let directory = path.parent().unwrap_or(std::path::Path::new(""));
-        Self::build(
+        let rig = Self::build(
             RigFile { name, bytes },
             &|name| std::fs::read(directory.join(name)).map_err(|error| error.to_string()),
             "a readable file, relative to the rig file",
-        )
+        )?;
+        Ok(Self { path: Some(path.to_owned()), ..rig })
     }
 
     /// The same from files in memory: the rig file first, then everything it refers to by the names it uses.
@@ -177,6 +180,7 @@ impl Rig {
             limits: settings.limits,
             warning: settings.warning,
             chart: settings.chart,
+            path: None,
             content_hash: source.content_hash(),
             files: source.into_files(),
             contents: built.contents,

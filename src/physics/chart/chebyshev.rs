@@ -1,15 +1,112 @@
-//! Tensor Chebyshev interpolation on a box.
+//! Chebyshev polynomials of bounded total degree on a box, fitted to values and slopes at scattered points.
+
+use faer::prelude::*;
+use faer::{Mat, linalg::solvers::Qr};
+
+use super::MAX_AXES;
+
+/// Products of Chebyshev polynomials of at most `degree` in all, lowest degree first.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Basis {
+    axes: usize,
+    degree: usize,
+    degrees: Vec<[u8; MAX_AXES]>,
+}
 
 /// Polynomials a smooth function of one variable is expanded in at most.
 pub const MOST_DEGREES: usize = 32;
 
-/// Nodes per axis by the number of axes: fewer where their number is a power.
-pub fn nodes_per_axis(axes: usize) -> usize {
-    match axes {
-        0 | 1 => 17,
-        2 => 9,
-        _ => 7,
+/// Largest degree of a basis.
+const MAX_DEGREE: usize = 24;
+
+impl Basis {
+    /// The basis of `axes` axes and total degree `degree`.
+    pub fn new(axes: usize, degree: usize) -> Self {
+        assert!(axes <= MAX_AXES && degree <= MAX_DEGREE, "{axes} axes of degree {degree}");
+        let mut degrees = vec![];
+        let range = |k: usize| 0..=if k < axes { degree as u8 } else { 0 };
+        for (a, b, c) in range(0).flat_map(|a| range(1).flat_map(move |b| range(2).map(move |c| (a, b, c)))) {
+            if usize::from(a) + usize::from(b) + usize::from(c) <= degree {
+                degrees.push([a, b, c]);
+            }
+        }
+        degrees.sort_by_key(|d| (total(d), std::cmp::Reverse(*d)));
+        Self { axes, degree, degrees }
     }
+
+    /// The total degree used for a number of axes: as high as keeps evaluation short.
+    pub fn for_axes(axes: usize) -> Self {
+        Self::new(
+            axes,
+            match axes {
+                0 | 1 => 20,
+                2 => 12,
+                _ => 14,
+            },
+        )
+    }
+
+    /// Number of polynomials.
+    pub fn len(&self) -> usize {
+        self.degrees.len()
+    }
+
+    /// The highest total degree.
+    pub fn degree(&self) -> usize {
+        self.degree
+    }
+
+    /// The polynomials of total degree `degree`, which stand together.
+    pub fn of_degree(&self, degree: usize) -> std::ops::Range<usize> {
+        let below = |degree: usize| (0..self.axes).fold(1, |count, k| count * (degree + k) / (k + 1));
+        below(degree)..below(degree + 1)
+    }
+
+    /// The sum of the sizes of all coefficients beyond total degree `degree`.
+    pub fn beyond(&self, coefficients: &[f64], degree: usize) -> f64 {
+        coefficients[self.of_degree(degree).end.min(coefficients.len())..].iter().map(|c| c.abs()).sum()
+    }
+
+    /// Their values at `unit`, each coordinate in `[-1, 1]`.
+    pub fn values(&self, unit: &[f64; MAX_AXES], out: &mut Vec<f64>) {
+        let tables = unit.map(table);
+        out.clear();
+        out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| tables[k][usize::from(d[k])]).product::<f64>()));
+    }
+
+    /// Their slopes along `axis` at `unit`, by recurrence `T'_n = n U_{n-1}`.
+    fn slopes(&self, unit: &[f64; MAX_AXES], axis: usize, out: &mut Vec<f64>) {
+        let tables = unit.map(table);
+        let mut slope = [0.0; MAX_DEGREE + 1];
+        let mut second = [0.0; MAX_DEGREE + 1]; // U_n
+        for n in 0..=MAX_DEGREE {
+            second[n] = match n {
+                0 => 1.0,
+                1 => 2.0 * unit[axis],
+                _ => 2.0 * unit[axis] * second[n - 1] - second[n - 2],
+            };
+            slope[n] = if n == 0 { 0.0 } else { n as f64 * second[n - 1] };
+        }
+        let factor = |d: &[u8; MAX_AXES], k: usize| {
+            let table = if k == axis { &slope } else { &tables[k] };
+            table[usize::from(d[k])]
+        };
+        out.clear();
+        out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| factor(d, k)).product::<f64>()));
+    }
+
+    /// The axis along which the two highest degrees of `coefficients` weigh most.
+    fn worst_axis(&self, coefficients: impl Iterator<Item = f64>) -> usize {
+        let mut by_axis = [0.0; MAX_AXES];
+        for (d, c) in self.degrees.iter().zip(coefficients).filter(|(d, _)| total(d) + 1 >= self.degree) {
+            by_axis.iter_mut().zip(d).for_each(|(sum, &degree)| *sum += f64::from(degree) * c.abs());
+        }
+        (0..self.axes).max_by(|&a, &b| by_axis[a].total_cmp(&by_axis[b])).unwrap_or(0)
+    }
+}
+
+fn total(degrees: &[u8; MAX_AXES]) -> usize {
+    degrees.iter().map(|&d| usize::from(d)).sum()
 }
 
 /// Chebyshev points of the first kind in `[-1, 1]`, `cos(π (2k + 1) / 2m)`.
@@ -17,8 +114,18 @@ pub fn nodes(m: usize) -> Vec<f64> {
     (0..m).map(|k| (std::f64::consts::PI * (2 * k + 1) as f64 / (2 * m) as f64).cos()).collect()
 }
 
-/// `T_0(x) .. T_{m-1}(x)` into `out`.
-pub fn polynomials(x: f64, out: &mut [f64]) {
+/// Coefficients of the interpolant through `values` at as many [`nodes`].
+pub fn coefficients(values: &[f64]) -> Vec<f64> {
+    let m = values.len();
+    let cosine =
+        |degree: usize, k: usize| (std::f64::consts::PI * (degree * (2 * k + 1)) as f64 / (2 * m) as f64).cos();
+    let weight = |degree: usize| if degree == 0 { 1.0 } else { 2.0 } / m as f64;
+    let sum = |degree: usize| values.iter().enumerate().map(|(k, value)| cosine(degree, k) * value).sum::<f64>();
+    (0..m).map(|degree| weight(degree) * sum(degree)).collect()
+}
+
+/// `T_0(x), T_1(x), ..` into `out`.
+fn polynomials(x: f64, out: &mut [f64]) {
     for k in 0..out.len() {
         out[k] = match k {
             0 => 1.0,
@@ -26,6 +133,12 @@ pub fn polynomials(x: f64, out: &mut [f64]) {
             _ => 2.0 * x * out[k - 1] - out[k - 2],
         };
     }
+}
+
+fn table(x: f64) -> [f64; MAX_DEGREE + 1] {
+    let mut out = [0.0; MAX_DEGREE + 1];
+    polynomials(x, &mut out);
+    out
 }
 
 /// `x T_k(x / range)`; not a number beyond the range, where the expansion it belongs to means nothing. Differences
@@ -55,53 +168,88 @@ pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
     t + degree as f64 * y * u
 }
 
-/// Coefficients of the interpolant through `values` at the tensor nodes of `axes` axes with `m` nodes each, axis 0
-/// fastest; in place, value by value of the first axis turned into coefficient by coefficient, then the next axis.
-pub fn coefficients(values: &mut [f64], m: usize, axes: usize) {
-    let transform: Vec<f64> = (0..m)
-        .flat_map(|degree| {
-            let weight = if degree == 0 { 1.0 } else { 2.0 } / m as f64;
-            (0..m).map(move |k| weight * (std::f64::consts::PI * (degree * (2 * k + 1)) as f64 / (2 * m) as f64).cos())
-        })
-        .collect();
-    let mut line = vec![0.0; m];
-    for axis in 0..axes {
-        let stride = m.pow(axis as u32);
-        for start in (0..values.len()).filter(|start| (start / stride).is_multiple_of(m)) {
-            for (k, slot) in line.iter_mut().enumerate() {
-                *slot = values[start + k * stride];
-            }
-            for degree in 0..m {
-                let row = &transform[degree * m..(degree + 1) * m];
-                values[start + degree * stride] = row.iter().zip(&line).map(|(t, v)| t * v).sum();
-            }
-        }
-    }
+/// An expansion of one function.
+pub struct Fitted {
+    /// Coefficients of the basis.
+    pub coefficients: Vec<f64>,
+    /// What the expansion leaves out, estimated: the largest misfit of a value, and what the highest total degree amounts to
+    /// at most, over the points.
+    pub missing: f64,
+    /// The axis along which it converges worst.
+    pub worst_axis: usize,
 }
 
-/// The degree along each axis of the coefficient at `index`.
-pub fn degrees(index: usize, m: usize, axes: usize) -> impl Iterator<Item = usize> {
-    (0..axes).map(move |axis| index / m.pow(axis as u32) % m)
+/// A least-squares fit of values and slopes at given points.
+pub struct Fit {
+    basis: Basis,
+    rows: Mat<f64>,
+    weights: Vec<f64>,
+    qr: Qr<f64>,
 }
 
-/// What interpolation leaves out, estimated from coefficients that fall off geometrically: the sum of those of the two
-/// highest degrees along each axis; and the axis that contributes most.
-pub fn tail(coefficients: &[f64], m: usize, axes: usize) -> (f64, usize) {
-    let mut by_axis = vec![0.0; axes.max(1)];
-    for (index, value) in coefficients.iter().enumerate() {
-        for (axis, degree) in degrees(index, m, axes).enumerate() {
-            if degree + 2 >= m {
-                by_axis[axis] += value.abs();
+impl Fit {
+    /// For data at `units`: at each point the value, then the slope along each axis, which is left out where it is not
+    /// `sound`. `None` where the points do not determine the coefficients.
+    pub fn new(basis: &Basis, units: &[[f64; MAX_AXES]], sound: &[bool]) -> Option<Self> {
+        let axes = basis.axes;
+        let mut rows = Mat::zeros(units.len() * (1 + axes), basis.len());
+        let mut weights = vec![];
+        let mut row = vec![];
+        for (unit, &sound) in units.iter().zip(sound) {
+            for part in 0..=axes {
+                let weight = if part == 0 {
+                    basis.values(unit, &mut row);
+                    1.0
+                } else {
+                    basis.slopes(unit, part - 1, &mut row);
+                    // As a slope in θ, x = cos θ, which is of the order of the degree everywhere.
+                    let (x, degree) = (unit[part - 1], basis.degree.max(1) as f64);
+                    if sound { (1.0 - x * x).max(0.0).sqrt().max(1.0 / degree) / degree } else { 0.0 }
+                };
+                for (column, value) in row.iter().enumerate() {
+                    rows[(weights.len(), column)] = weight * value;
+                }
+                weights.push(weight);
             }
         }
+        let known = weights.iter().filter(|&&weight| weight > 0.0).count();
+        if known < basis.len() {
+            return None;
+        }
+        let qr = rows.qr();
+        let pivot = |k: usize| qr.R()[(k, k)].abs();
+        let smallest = (0..basis.len()).map(pivot).fold(f64::INFINITY, f64::min);
+        (smallest > 1e-3 * pivot(0)).then_some(Self { basis: basis.clone(), rows, weights, qr })
     }
-    let worst = (0..by_axis.len()).max_by(|&a, &b| by_axis[a].total_cmp(&by_axis[b])).unwrap_or(0);
-    (by_axis.iter().sum(), worst)
+
+    /// The expansions of the columns of `data`, ordered as said at [`Fit::new`].
+    pub fn expand(&self, mut data: Mat<f64>) -> Vec<Fitted> {
+        for (row, &weight) in self.weights.iter().enumerate() {
+            (0..data.ncols()).for_each(|column| data[(row, column)] *= weight);
+        }
+        let coefficients = self.qr.solve_lstsq(&data);
+        let highest = self.basis.of_degree(self.basis.degree);
+        let last = self.rows.get(.., highest.clone()) * coefficients.get(highest, ..);
+        let fitted = &self.rows * &coefficients;
+        let values = || (0..data.nrows()).step_by(1 + self.basis.axes);
+        (0..data.ncols())
+            .map(|column| {
+                let misfit =
+                    values().map(|row| (fitted[(row, column)] - data[(row, column)]).abs()).fold(0.0, f64::max);
+                let tail = values().map(|row| last[(row, column)].abs()).fold(0.0, f64::max);
+                let coefficients: Vec<f64> = (0..self.basis.len()).map(|row| coefficients[(row, column)]).collect();
+                // NaN, of data that are not numbers, must not be lost in a maximum.
+                let missing = if coefficients[0].is_nan() { f64::NAN } else { misfit + tail };
+                Fitted { worst_axis: self.basis.worst_axis(coefficients.iter().copied()), coefficients, missing }
+            })
+            .collect()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::physics::chart::samples::spread;
 
     /// Central differences of step h err by h² f'''/6, below 1e-7 here.
     #[test]
@@ -115,22 +263,31 @@ mod tests {
         }
     }
 
-    /// An analytic function of two variables, interpolated and evaluated elsewhere.
+    /// An analytic function of three variables, fitted and evaluated elsewhere.
     #[test]
-    fn interpolates_in_two_variables() {
-        let f = |x: f64, y: f64| (0.7 * x - 0.3 * y).exp() / (3.0 + x * y);
-        let m = 16;
-        let points = nodes(m);
-        let mut values: Vec<f64> = (0..m * m).map(|k| f(points[k % m], points[k / m])).collect();
-        coefficients(&mut values, m, 2);
-        let (mut tx, mut ty) = (vec![0.0; m], vec![0.0; m]);
-        for (x, y) in [(0.3, -0.8), (-0.99, 0.99), (0.0, 0.5)] {
-            polynomials(x, &mut tx);
-            polynomials(y, &mut ty);
-            let sum: f64 = (0..m * m).map(|k| values[k] * tx[k % m] * ty[k / m]).sum();
-            // The interpolant converges like (3 + √8)^-m, about 1e-12.
-            assert!((sum - f(x, y)).abs() < 1e-11, "{sum} is not {}", f(x, y));
+    fn fits_in_three_variables() {
+        let f = |x: [f64; 3]| (0.7 * x[0] - 0.3 * x[1]).exp() / (5.0 + x[0] * x[1] + x[2]);
+        let h = 1e-5;
+        let slope = |x: [f64; 3], k: usize| {
+            let (mut up, mut down) = (x, x);
+            up[k] += h;
+            down[k] -= h;
+            (f(up) - f(down)) / (2.0 * h)
+        };
+        let basis = Basis::new(3, 8);
+        let units = spread(3, &[], 60);
+        let fit = Fit::new(&basis, &units, &[true; 60]).expect("the points determine it");
+        let data = Mat::from_fn(240, 1, |row, _| {
+            let unit = units[row / 4];
+            if row % 4 == 0 { f(unit) } else { slope(unit, row % 4 - 1) }
+        });
+        let fitted = fit.expand(data).remove(0);
+        let mut values = vec![];
+        for unit in [[0.3, -0.8, 0.1], [-0.99, 0.99, 0.99], [0.0, 0.5, -0.7]] {
+            basis.values(&unit, &mut values);
+            let sum: f64 = fitted.coefficients.iter().zip(&values).map(|(c, v)| c * v).sum();
+            let bound = 4.0 * fitted.missing;
+            assert!((sum - f(unit)).abs() < bound && bound < 1e-2, "{sum} is not {}: {bound:e}", f(unit));
         }
-        assert!(tail(&values, m, 2).0 < 1e-9);
     }
 }

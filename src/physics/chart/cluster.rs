@@ -22,6 +22,29 @@ pub fn symmetric_functions(z: &[c64]) -> Vec<c64> {
     std::iter::once(mean).chain(polynomial.into_iter().skip(2)).collect()
 }
 
+/// The slopes of [`symmetric_functions`] where the roots `z` have slopes `dz`.
+pub fn symmetric_slopes(z: &[c64], dz: &[c64]) -> Vec<c64> {
+    let mean = |z: &[c64]| z.iter().sum::<c64>() / z.len() as f64;
+    let (centre, drift) = (mean(z), mean(dz));
+    let mut slopes = vec![c64::ZERO; z.len()];
+    slopes[0] = drift;
+    for (i, &dz) in dz.iter().enumerate() {
+        // The product of all other factors, w^(k-1) first.
+        let mut others = vec![c64::new(1.0, 0.0)];
+        for (_, &root) in z.iter().enumerate().filter(|&(j, _)| j != i) {
+            others.push(c64::ZERO);
+            for k in (1..others.len()).rev() {
+                let below = others[k - 1];
+                others[k] -= (root - centre) * below;
+            }
+        }
+        for (slope, coefficient) in slopes[1..].iter_mut().zip(&others[1..]) {
+            *slope -= (dz - drift) * coefficient;
+        }
+    }
+    slopes
+}
+
 /// The roots of a cluster of `functions.len()` from its symmetric functions, and a bound of each one's error from
 /// bounds of theirs.
 ///
@@ -31,15 +54,7 @@ pub fn symmetric_functions(z: &[c64]) -> Vec<c64> {
 pub fn roots(functions: &[c64], errors: &[f64], out: &mut [(c64, f64); MAX_SIZE]) {
     let k = functions.len();
     let mean = functions[0];
-    let mut w = [c64::ZERO; MAX_SIZE];
-    match k {
-        1 => {}
-        2 => {
-            let half = (-functions[1]).sqrt();
-            (w[0], w[1]) = (half, -half);
-        }
-        _ => simultaneous(&functions[1..], &mut w[..k]),
-    }
+    let w = offsets(functions);
     for i in 0..k {
         let (mut rho, mut slope) = (0.0, c64::new(1.0, 0.0));
         let size = w[i].norm();
@@ -56,6 +71,20 @@ pub fn roots(functions: &[c64], errors: &[f64], out: &mut [(c64, f64); MAX_SIZE]
         let spread = if rho == 0.0 { 0.0 } else { far.min(near) };
         out[i] = (mean + w[i], errors[0] + spread);
     }
+}
+
+/// The roots of a cluster less their mean.
+pub fn offsets(functions: &[c64]) -> [c64; MAX_SIZE] {
+    let mut w = [c64::ZERO; MAX_SIZE];
+    match functions.len() {
+        0 | 1 => {}
+        2 => {
+            let half = (-functions[1]).sqrt();
+            (w[0], w[1]) = (half, -half);
+        }
+        k => simultaneous(&functions[1..], &mut w[..k]),
+    }
+    w
 }
 
 /// All roots of `w^k + a_0 w^(k-2) + a_1 w^(k-3) + ..` at once (Aberth 1973).

@@ -9,13 +9,19 @@
 pub mod build;
 pub(super) mod chebyshev;
 mod cluster;
+pub mod hold_out;
+mod samples;
+mod words;
 
 use faer::c64;
 
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError};
 use super::summary::Mode;
+use chebyshev::Basis;
 use cluster::MAX_SIZE;
+
+pub use words::FORMAT;
 
 /// A condition that a chart depends on; its coordinate inside a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,8 +30,10 @@ pub enum Axis {
     Friction,
     /// Normal load, by its logarithm.
     Load,
-    /// Disc speed, by its logarithm; one direction of rotation.
+    /// Disc speed, by minus its inverse, which lateral friction is linear in; one direction of rotation.
     Speed,
+    /// Load over speed, where nothing else of either matters.
+    LoadOverSpeed,
 }
 
 impl Axis {
@@ -33,7 +41,8 @@ impl Axis {
         match self {
             Self::Friction => p.friction_coefficient,
             Self::Load => p.normal_load_n.ln(),
-            Self::Speed => p.disc_speed_rad_s.ln(),
+            Self::Speed => -1.0 / p.disc_speed_rad_s,
+            Self::LoadOverSpeed => p.normal_load_n / p.disc_speed_rad_s,
         }
     }
 
@@ -41,7 +50,18 @@ impl Axis {
         match self {
             Self::Friction => p.friction_coefficient = coordinate,
             Self::Load => p.normal_load_n = coordinate.exp(),
-            Self::Speed => p.disc_speed_rad_s = coordinate.exp(),
+            Self::Speed => p.disc_speed_rad_s = -1.0 / coordinate,
+            Self::LoadOverSpeed => p.normal_load_n = coordinate * p.disc_speed_rad_s,
+        }
+    }
+
+    /// A measure of conditions: equal steps of it hold equally many, if speeds and loads are evenly spread.
+    fn condition(self, coordinate: f64) -> f64 {
+        match self {
+            Self::Friction => coordinate,
+            Self::Load => coordinate.exp(),
+            // At a given load, evenly spread speeds.
+            Self::Speed | Self::LoadOverSpeed => -1.0 / coordinate,
         }
     }
 }
@@ -73,6 +93,8 @@ enum Branch {
     Leaf(usize),
     /// Not converged: a dense solve is due there.
     Dense,
+    /// Not yet tried: a dense solve is due there meanwhile.
+    Pending,
 }
 
 /// Some roots of a leaf.
@@ -96,9 +118,11 @@ struct Leaf {
     low: [f64; MAX_AXES],
     high: [f64; MAX_AXES],
     clusters: Vec<Cluster>,
-    /// Channels, the last two (or three) of them what the charted roots leave of the traces.
-    channels: usize,
-    /// `basis × channels`, channel fastest.
+    /// How many channels have coefficients of each total degree: those of high degree come first.
+    widths: Vec<usize>,
+    /// Where the two channels begin that hold what the charted roots leave of the traces.
+    remainder: usize,
+    /// Degree by degree, polynomial by polynomial, channel fastest.
     coefficients: Vec<f64>,
     /// Error bounds of the two remainders.
     remainder_errors: [f64; 2],
@@ -110,7 +134,7 @@ pub struct Chart {
     axes: Vec<Axis>,
     low: [f64; MAX_AXES],
     high: [f64; MAX_AXES],
-    nodes_per_axis: usize,
+    basis: Basis,
     branches: Vec<Branch>,
     leaves: Vec<Leaf>,
     /// Roots are charted by `λ²` where no damping takes part, by `λ` otherwise.
@@ -142,36 +166,55 @@ impl Chart {
         self.leaves.iter().map(|leaf| 8 * leaf.coefficients.len()).sum()
     }
 
-    /// Share of the box, by volume in its coordinates, that did not converge.
+    /// Share of the conditions, evenly spread over friction coefficient, load and speed, that have no leaf.
     pub fn dense_share(&self) -> f64 {
-        let total: f64 = (0..self.axes.len()).map(|k| self.high[k] - self.low[k]).product();
-        let charted: f64 = self
-            .leaves
-            .iter()
-            .map(|leaf| (0..self.axes.len()).map(|k| leaf.high[k] - leaf.low[k]).product::<f64>())
-            .sum();
-        1.0 - charted / total
+        1.0 - self.leaves.iter().map(|leaf| self.share(&leaf.low, &leaf.high)).sum::<f64>()
     }
 
-    /// Every number that a prediction can depend on, as bits: two charts with equal words predict the same.
-    pub fn words(&self) -> impl Iterator<Item = u64> {
-        let branches = self.branches.iter().flat_map(|branch| match *branch {
-            Branch::Split { axis, at, below, above } => [axis as u64, at.to_bits(), below as u64, above as u64],
-            Branch::Leaf(leaf) => [u64::MAX, leaf as u64, 0, 0],
-            Branch::Dense => [u64::MAX, u64::MAX, 0, 0],
-        });
-        let leaves = self.leaves.iter().flat_map(|leaf| {
-            let clusters = leaf.clusters.iter().flat_map(|cluster| {
-                let ids = cluster.ids.iter().map(|&id| u64::from(id));
-                let errors = cluster.errors.iter().map(|error| error.to_bits());
-                let rest =
-                    [cluster.channel, cluster.share.map_or(0, |share| share + 1), usize::from(cluster.ascending)];
-                ids.chain(errors).chain(rest.map(|number| number as u64))
-            });
-            let numbers = leaf.coefficients.iter().chain(&leaf.remainder_errors).chain(&leaf.low).chain(&leaf.high);
-            clusters.chain(numbers.map(|number| number.to_bits()))
-        });
-        branches.chain(leaves)
+    /// Share of the conditions that a box holds.
+    fn share(&self, low: &[f64; MAX_AXES], high: &[f64; MAX_AXES]) -> f64 {
+        let width = |axis: &Axis, low: f64, high: f64| axis.condition(high) - axis.condition(low);
+        let along = |k: usize| width(&self.axes[k], low[k], high[k]) / width(&self.axes[k], self.low[k], self.high[k]);
+        (0..self.axes.len()).map(along).product()
+    }
+
+    /// Every box of the tree, with its place among the branches.
+    fn boxes(&self) -> impl Iterator<Item = (usize, [f64; MAX_AXES], [f64; MAX_AXES])> {
+        let mut open = vec![(0, self.low, self.high)];
+        std::iter::from_fn(move || {
+            let (slot, low, high) = open.pop()?;
+            if let Branch::Split { axis, at, below, above } = self.branches[slot] {
+                let (mut middle_high, mut middle_low) = (high, low);
+                (middle_high[axis], middle_low[axis]) = (at, at);
+                open.extend([(above, middle_low, high), (below, low, middle_high)]);
+            }
+            Some((slot, low, high))
+        })
+    }
+
+    /// Share of the conditions that is charted or given up.
+    fn settled_share(&self) -> f64 {
+        let pending = self.boxes().filter(|(slot, ..)| matches!(self.branches[*slot], Branch::Pending));
+        1.0 - pending.map(|(_, low, high)| self.share(&low, &high)).sum::<f64>()
+    }
+
+    /// A chart of one leaf, to try it.
+    fn with_only(&self, leaf: &Leaf) -> Self {
+        Self {
+            axes: self.axes.clone(),
+            low: leaf.low,
+            high: leaf.high,
+            basis: self.basis.clone(),
+            branches: vec![Branch::Leaf(0)],
+            leaves: vec![leaf.clone()],
+            undamped: self.undamped,
+            solves: 0,
+        }
+    }
+
+    /// Whether every box was charted or given up; otherwise a build can go on from it.
+    pub fn is_complete(&self) -> bool {
+        !self.branches.iter().any(|branch| matches!(branch, Branch::Pending))
     }
 
     /// The charted roots at `p`, appended to `out` in no particular order, without residuals, with shares of the
@@ -186,16 +229,7 @@ impl Chart {
         scratch: &mut Scratch,
         out: &mut Vec<Mode>,
     ) -> Result<(), NotCharted> {
-        let mut x = [0.0; MAX_AXES];
-        for (k, axis) in self.axes.iter().enumerate() {
-            x[k] = axis.coordinate(p);
-            // Written so that NaN is outside.
-            if !(x[k] >= self.low[k] && x[k] <= self.high[k]) {
-                return Err(NotCharted::Outside);
-            }
-        }
-        let leaf = &self.leaves[self.find(&x)?];
-        self.expand(leaf, &x, scratch);
+        let leaf = self.expand(p, scratch)?;
         let values = &scratch.channels;
         let before = out.len();
         let mut found = [0.0; 2];
@@ -203,14 +237,7 @@ impl Chart {
         let mut roots = [(c64::ZERO, 0.0); MAX_SIZE];
         for cluster in &leaf.clusters {
             let size = cluster.ids.len();
-            let mut functions = [c64::ZERO; MAX_SIZE];
-            for (m, function) in functions[..size].iter_mut().enumerate() {
-                *function = if self.undamped {
-                    c64::new(values[cluster.channel + m], 0.0)
-                } else {
-                    c64::new(values[cluster.channel + 2 * m], values[cluster.channel + 2 * m + 1])
-                };
-            }
+            let functions = self.functions(cluster, values);
             cluster::roots(&functions[..size], &cluster.errors, &mut roots);
             self.sort_pair(cluster, &mut roots);
             let gap = if size == 2 { (roots[0].0 - roots[1].0).norm() } else { f64::INFINITY };
@@ -226,7 +253,7 @@ impl Chart {
             }
         }
         for moment in 0..2 {
-            let rest = values[leaf.channels - 2 + moment];
+            let rest = values[leaf.remainder + moment];
             let difference = (found[moment] + rest - traces[moment]).abs();
             let limit = limit[moment] + leaf.remainder_errors[moment];
             if difference.is_nan() || difference > limit {
@@ -243,36 +270,65 @@ impl Chart {
             match self.branches[at] {
                 Branch::Split { axis, at: middle, below, above } => at = if x[axis] < middle { below } else { above },
                 Branch::Leaf(leaf) => return Ok(leaf),
-                Branch::Dense => return Err(NotCharted::NotConverged),
+                Branch::Dense | Branch::Pending => return Err(NotCharted::NotConverged),
             }
         }
     }
 
-    /// All channels of `leaf` at `x`.
-    fn expand(&self, leaf: &Leaf, x: &[f64; MAX_AXES], scratch: &mut Scratch) {
-        let (m, axes) = (self.nodes_per_axis, self.axes.len());
-        scratch.basis.clear();
-        scratch.basis.push(1.0);
-        let mut polynomials = [0.0; 32];
-        for (k, x) in x[..axes].iter().enumerate() {
-            let unit = 2.0 * (x - leaf.low[k]) / (leaf.high[k] - leaf.low[k]) - 1.0;
-            chebyshev::polynomials(unit, &mut polynomials[..m]);
-            let inner = scratch.basis.len();
-            scratch.basis.resize(inner * m, 0.0);
-            // From the highest degree down, so that the lower ones are still there to multiply.
-            for degree in (0..m).rev() {
-                for i in 0..inner {
-                    scratch.basis[degree * inner + i] = scratch.basis[i] * polynomials[degree];
-                }
+    /// The charted roots at `p` alone, appended to `out` in no particular order: `λ²` of an undamped model, `λ` of a damped
+    /// one, without bounds and unchecked.
+    ///
+    /// # Errors
+    /// [`NotCharted`]; `out` is then as it was.
+    pub fn values(&self, p: &OperatingPoint, scratch: &mut Scratch, out: &mut Vec<c64>) -> Result<(), NotCharted> {
+        let leaf = self.expand(p, scratch)?;
+        for cluster in &leaf.clusters {
+            let size = cluster.ids.len();
+            let functions = self.functions(cluster, &scratch.channels);
+            out.extend(cluster::offsets(&functions[..size])[..size].iter().map(|w| functions[0] + w));
+        }
+        Ok(())
+    }
+
+    /// The symmetric functions of a cluster out of the channels of its leaf.
+    fn functions(&self, cluster: &Cluster, channels: &[f64]) -> [c64; MAX_SIZE] {
+        let mut functions = [c64::ZERO; MAX_SIZE];
+        for (m, function) in functions[..cluster.ids.len()].iter_mut().enumerate() {
+            *function = if self.undamped {
+                c64::new(channels[cluster.channel + m], 0.0)
+            } else {
+                c64::new(channels[cluster.channel + 2 * m], channels[cluster.channel + 2 * m + 1])
+            };
+        }
+        functions
+    }
+
+    /// The leaf that holds `p`, with all of its channels evaluated there.
+    fn expand(&self, p: &OperatingPoint, scratch: &mut Scratch) -> Result<&Leaf, NotCharted> {
+        let mut x = [0.0; MAX_AXES];
+        for (k, axis) in self.axes.iter().enumerate() {
+            x[k] = axis.coordinate(p);
+            // Written so that NaN is outside.
+            if !(x[k] >= self.low[k] && x[k] <= self.high[k]) {
+                return Err(NotCharted::Outside);
             }
         }
+        let leaf = &self.leaves[self.find(&x)?];
+        let mut unit = [0.0; MAX_AXES];
+        for (k, unit) in unit[..self.axes.len()].iter_mut().enumerate() {
+            *unit = 2.0 * (x[k] - leaf.low[k]) / (leaf.high[k] - leaf.low[k]) - 1.0;
+        }
+        self.basis.values(&unit, &mut scratch.basis);
         scratch.channels.clear();
-        scratch.channels.resize(leaf.channels, 0.0);
-        for (weight, row) in scratch.basis.iter().zip(leaf.coefficients.chunks_exact(leaf.channels)) {
-            for (channel, coefficient) in scratch.channels.iter_mut().zip(row) {
-                *channel += weight * coefficient;
-            }
+        scratch.channels.resize(leaf.widths[0], 0.0);
+        let mut coefficients = leaf.coefficients.as_slice();
+        for (degree, &width) in leaf.widths.iter().enumerate() {
+            let weights = &scratch.basis[self.basis.of_degree(degree)];
+            let (block, rest) = coefficients.split_at(weights.len() * width);
+            accumulate(&mut scratch.channels[..width], weights, block);
+            coefficients = rest;
         }
+        Ok(leaf)
     }
 
     /// The root for a charted `z`; `apart` where an undamped one is known not to be one of a complex pair.
@@ -302,6 +358,28 @@ impl Chart {
         };
         if !in_order {
             roots.swap(0, 1);
+        }
+    }
+}
+
+/// Adds `weights` times `rows` to `sums`, four rows at a time: each sum is then loaded and stored a fourth as often.
+fn accumulate(sums: &mut [f64], weights: &[f64], rows: &[f64]) {
+    let width = sums.len();
+    if width == 0 {
+        return;
+    }
+    let whole = weights.len() / 4 * 4;
+    for (w, four) in weights.chunks_exact(4).zip(rows.chunks_exact(4 * width)) {
+        let (a, rest) = four.split_at(width);
+        let (b, rest) = rest.split_at(width);
+        let (c, d) = rest.split_at(width);
+        for ((((sum, a), b), c), d) in sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *sum += w[0] * a + w[1] * b + w[2] * c + w[3] * d;
+        }
+    }
+    for (w, row) in weights[whole..].iter().zip(rows[whole * width..].chunks_exact(width)) {
+        for (sum, value) in sums.iter_mut().zip(row) {
+            *sum += w * value;
         }
     }
 }

@@ -1,0 +1,135 @@
+//! Charts held against dense solves at conditions that took no part in building them.
+
+use faer::c64;
+
+use super::build::{ChartOptions, MERGING};
+use super::{Chart, NotCharted, Scratch};
+use crate::physics::model::{Model, Traces};
+use crate::physics::operating_point::OperatingPoint;
+use crate::physics::spectrum::{ROUNDING, SolveError, Solver, Spectrum, Vectors};
+use crate::physics::summary::Mode;
+use crate::physics::synthetic::Uniform;
+use crate::physics::tracking::tracked;
+
+/// What a comparison found.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct HoldOut {
+    /// Conditions that the chart answered.
+    pub charted: usize,
+    /// Conditions for which it has no leaf.
+    pub not_converged: usize,
+    /// Conditions at which its roots do not agree with the traces.
+    pub incomplete: usize,
+    /// Roots that differ from dense ones by more than the bounds of both.
+    pub violations: usize,
+    /// Largest relative error of `λ²` outside merging points ([`MERGING`]).
+    pub largest_error: f64,
+    /// The 99th percentile of those.
+    pub p99_error: f64,
+    /// Largest relative error of the mean `λ²` of two merging roots.
+    pub largest_mean_error: f64,
+    /// Largest bound relative to `|λ²|`, outside merging points.
+    pub largest_bound: f64,
+}
+
+/// A condition of the box, each value uniform.
+pub fn draw(options: &ChartOptions, uniform: &mut Uniform) -> OperatingPoint {
+    let mut between = |low: f64, high: f64| low + 0.5 * (uniform.draw() + 1.0) * (high - low);
+    let ChartOptions { low, high, .. } = options;
+    OperatingPoint {
+        friction_coefficient: between(low.friction_coefficient, high.friction_coefficient),
+        normal_load_n: between(low.normal_load_n, high.normal_load_n),
+        disc_speed_rad_s: between(low.disc_speed_rad_s, high.disc_speed_rad_s),
+    }
+}
+
+/// Compares `chart` with dense solves at `conditions` random conditions of the box of `options`.
+///
+/// # Errors
+/// [`SolveError`] where a dense solve fails.
+pub fn hold_out(
+    model: &Model,
+    options: &ChartOptions,
+    chart: &Chart,
+    conditions: usize,
+    seed: u64,
+) -> Result<HoldOut, SolveError> {
+    let traces = Traces::new(model);
+    let mut solver = Solver::new(model.dimension());
+    let (mut scratch, mut modes) = (Scratch::default(), vec![]);
+    let mut uniform = Uniform::new(seed);
+    let mut found = HoldOut::default();
+    let mut errors = vec![];
+    for _ in 0..conditions {
+        let p = draw(options, &mut uniform);
+        modes.clear();
+        match chart.evaluate(&p, traces.at(model, &p), &mut scratch, &mut modes) {
+            Err(NotCharted::NotConverged | NotCharted::Outside) => found.not_converged += 1,
+            Err(NotCharted::Incomplete { .. }) => found.incomplete += 1,
+            Ok(()) => {
+                found.charted += 1;
+                found.compare(&modes, &solver.solve(model, &p, Vectors::Both)?, &mut errors);
+            }
+        }
+    }
+    errors.sort_by(f64::total_cmp);
+    found.largest_error = errors.last().copied().unwrap_or(0.0);
+    found.p99_error = errors.get(errors.len() * 99 / 100).copied().unwrap_or(0.0);
+    Ok(found)
+}
+
+impl HoldOut {
+    fn compare(&mut self, modes: &[Mode], spectrum: &Spectrum, errors: &mut Vec<f64>) {
+        let dense: Vec<c64> = spectrum.roots[..tracked(spectrum)].iter().map(|root| root.square).collect();
+        let partners = partners(modes, spectrum);
+        let mut charted: Vec<Option<c64>> = vec![None; dense.len()];
+        for (mode, partner) in modes.iter().zip(&partners) {
+            let Some((k, within)) = *partner else {
+                self.violations += 1;
+                continue;
+            };
+            charted[k] = Some(mode.root.square);
+            self.violations += usize::from(!within);
+        }
+        for (mode, partner) in modes.iter().zip(&partners) {
+            let Some((k, _)) = *partner else { continue };
+            let (root, size) = (dense[k], dense[k].norm());
+            let gap = |&j: &usize| (dense[j] - root).norm();
+            let nearest = (0..dense.len()).filter(|&j| j != k).min_by(|a, b| gap(a).total_cmp(&gap(b)));
+            match nearest.filter(|j| gap(j) < MERGING * size) {
+                None => {
+                    errors.push((mode.root.square - root).norm() / size);
+                    self.largest_bound = self.largest_bound.max(mode.root.error.square / size);
+                }
+                Some(j) => {
+                    if let Some(other) = charted[j] {
+                        let off = 0.5 * (mode.root.square + other - root - dense[j]).norm() / size;
+                        self.largest_mean_error = self.largest_mean_error.max(off);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// The dense root nearest to each charted one, each taken once, and whether it lies within the bounds of both.
+fn partners(modes: &[Mode], spectrum: &Spectrum) -> Vec<Option<(usize, bool)>> {
+    let rounding = ROUNDING * f64::EPSILON * spectrum.matrix_norm;
+    let mut left: Vec<usize> = (0..tracked(spectrum)).collect();
+    let partner = |mode: &Mode| {
+        let root = &mode.root;
+        let off = |k: usize| (spectrum.roots[k].square - root.square).norm();
+        let at = (0..left.len()).min_by(|&a, &b| off(left[a]).total_cmp(&off(left[b])))?;
+        let nearest = left.swap_remove(at);
+        let dense = spectrum.roots[nearest].error.square;
+        let slack = if spectrum.undamped { rounding } else { 2.0 * root.lambda.norm() * rounding };
+        let limit = root.error.square + if dense.is_finite() { dense } else { slack };
+        Some((nearest, off(nearest) <= limit))
+    };
+    modes.iter().map(partner).collect()
+}
+
+/// Whether every charted root has a dense root within the bounds of both, each dense root taken once.
+pub(super) fn within_bounds(modes: &[Mode], spectrum: &Spectrum) -> bool {
+    partners(modes, spectrum).iter().all(|partner| partner.is_some_and(|(_, within)| within))
+}

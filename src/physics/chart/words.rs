@@ -1,0 +1,148 @@
+//! A chart as words of 64 bits, and back: what is kept, compared and hashed.
+
+use super::chebyshev::Basis;
+use super::cluster::MAX_SIZE;
+use super::{Axis, Branch, Chart, Cluster, Leaf, MAX_AXES};
+
+/// Changes whenever the words, or what a build makes of a model, mean something else than before.
+pub const FORMAT: u64 = 2;
+
+const AXES: [Axis; 4] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed];
+
+impl Chart {
+    /// Everything there is to a chart: two with equal words predict the same.
+    pub fn words(&self) -> Vec<u64> {
+        let mut words = vec![FORMAT, u64::from(self.undamped), self.solves as u64, self.axes.len() as u64];
+        words.extend(self.axes.iter().map(|axis| *axis as u64));
+        words.push(self.basis.degree() as u64);
+        words.extend(self.low.iter().chain(&self.high).map(|x| x.to_bits()));
+        words.push(self.branches.len() as u64);
+        for branch in &self.branches {
+            words.extend(match *branch {
+                Branch::Split { axis, at, below, above } => [axis as u64, at.to_bits(), below as u64, above as u64],
+                Branch::Leaf(leaf) => [u64::MAX, leaf as u64, 0, 0],
+                Branch::Dense => [u64::MAX, u64::MAX, 0, 0],
+                Branch::Pending => [u64::MAX, u64::MAX, 1, 0],
+            });
+        }
+        words.push(self.leaves.len() as u64);
+        for leaf in &self.leaves {
+            let numbers = leaf.low.iter().chain(&leaf.high).chain(&leaf.remainder_errors);
+            words.extend(numbers.map(|x| x.to_bits()));
+            words.push(leaf.remainder as u64);
+            words.extend(leaf.widths.iter().map(|&width| width as u64));
+            words.push(leaf.clusters.len() as u64);
+            for cluster in &leaf.clusters {
+                let share = cluster.share.map_or(0, |share| share as u64 + 1);
+                words.extend([cluster.ids.len() as u64, cluster.channel as u64, share, u64::from(cluster.ascending)]);
+                words.extend(cluster.ids.iter().map(|&id| u64::from(id)));
+                words.extend(cluster.errors.iter().map(|error| error.to_bits()));
+            }
+            words.extend(leaf.coefficients.iter().map(|x| x.to_bits()));
+        }
+        words
+    }
+
+    /// The chart of [`Chart::words`]; `None` where the words are those of no chart.
+    pub fn from_words(words: &[u64]) -> Option<Self> {
+        let mut words = Reader(words);
+        if words.next()? != FORMAT {
+            return None;
+        }
+        let (undamped, solves) = (words.next()? != 0, words.count(usize::MAX)?);
+        let axes: Vec<Axis> = (0..words.count(MAX_AXES)?).map(|_| words.axis()).collect::<Option<_>>()?;
+        let basis = Basis::for_axes(axes.len());
+        if words.count(usize::MAX)? != basis.degree() {
+            return None;
+        }
+        let (low, high) = (words.numbers()?, words.numbers()?);
+        let count = words.count(words.0.len())?;
+        let branches: Vec<Branch> = (0..count).map(|k| words.branch(k, count)).collect::<Option<_>>()?;
+        let leaves: Vec<Leaf> =
+            (0..words.count(words.0.len())?).map(|_| words.leaf(&basis, undamped)).collect::<Option<_>>()?;
+        let known = branches.iter().all(|branch| !matches!(branch, Branch::Leaf(leaf) if *leaf >= leaves.len()));
+        let whole = words.0.is_empty() && known && count > 0;
+        whole.then_some(Self { axes, low, high, basis, branches, leaves, undamped, solves })
+    }
+}
+
+/// What is still to be read.
+struct Reader<'a>(&'a [u64]);
+
+impl Reader<'_> {
+    fn next(&mut self) -> Option<u64> {
+        let (&first, rest) = self.0.split_first()?;
+        self.0 = rest;
+        Some(first)
+    }
+
+    fn count(&mut self, most: usize) -> Option<usize> {
+        usize::try_from(self.next()?).ok().filter(|&count| count <= most)
+    }
+
+    fn number(&mut self) -> Option<f64> {
+        self.next().map(f64::from_bits)
+    }
+
+    fn numbers<const N: usize>(&mut self) -> Option<[f64; N]> {
+        let mut numbers = [0.0; N];
+        for number in &mut numbers {
+            *number = self.number()?;
+        }
+        Some(numbers)
+    }
+
+    fn axis(&mut self) -> Option<Axis> {
+        AXES.get(self.count(AXES.len())?).copied()
+    }
+
+    /// Branch `k` of `count`: what it splits into stands behind it.
+    fn branch(&mut self, k: usize, count: usize) -> Option<Branch> {
+        let words: [u64; 4] = [self.next()?, self.next()?, self.next()?, self.next()?];
+        Some(match words {
+            [u64::MAX, u64::MAX, 0, 0] => Branch::Dense,
+            [u64::MAX, u64::MAX, 1, 0] => Branch::Pending,
+            [u64::MAX, leaf, 0, 0] => Branch::Leaf(usize::try_from(leaf).ok()?),
+            [axis, at, below, above] => {
+                let (below, above) = (usize::try_from(below).ok()?, usize::try_from(above).ok()?);
+                let axis = usize::try_from(axis).ok().filter(|&axis| axis < MAX_AXES)?;
+                let behind = |other: usize| other > k && other < count;
+                (behind(below) && behind(above)).then_some(Branch::Split {
+                    axis,
+                    at: f64::from_bits(at),
+                    below,
+                    above,
+                })?
+            }
+        })
+    }
+
+    fn leaf(&mut self, basis: &Basis, undamped: bool) -> Option<Leaf> {
+        let (low, high, remainder_errors) = (self.numbers()?, self.numbers()?, self.numbers()?);
+        let remainder = self.count(usize::MAX)?;
+        let most = self.0.len();
+        let widths: Vec<usize> = (0..=basis.degree()).map(|_| self.count(most)).collect::<Option<_>>()?;
+        let descending = widths.windows(2).all(|pair| pair[0] >= pair[1]);
+        if !descending || remainder.checked_add(2)? > widths[0] {
+            return None;
+        }
+        let clusters = (0..self.count(most)?).map(|_| self.cluster(widths[0], undamped)).collect::<Option<_>>()?;
+        let count: usize = widths.iter().enumerate().map(|(degree, width)| basis.of_degree(degree).len() * width).sum();
+        if count > self.0.len() {
+            return None;
+        }
+        let coefficients = (0..count).map(|_| self.number()).collect::<Option<_>>()?;
+        Some(Leaf { low, high, clusters, widths, remainder, coefficients, remainder_errors })
+    }
+
+    fn cluster(&mut self, channels: usize, undamped: bool) -> Option<Cluster> {
+        let size = self.count(MAX_SIZE)?;
+        let channel = self.count(channels)?;
+        let share = self.count(channels)?.checked_sub(1);
+        let ascending = self.next()? != 0;
+        let ids = (0..size).map(|_| u32::try_from(self.next()?).ok()).collect::<Option<_>>()?;
+        let errors = (0..size).map(|_| self.number()).collect::<Option<_>>()?;
+        let parts = if undamped { 1 } else { 2 };
+        (size > 0 && channel + size * parts <= channels).then_some(Cluster { ids, channel, errors, share, ascending })
+    }
+}
