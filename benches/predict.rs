@@ -27,7 +27,7 @@ fn main() {
             high: point(1.0),
             band_max_hz: Some(5000.0),
             tolerance: 1e-8,
-            max_depth: 16,
+            smallest_share: 1e-4,
             max_solves: 100_000,
             threads: 1,
         };

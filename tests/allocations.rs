@@ -91,7 +91,7 @@ fn session(rig: &Arc<Rig>) -> Session {
 fn a_charted_condition_allocates_nothing() {
     let rig = synthetic(24);
     let mut session = session(&rig);
-    let chart = session_chart(&rig, 2).expect("it can be charted");
+    let chart = session_chart(&rig, 2, &|| true).expect("it can be charted");
     session.step(Event::ChartReady(Arc::new(chart))).expect("no setting");
     let mut bytes = vec![];
     let [_, first] = allocations(&mut session, &mut bytes, 0..500);

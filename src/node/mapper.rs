@@ -40,13 +40,13 @@ pub fn session_ends(
     Ends::carried(&rig.model, solver, map, point).map_err(|error| error.to_string())
 }
 
-/// The chart a session uses, the same whatever the number of threads.
+/// The chart a session uses, the same whatever the number of threads; `go_on` stops the work by saying no.
 ///
 /// # Errors
 /// Why there is none, in words.
-pub fn session_chart(rig: &Rig, threads: usize) -> Result<Chart, String> {
+pub fn session_chart(rig: &Rig, threads: usize, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
     let options = ChartOptions { threads, ..chart_options(rig) };
-    build(&rig.model, &options, &|_| true).map_err(|error| error.to_string())
+    build(&rig.model, &options, &|_| go_on()).map_err(|error| error.to_string())
 }
 
 /// The chart a session uses, from where it is `kept`, or built on from what is; `go_on` stops the work by saying no.
@@ -108,7 +108,7 @@ pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming
         let go_on = || !stopped.load(Ordering::Relaxed);
         let built = catch_unwind(AssertUnwindSafe(|| match &kept {
             Some(kept) => kept_chart(&rig, kept, &go_on),
-            None => build(&rig.model, &chart_options(&rig), &|_| go_on()).map_err(|error| error.to_string()),
+            None => session_chart(&rig, 1, &go_on),
         }));
         let chart = built.unwrap_or_else(|_| Err("internal error while the rig was charted".to_owned()));
         if go_on() {

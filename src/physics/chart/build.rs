@@ -116,8 +116,11 @@ pub fn resume(
     Ok(builder.chart)
 }
 
+/// One end of a box on every axis.
+type Corner = [f64; MAX_AXES];
+
 /// The axes that matter for `model`, and the box in their coordinates.
-fn domain(model: &Model, options: &ChartOptions) -> Result<(Vec<Axis>, [f64; MAX_AXES], [f64; MAX_AXES]), ChartError> {
+fn domain(model: &Model, options: &ChartOptions) -> Result<(Vec<Axis>, Corner, Corner), ChartError> {
     let (load, speed) = model.depends_on_load_and_speed();
     let mut axes = vec![Axis::Friction];
     if model.depends_on_load_over_speed_only() {

@@ -206,9 +206,9 @@ pub fn follow(samples: &[&Sample], units: &[[f64; MAX_AXES]], start: usize) -> O
             there[branch] = link.source[..count].iter().position(|&source| source == Some(root))?;
         }
         known[next] = Some(there);
-        for k in 0..samples.len() {
-            if distance(k, next) < nearest[k].0 {
-                nearest[k] = (distance(k, next), next);
+        for (k, nearest) in nearest.iter_mut().enumerate() {
+            if distance(k, next) < nearest.0 {
+                *nearest = (distance(k, next), next);
             }
         }
     }
