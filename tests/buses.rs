@@ -731,7 +731,7 @@ fn speed_of_the_bus() {
         let sink = ShmSink::spawn(options, into(predictions)).expect("sink");
         (ShmSource::new(options).expect("source"), heard, sink)
     };
-    let (node_source, node_heard, _node_sink) = source_and_sink(&node_bus);
+    let (node_source, node_heard, node_sink) = source_and_sink(&node_bus);
     let (bare_source, bare_heard, _bare_sink) = source_and_sink(&bare_bus);
     let mut seq = 0;
     let mut block = |source: &ShmSource, heard: &Receiver<Heard<Prediction>>, times: &mut Vec<Duration>| {
@@ -807,6 +807,8 @@ fn speed_of_the_bus() {
         take(heard.message);
     }
     println!("10 kHz: {COUNT} sent in {sent_in:.1?}, {heard_count} answered, {gaps} missing");
+    let seen = node.watch.snapshot();
+    println!("{:?}, {} passed over; sink {:?}", seen.counters, seen.passed_over, node_sink.counts());
     assert_eq!((heard_count, gaps), (COUNT, 0));
     assert!(node_times[0] <= 2.0 * bus_times[0], "the node takes more than twice a bare round trip");
     assert!(first_prediction < Duration::from_millis(50), "{first_prediction:?}");
