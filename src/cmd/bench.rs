@@ -29,7 +29,7 @@ pub struct Options {
     /// Contact pairs of the rigs
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(1..))]
     pairs: u16,
-    /// The same seed gives the same rigs and conditions
+    /// The same seed gives the same rigs and conditions; rigs are drawn from it on until one has merging points
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Modes up to this frequency are charted and compared
@@ -92,7 +92,7 @@ impl Options {
             machine: machine(),
             lapack: lapack.as_ref().map(|peer| format!("{}, one thread", peer.versions)),
             conditions: format!(
-                "{:?} rigs, {} contact pairs, seed {}; {} conditions, friction 0 to 1, 50 to 2000 N, 1 to 60 rad/s, one in ten within 1e-6 of a merging point; up to {} Hz",
+                "{:?} rigs, {} contact pairs, seeds from {}; {} conditions, friction 0 to 1, 50 to 2000 N, 1 to 60 rad/s, one in ten within 1e-6 of a merging point where the rig has any; up to {} Hz",
                 self.rig, self.pairs, self.seed, self.conditions, self.band_max_hz
             ),
             routes: vec![],
@@ -177,8 +177,9 @@ fn table(report: &Report) -> String {
     let _ =
         writeln!(text, "\nerrors: relative, of the squared eigenvalue; pairs near merging by mean and discriminant");
     for offline in &report.offline {
-        let Offline { modes, merging_points, map_s, chart_s, chart_solves, chart_leaves, chart_bytes, .. } = offline;
-        let _ = write!(text, "n = {modes}: {merging_points} merging points mapped in {map_s:.1} s; ");
+        let Offline { modes, seed, merging_points, map_s, chart_s, chart_solves, chart_leaves, chart_bytes, .. } =
+            offline;
+        let _ = write!(text, "n = {modes}, seed {seed}: {merging_points} merging points mapped in {map_s:.1} s; ");
         let _ = if offline.chart_built {
             writeln!(
                 text,
