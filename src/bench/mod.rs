@@ -387,8 +387,11 @@ fn chart(model: &Model, plan: &Plan, say: &dyn Fn(&str)) -> anyhow::Result<Optio
     }
 }
 
-/// A few modes of the band to thirty digits, each with those that it merges with; `None` for one that was not found. The nearest pair
-/// is always among them.
+/// Nearest roots closer than this, relative to themselves, are compared as a pair.
+const NEARLY_MERGED: f64 = 1e-2;
+
+/// A few modes of the band to thirty digits, each with those that it merges with, the nearest pair among them where it is close to
+/// merging; `None` for one that was not found.
 fn refined(
     model: &Model,
     p: &OperatingPoint,
@@ -404,6 +407,16 @@ fn refined(
     clusters.retain(in_band);
     ensure!(!clusters.is_empty(), "no mode below {} Hz", plan.band_max_hz);
     let (mut chosen, mut single): (Vec<_>, Vec<_>) = clusters.into_iter().partition(|cluster| cluster.len() > 1);
+    let gap = |i: usize, j: usize| {
+        let (a, b) = (reference::solved_for(spectrum, single[i][0]), reference::solved_for(spectrum, single[j][0]));
+        (a - b).norm() / a.norm()
+    };
+    let pairs = (0..single.len()).flat_map(|j| (0..j).map(move |i| (i, j)));
+    let nearest = pairs.min_by(|a, b| gap(a.0, a.1).total_cmp(&gap(b.0, b.1)));
+    if let Some((i, j)) = nearest.filter(|&(i, j)| gap(i, j) < NEARLY_MERGED) {
+        let pair = [single.swap_remove(j), single.swap_remove(i)].concat(); // the later one first: the other keeps its place
+        chosen.push(pair);
+    }
     while chosen.len() < plan.compared && !single.is_empty() {
         let k = (0.5 * (choice.draw() + 1.0) * single.len() as f64) as usize;
         chosen.push(single.swap_remove(k.min(single.len() - 1)));
