@@ -1,0 +1,70 @@
+//! The reference tribometer as files: sizes agree, the contact nodes of pad and disc coincide, matrices are symmetric
+//! and positive on the diagonal.
+#![cfg(feature = "node")]
+
+mod program;
+
+use std::fs;
+
+use program::{run, text};
+
+/// Rows of a CSV file below its header.
+fn rows(text: &str) -> Vec<Vec<&str>> {
+    text.lines().skip(1).map(|line| line.split(',').collect()).collect()
+}
+
+#[test]
+fn its_files_agree_with_each_other() {
+    let temp = tempfile::tempdir().unwrap();
+    let folder = temp.path().join("rig");
+    run(["tribometer", "--dof", "5000", "-o", &text(&folder)]).exits(0).says("degrees of freedom");
+    let file = |name: &str| fs::read_to_string(folder.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"));
+    let full: toml::Table = file("tribometer.toml").parse().unwrap();
+    let (mut sizes, mut contact, mut node_count) = (vec![], vec![], 0);
+    for part in ["pad", "disc"] {
+        let (nodes_csv, rows_csv) = (file(&format!("{part}-nodes.csv")), file(&format!("{part}-rows.csv")));
+        let (nodes, degrees) = (rows(&nodes_csv), rows(&rows_csv));
+        node_count += nodes.len();
+        sizes.push(degrees.len());
+        for what in ["mass", "stiffness"] {
+            let matrix = file(full[part][what].as_str().unwrap());
+            let mut lines = matrix.lines();
+            assert_eq!(lines.next(), Some("%%MatrixMarket matrix coordinate real symmetric"), "{part} {what}");
+            let mut lines = lines.filter(|line| !line.starts_with('%'));
+            let size = format!("{} {} ", degrees.len(), degrees.len());
+            let entries = lines.next().unwrap().strip_prefix(&size).expect("as many rows as listed").parse().unwrap();
+            let (mut found, mut on_diagonal) = (0usize, 0);
+            for line in lines {
+                let values: Vec<&str> = line.split_whitespace().collect();
+                let value: f64 = values[2].parse().unwrap();
+                found += 1;
+                if values[0] == values[1] {
+                    on_diagonal += 1;
+                    assert!(value > 0.0, "{part} {what}: {line}");
+                }
+            }
+            assert_eq!((found, on_diagonal), (entries, degrees.len()), "{part} {what}");
+        }
+        let of_patch = full[part]["interface_nodes"].as_array().unwrap();
+        let place = |node: &toml::Value| {
+            let node = &nodes[usize::try_from(node.as_integer().unwrap()).unwrap()];
+            node.iter().map(|x| x.parse::<f64>().unwrap()).collect::<Vec<_>>()
+        };
+        contact.push(of_patch.iter().map(place).collect::<Vec<_>>());
+    }
+    assert!(sizes.iter().sum::<usize>() >= 5000, "{sizes:?}");
+    // The paper's 14 by 21 pairs. Coordinates are millimetres with few decimals, the same arithmetic on both sides.
+    assert_eq!((contact[0].len(), contact[1].len()), (294, 294));
+    for place in &contact[0] {
+        let nearest = contact[1]
+            .iter()
+            .map(|other| place.iter().zip(other).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max))
+            .fold(f64::INFINITY, f64::min);
+        assert!(nearest < 1e-12, "{place:?} is {nearest:e} m off its partner");
+    }
+    assert!(file("tribometer.vtk").contains(&format!("POINTS {node_count} double")));
+    for part in ["pad.inp", "disc.inp"] {
+        assert!(file(part).contains("C3D8I"), "{part}");
+    }
+    run(["tribometer", "--dof", "10", "-o", &text(&folder)]).exits(2).complains("5000");
+}
