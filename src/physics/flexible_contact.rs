@@ -209,3 +209,142 @@ fn symmetric_part(matrix: &Mat<f64>) -> Mat<f64> {
 fn one_norm(matrix: &Mat<f64>) -> f64 {
     matrix.col_iter().map(|column| column.norm_l1()).fold(0.0, f64::max)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::model::{ContactLaw, Term};
+    use super::super::operating_point::OperatingPoint;
+    use super::*;
+
+    const KEPT: usize = 4;
+    const ALL: usize = 12;
+    const PAIRS: usize = 3;
+
+    fn omega(mode: usize) -> f64 {
+        1000.0 * (mode + 1) as f64
+    }
+
+    /// Rows of relative displacement, no two alike.
+    fn rows(modes: usize, phase: f64) -> Mat<f64> {
+        Mat::from_fn(PAIRS, modes, |pair, mode| (phase + 1.7 * pair as f64 + 2.3 * mode as f64).sin())
+    }
+
+    fn pairs(modes: usize) -> ContactPairs {
+        ContactPairs {
+            normal: rows(modes, 0.3),
+            sliding: rows(modes, 1.1),
+            lateral: rows(modes, 2.0),
+            stiffness_n_per_m: vec![2e6, 3e6, 0.0],
+            damping_n_s_per_m: vec![5.0, 7.0, 1.0],
+            radius_m: vec![0.1; PAIRS],
+        }
+    }
+
+    fn free(modes: usize) -> Model {
+        let matrix = Mat::from_fn(modes, modes, |i, j| if i == j { omega(i).powi(2) } else { 0.0 });
+        let term = Term { matrix, law: Law::Constant };
+        Model::new(modes, vec![term], vec![], ContactLaw::default(), None).unwrap()
+    }
+
+    fn residual() -> ResidualFlexibility {
+        let all = pairs(ALL);
+        let sum = |rows: &Mat<f64>, power: i32| {
+            Mat::from_fn(PAIRS, PAIRS, |a, b| {
+                (KEPT..ALL).map(|k| all.normal[(a, k)] * rows[(b, k)] / omega(k).powi(power)).sum()
+            })
+        };
+        ResidualFlexibility {
+            normal: sum(&all.normal, 2),
+            sliding: sum(&all.sliding, 2),
+            inertia: Some([sum(&all.normal, 4), sum(&all.sliding, 4)]),
+        }
+    }
+
+    fn assembled(model: &Model, mu: f64) -> [Mat<f64>; 2] {
+        let n = model.dimension();
+        let (mut stiffness, mut damping) = (Mat::zeros(n, n), Mat::zeros(n, n));
+        let point =
+            OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: mu.signum(), friction_coefficient: mu.abs() };
+        model.assemble(&point, &mut stiffness, &mut damping).unwrap();
+        [stiffness, damping]
+    }
+
+    /// Block elimination of the modes beyond [`KEPT`] from the model of all of them: `K`, `M` and `C` of a motion in
+    /// which they follow the others statically.
+    fn condensed(mu: f64) -> [Mat<f64>; 3] {
+        let [stiffness, damping] = assembled(&free(ALL).with_contact(&pairs(ALL)).unwrap(), mu);
+        let rest = ALL - KEPT;
+        let part = |matrix: &Mat<f64>, i: usize, j: usize| {
+            let (from, size) = (|k: usize| k * KEPT, |k: usize| if k == 0 { KEPT } else { rest });
+            matrix.submatrix(from(i), from(j), size(i), size(j)).to_owned()
+        };
+        let inverse = part(&stiffness, 1, 1).partial_piv_lu().solve(Mat::<f64>::identity(rest, rest));
+        let right = -(&inverse * part(&stiffness, 1, 0));
+        let left = -(part(&stiffness, 0, 1) * &inverse);
+        let seen = |m: &Mat<f64>| {
+            part(m, 0, 0) + part(m, 0, 1) * &right + &left * part(m, 1, 0) + &left * part(m, 1, 1) * &right
+        };
+        let mass = Mat::<f64>::identity(KEPT, KEPT) + &left * &right;
+        [part(&stiffness, 0, 0) + part(&stiffness, 0, 1) * &right, mass, seen(&damping)]
+    }
+
+    #[test]
+    fn truncated_modes_follow_statically() {
+        let mut flexibility = residual();
+        let with_inertia = free(KEPT).with_flexible_contact(&pairs(KEPT), &flexibility, 1.0).unwrap();
+        flexibility.inertia = None;
+        let without = free(KEPT).with_flexible_contact(&pairs(KEPT), &flexibility, 1.0).unwrap();
+        for mu in [0.0, 0.123, 0.377, 0.9, 1.0, -0.6] {
+            let [stiffness, mass, damping] = condensed(mu);
+            let solver = mass.partial_piv_lu();
+            let [k, c] = assembled(&without, mu);
+            let [k_inertia, c_inertia] = assembled(&with_inertia, mu);
+            for (found, expected) in [
+                (k, stiffness.clone()),
+                (c, damping.clone()),
+                (k_inertia, solver.solve(&stiffness)),
+                (c_inertia, solver.solve(&damping)),
+            ] {
+                // The expansion is cut where its last coefficients fall below 1e-9.
+                let error = (&found - &expected).norm_max() / expected.norm_max();
+                assert!(error < 1e-8, "mu {mu}: {error:e}");
+            }
+        }
+        // At rest exactly symmetric, as the solver looks for it.
+        let [k, _] = assembled(&without, 0.0);
+        assert_eq!(k, k.transpose().to_owned());
+    }
+
+    #[test]
+    fn without_residual_it_is_the_plain_contact() {
+        let zero = Mat::<f64>::zeros(PAIRS, PAIRS);
+        let none = ResidualFlexibility { normal: zero.clone(), sliding: zero, inertia: None };
+        let flexible = free(KEPT).with_flexible_contact(&pairs(KEPT), &none, 2.0).unwrap();
+        let plain = free(KEPT).with_contact(&pairs(KEPT)).unwrap();
+        for mu in [0.0, 0.4, -1.9] {
+            for (found, expected) in assembled(&flexible, mu).iter().zip(assembled(&plain, mu)) {
+                assert!((found - &expected).norm_max() <= 1e-13 * expected.norm_max(), "{mu}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_has_no_meaning_is_refused() {
+        let with = |residual: &ResidualFlexibility, law: ContactLaw, range: f64| {
+            let mut model = free(KEPT);
+            model.contact_law = law;
+            model.with_flexible_contact(&pairs(KEPT), residual, range).map(|_| ()).unwrap_err()
+        };
+        let hertzian = ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() };
+        assert!(matches!(with(&residual(), hertzian, 1.0), ModelError::FlexibleLoadExponent { .. }));
+        // I + K_c R loses its first pivot near μ = 0.5: 1 + 2e6 (1e-6 - 3e-6 μ).
+        let one = |value: f64| Mat::from_fn(PAIRS, PAIRS, |i, j| if i == 0 && j == 0 { value } else { 0.0 });
+        let singular = ResidualFlexibility { normal: one(1e-6), sliding: one(-3e-6), inertia: None };
+        let refused = with(&singular, ContactLaw::default(), 1.0);
+        assert!(matches!(refused, ModelError::FlexibilityFit { .. } | ModelError::IllConditioned { .. }), "{refused}");
+        let fitted = free(KEPT).with_flexible_contact(&pairs(KEPT), &residual(), 0.5).unwrap();
+        let (mut k, mut c) = (Mat::zeros(KEPT, KEPT), Mat::zeros(KEPT, KEPT));
+        let beyond = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 1.0, friction_coefficient: 0.6 };
+        assert!(matches!(fitted.assemble(&beyond, &mut k, &mut c), Err(ModelError::LawNotFinite { .. })));
+    }
+}
