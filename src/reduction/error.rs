@@ -34,6 +34,8 @@ pub enum ReductionError {
     MissedModes { what: String, found: usize, counted: usize, below: f64 },
     #[error("{what}: mode {mode} has |K phi - omega^2 M phi| = {value:.3e} of its parts, limit {limit:.1e}")]
     Residual { what: String, mode: usize, value: f64, limit: f64 },
+    #[error("{what}: shifts covered the band up to {covered:.6e} rad/s only, expected {band:.6e} rad/s")]
+    NotCovered { what: String, covered: f64, band: f64 },
     #[error(
         "{what}: its modes need {:.2} GiB of memory, more than the {:.2} GiB allowed",
         *bytes as f64 / GIB, *limit as f64 / GIB
