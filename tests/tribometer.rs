@@ -17,7 +17,7 @@ fn rows(text: &str) -> Vec<Vec<&str>> {
 fn its_files_agree_with_each_other() {
     let temp = tempfile::tempdir().unwrap();
     let folder = temp.path().join("rig");
-    run(["tribometer", "--dof", "5000", "-o", &text(&folder)]).exits(0).says("degrees of freedom");
+    run(["tribometer", "--dof", "5000", "-o", &text(&folder)]).exits(0).complains("degrees of freedom");
     let file = |name: &str| fs::read_to_string(folder.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"));
     let full: toml::Table = file("tribometer.toml").parse().unwrap();
     let (mut sizes, mut contact, mut node_count) = (vec![], vec![], 0);
