@@ -14,6 +14,7 @@ use serde::Serialize;
 
 use crate::physics::chart::Scratch;
 use crate::physics::chart::build::{ChartError, ChartOptions, build};
+use crate::physics::chart::hold_out::hold_out;
 use crate::physics::reference::{self, Refined};
 use crate::physics::synthetic::{Synthetic, Uniform, rig};
 use crate::physics::{
@@ -40,6 +41,8 @@ pub struct Plan {
     pub conditions: usize,
     /// Modes compared with the reference per condition.
     pub compared: usize,
+    /// Random conditions at which every root of the chart is held against a dense solve.
+    pub held_out: usize,
     pub pairs: usize,
     pub seed: u64,
     pub band_max_hz: f64,
@@ -94,10 +97,32 @@ pub struct Offline {
     /// Merging pairs among what was compared, and roots that the reference did not find.
     pub pairs_compared: usize,
     pub not_refined: usize,
+    /// None where it was not asked for or there is no chart.
+    pub held_out: Option<HeldOut>,
 }
 
-const ROUTES: [&str; 6] =
-    ["dense values", "dense both vectors", "chart", "chart + certificate", "LAPACK values", "LAPACK both vectors"];
+/// Every root of a chart against dense solves at random conditions.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct HeldOut {
+    /// Conditions that the chart answered, those it has no leaf for, those at which it contradicts the traces.
+    pub charted: usize,
+    pub not_converged: usize,
+    pub incomplete: usize,
+    /// Roots off by more than the bounds of both.
+    pub bounds_broken: usize,
+    /// Relative error of `λ²` outside merging points, and of the mean of merging pairs.
+    pub largest_error: f64,
+    pub largest_pair_mean_error: f64,
+}
+
+const ROUTES: [&str; 6] = [
+    "dense values",
+    "dense both vectors",
+    "chart values",
+    "chart + certificate",
+    "LAPACK values",
+    "LAPACK both vectors",
+];
 
 /// What a route collected.
 #[derive(Clone, Debug, Default)]
@@ -251,11 +276,27 @@ pub fn measure(
     let points = conditions(plan, &merging, &reference);
 
     let begun = Instant::now();
-    let chart = chart(&model, plan, say)?;
+    let options = chart_options(plan);
+    let chart = chart(&model, plan, &options, say)?;
     let chart_s = begun.elapsed().as_secs_f64();
+    let held_out = match &chart {
+        Some(chart) if plan.held_out > 0 => {
+            say("held-out conditions");
+            let found = hold_out(&model, &options, chart, plan.held_out, plan.seed.wrapping_add(3000))?;
+            Some(HeldOut {
+                charted: found.charted,
+                not_converged: found.not_converged,
+                incomplete: found.incomplete,
+                bounds_broken: found.violations,
+                largest_error: found.largest_error,
+                largest_pair_mean_error: found.largest_mean_error,
+            })
+        }
+        _ => None,
+    };
 
     let mut samples: [Samples; 6] = Default::default();
-    let (mut scratch, mut charted, mut summary) = (Scratch::default(), vec![], Summary::default());
+    let (mut scratch, mut charted, mut bare, mut summary) = (Scratch::default(), vec![], vec![], Summary::default());
     let (mut pairs_compared, mut not_refined) = (0, 0);
     let mut choice = Uniform::new(plan.seed.wrapping_add(2000));
     for (done, p) in points.iter().enumerate() {
@@ -269,6 +310,10 @@ pub fn measure(
         let on_chart = chart
             .as_ref()
             .is_some_and(|chart| chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted).is_ok());
+        bare.clear();
+        if let Some(chart) = chart.as_ref().filter(|_| on_chart) {
+            chart.values(p, &mut scratch, &mut bare)?;
+        }
         let theirs = lapack.as_deref_mut().map(|peer| peer.solve(solver.matrix(&spectrum), false)).transpose()?;
         let theirs_both = lapack.as_deref_mut().map(|peer| peer.solve(solver.matrix(&spectrum), true)).transpose()?;
         let refined = refined(&model, p, &spectrum, plan, &mut choice)?;
@@ -288,7 +333,7 @@ pub fn measure(
             samples[1].compare(&spectrum, refined, &all(&spectrum.roots, true));
             if on_chart {
                 let roots: Vec<Root> = charted.iter().map(|mode: &Mode| mode.root).collect();
-                samples[2].compare(&spectrum, refined, &all(&roots, true));
+                samples[2].compare(&spectrum, refined, &bare.iter().map(|&z| (z, None)).collect::<Vec<_>>());
                 samples[3].compare(&spectrum, refined, &all(&roots, true));
             }
             let sign = if spectrum.undamped { -1.0 } else { 1.0 };
@@ -311,13 +356,12 @@ pub fn measure(
             }
         }
         if let Some(chart) = chart.as_ref().filter(|_| on_chart) {
-            let known = traces.at(&model, p);
-            charted.clear();
             // Once unseen: the dense solves before have emptied the caches, which charts in a row would not find so.
-            chart.evaluate(p, known, &mut scratch, &mut charted)?;
-            charted.clear();
+            bare.clear();
+            chart.values(p, &mut scratch, &mut bare)?;
+            bare.clear();
             let begun = Instant::now();
-            chart.evaluate(p, known, &mut scratch, &mut charted)?;
+            chart.values(p, &mut scratch, &mut bare)?;
             time(2, begun.elapsed().as_secs_f64());
             charted.clear();
             let begun = Instant::now();
@@ -355,18 +399,19 @@ pub fn measure(
         conditions: points.len(),
         pairs_compared,
         not_refined,
+        held_out,
     };
     Ok((routes, offline))
 }
 
-/// The chart of the whole box of conditions; none where it takes too long.
-fn chart(model: &Model, plan: &Plan, say: &dyn Fn(&str)) -> anyhow::Result<Option<Chart>> {
+/// The whole box of conditions.
+fn chart_options(plan: &Plan) -> ChartOptions {
     let corner = |normal_load_n, disc_speed_rad_s, friction_coefficient| OperatingPoint {
         normal_load_n,
         disc_speed_rad_s,
         friction_coefficient,
     };
-    let options = ChartOptions {
+    ChartOptions {
         low: corner(50.0, 1.0, 0.0),
         high: corner(2000.0, 60.0, 1.0),
         band_max_hz: Some(plan.band_max_hz),
@@ -374,13 +419,17 @@ fn chart(model: &Model, plan: &Plan, say: &dyn Fn(&str)) -> anyhow::Result<Optio
         smallest_share: 1e-4,
         max_solves: usize::MAX,
         threads: plan.threads,
-    };
+    }
+}
+
+/// The chart of that box; none where it takes too long.
+fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str)) -> anyhow::Result<Option<Chart>> {
     let begun = Instant::now();
     let go_on = |done: f64| {
         say(&format!("chart {:.0} %", 100.0 * done));
         begun.elapsed() < plan.chart_limit
     };
-    match build(model, &options, &go_on) {
+    match build(model, options, &go_on) {
         Ok(chart) => Ok(Some(chart)),
         Err(ChartError::Stopped) => Ok(None),
         Err(error) => Err(error.into()),

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::{Outcome, positive, print, write_file};
 use crate::bench::lapack::Lapack;
-use crate::bench::{Kind, Offline, Plan, Route, measure};
+use crate::bench::{HeldOut, Kind, Offline, Plan, Route, measure};
 use crate::physics::stress;
 use crate::plot;
 
@@ -26,6 +26,9 @@ pub struct Options {
     /// Modes of each condition that are compared with roots to thirty digits
     #[arg(long, value_name = "N", default_value_t = 2)]
     compared: usize,
+    /// Random conditions at which every root of the chart is held against a dense solve, and each bound against the error
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    held_out: usize,
     /// Contact pairs of the rigs
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(1..))]
     pairs: u16,
@@ -80,6 +83,7 @@ impl Options {
             kind: self.rig,
             conditions: self.conditions as usize,
             compared: self.compared,
+            held_out: self.held_out,
             pairs: usize::from(self.pairs),
             seed: self.seed,
             band_max_hz: self.band_max_hz,
@@ -116,7 +120,9 @@ impl Options {
         if let Some(path) = &self.svg {
             write_file(path, plot::front(&report.machine, &report.routes)?.as_bytes())?;
         }
-        let broken = report.routes.iter().any(|route| route.bounds_broken > 0);
+        let held_out_wrong = |offline: &Offline| offline.held_out.is_some_and(|h| h.bounds_broken + h.incomplete > 0);
+        let broken =
+            report.routes.iter().any(|route| route.bounds_broken > 0) || report.offline.iter().any(held_out_wrong);
         Ok(if broken { Outcome::Differences } else { Outcome::Done })
     }
 }
@@ -191,6 +197,14 @@ fn table(report: &Report) -> String {
         };
         let (pairs, lost) = (offline.pairs_compared, offline.not_refined);
         let _ = writeln!(text, "         {pairs} merging pairs compared, {lost} roots without a reference");
+        if let Some(held_out) = &offline.held_out {
+            let HeldOut { charted, not_converged, incomplete, bounds_broken, largest_error, largest_pair_mean_error } =
+                held_out;
+            let _ = writeln!(
+                text,
+                "         held out: {charted} conditions charted, {not_converged} dense; {bounds_broken} bounds broken, {incomplete} incomplete; largest error {largest_error:.1e}, of pair means {largest_pair_mean_error:.1e}"
+            );
+        }
     }
     text
 }

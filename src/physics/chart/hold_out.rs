@@ -33,7 +33,7 @@ pub struct HoldOut {
 }
 
 /// A condition of the box, each value uniform.
-pub fn draw(options: &ChartOptions, uniform: &mut Uniform) -> OperatingPoint {
+fn draw(options: &ChartOptions, uniform: &mut Uniform) -> OperatingPoint {
     let mut between = |low: f64, high: f64| low + 0.5 * (uniform.draw() + 1.0) * (high - low);
     let ChartOptions { low, high, .. } = options;
     OperatingPoint {
