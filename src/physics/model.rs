@@ -65,6 +65,34 @@ impl std::fmt::Debug for CustomLaw {
     }
 }
 
+impl Law {
+    /// Its value at `p` under `contact`, with the contact in `state`.
+    pub fn value(&self, contact: &ContactLaw, state: ContactState, p: &OperatingPoint) -> f64 {
+        let closed = state != ContactState::Open;
+        let sliding = state == ContactState::Sliding;
+        let when = |holds: bool, value: f64| if holds { value } else { 0.0 };
+        let (load, mu) = (p.normal_load_n, p.friction_coefficient);
+        let stiffening = || match contact.exponent {
+            0.0 => 1.0,
+            exponent => (load / contact.reference_n).powf(exponent),
+        };
+        match self {
+            Self::Constant => 1.0,
+            Self::ContactStiffness => when(closed, stiffening()),
+            Self::FrictionStiffness => when(sliding, p.disc_speed_rad_s.signum() * mu * stiffening()),
+            Self::ContactDamping => when(closed, 1.0),
+            Self::FrictionDamping => when(sliding, p.disc_speed_rad_s.signum() * mu),
+            Self::FrictionSlope => when(sliding, load),
+            Self::LateralFriction => when(sliding, mu * load / p.disc_speed_rad_s.abs()),
+            Self::FrictionChebyshev { degree, range } => {
+                let x = p.disc_speed_rad_s.signum() * mu;
+                when(sliding, chebyshev::beside_zero(x, *degree, *range))
+            }
+            Self::Custom(custom) => (custom.evaluate)(&if sliding { *p } else { p.with_friction(0.0) }),
+        }
+    }
+}
+
 /// How contact and friction depend on load and speed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactLaw {
@@ -339,37 +367,12 @@ impl Model {
 
     /// The state of the contact, as far as this model knows contact: one without contact pairs never opens.
     pub fn contact_state(&self, p: &OperatingPoint) -> ContactState {
-        match p.contact_state() {
-            ContactState::Open if !self.has_contact => OperatingPoint { normal_load_n: 1.0, ..*p }.contact_state(),
-            state => state,
-        }
+        if self.has_contact { p.contact_state() } else { p.state_closed() }
     }
 
     /// Value of `law` at `p`.
     fn coefficient(&self, law: &Law, p: &OperatingPoint) -> f64 {
-        let state = self.contact_state(p);
-        let closed = state != ContactState::Open;
-        let sliding = state == ContactState::Sliding;
-        let when = |holds: bool, value: f64| if holds { value } else { 0.0 };
-        let (load, mu) = (p.normal_load_n, p.friction_coefficient);
-        let stiffening = || match self.contact_law.exponent {
-            0.0 => 1.0,
-            exponent => (load / self.contact_law.reference_n).powf(exponent),
-        };
-        match law {
-            Law::Constant => 1.0,
-            Law::ContactStiffness => when(closed, stiffening()),
-            Law::FrictionStiffness => when(sliding, p.disc_speed_rad_s.signum() * mu * stiffening()),
-            Law::ContactDamping => when(closed, 1.0),
-            Law::FrictionDamping => when(sliding, p.disc_speed_rad_s.signum() * mu),
-            Law::FrictionSlope => when(sliding, load),
-            Law::LateralFriction => when(sliding, mu * load / p.disc_speed_rad_s.abs()),
-            Law::FrictionChebyshev { degree, range } => {
-                let x = p.disc_speed_rad_s.signum() * mu;
-                when(sliding, chebyshev::beside_zero(x, *degree, *range))
-            }
-            Law::Custom(custom) => (custom.evaluate)(&if sliding { *p } else { p.with_friction(0.0) }),
-        }
+        law.value(&self.contact_law, self.contact_state(p), p)
     }
 
     /// Writes `K(p)` and `C(p)`, both `n×n`, and says what is known of them.

@@ -39,6 +39,11 @@ impl OperatingPoint {
         }
     }
 
+    /// The state of a contact that never opens, whatever the load.
+    pub fn state_closed(&self) -> ContactState {
+        Self { normal_load_n: 1.0, ..*self }.contact_state()
+    }
+
     /// The same load and speed with another friction coefficient.
     pub fn with_friction(self, friction_coefficient: f64) -> Self {
         Self { friction_coefficient, ..self }

@@ -164,8 +164,7 @@ fn value_at(law: &Law, reference: &OperatingPoint) -> f64 {
     match law {
         Law::Custom(custom) => {
             // A system of matrices knows no contact that could open, only one that does not slide.
-            let sliding = OperatingPoint { normal_load_n: 1.0, ..*reference }.contact_state();
-            let mu = match sliding {
+            let mu = match reference.state_closed() {
                 crate::physics::ContactState::Sliding => reference.friction_coefficient,
                 _ => 0.0,
             };

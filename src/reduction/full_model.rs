@@ -1,0 +1,340 @@
+//! A full model: what a finite-element program gives, before anything is left out.
+//!
+//! ```text
+//! M q̈ + C(p) q̇ + K(p) q = 0,   K(p) = diag(K_part) + Σ law(p) K_term + κ(N) (B_n + s μ B_t)ᵀ K_c B_n
+//! C(p) = Σ law(p) C_term + (B_n + s μ B_t)ᵀ C_c B_n + dμ/dv B_tᵀ diag(N_0) B_t + μ B_bᵀ diag(N_0 / v) B_b
+//! ```
+//!
+//! Everything sparse: the parts symmetric and apart from each other, terms of any symmetry, and rows `B` of contact pairs
+//! that join the parts. [`FullModel::project`] takes all of it to a basis, where it is an ordinary [`Model`].
+
+use faer::sparse::Triplet;
+use faer::{Mat, MatRef};
+
+use super::dense::symmetric_eigen;
+use super::sparse::{SparseMatrix, entries, is_symmetric, times};
+use super::{ReductionError, project_sparse, whiten};
+use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Term};
+
+/// A part of a full model: a substructure with its contact interface free, or a whole system.
+#[derive(Clone, Debug)]
+pub struct FullPart {
+    /// `pad`, `disc` or `system`: how errors name it.
+    pub name: String,
+    /// `M`, `n×n`, kg, symmetric and positive definite.
+    pub mass: SparseMatrix,
+    /// Constant `K`, `n×n`, N/m, symmetric; without entries where all stiffness is in terms.
+    pub stiffness: SparseMatrix,
+}
+
+/// A sparse matrix times a law of the operating point.
+#[derive(Clone, Debug)]
+pub struct SparseTerm {
+    /// `n×n` over the rows of all parts.
+    pub matrix: SparseMatrix,
+    pub law: Law,
+}
+
+/// A linear form of the displacements: `(row, weight)`.
+pub type SparseRow = Vec<(usize, f64)>;
+
+/// Contact pairs over the rows of all parts: relative displacement, pad minus disc, along the triad `n`, `t`, `b`.
+#[derive(Clone, Debug, Default)]
+pub struct FullContact {
+    pub normal: Vec<SparseRow>,
+    pub sliding: Vec<SparseRow>,
+    pub lateral: Vec<SparseRow>,
+    /// `k` per pair at the reference load, N/m.
+    pub stiffness_n_per_m: Vec<f64>,
+    /// `c` per pair, N·s/m.
+    pub damping_n_s_per_m: Vec<f64>,
+    /// Distance of each pair from the disc's axis, m.
+    pub radius_m: Vec<f64>,
+}
+
+/// A full model; the rows of its parts follow each other.
+#[derive(Clone, Debug)]
+pub struct FullModel {
+    pub parts: Vec<FullPart>,
+    pub stiffness: Vec<SparseTerm>,
+    pub damping: Vec<SparseTerm>,
+    pub contact: Option<FullContact>,
+    pub contact_law: ContactLaw,
+}
+
+/// A full model on a basis.
+#[derive(Clone, Debug)]
+pub struct Projected {
+    /// `V`, `n×k`, kg^-1/2: mass-normalised, and `Vᵀ diag(K_part) V = diag(Ω²)`.
+    pub basis: Mat<f64>,
+    /// `Ω²`, rad²/s², ascending.
+    pub omega_squared: Vec<f64>,
+    /// The contact pairs in the coordinates of the basis.
+    pub contact: Option<ContactPairs>,
+    pub stiffness: Vec<Term>,
+    pub damping: Vec<Term>,
+}
+
+/// A product of contact rows, one for each pair: `leftᵀ diag(weights) right`.
+struct ContactTerm<'a> {
+    left: Vec<SparseRow>,
+    weights: Vec<f64>,
+    right: &'a [SparseRow],
+}
+
+impl FullModel {
+    /// Number of degrees of freedom, `n`.
+    pub fn dimension(&self) -> usize {
+        self.parts.iter().map(|part| part.mass.nrows()).sum()
+    }
+
+    /// The first row of every part.
+    pub fn offsets(&self) -> Vec<usize> {
+        let mut next = 0;
+        self.parts
+            .iter()
+            .map(|part| {
+                let offset = next;
+                next += part.mass.nrows();
+                offset
+            })
+            .collect()
+    }
+
+    /// What `law` is at `p`; a model without contact pairs never opens.
+    fn value(&self, law: &Law, p: &OperatingPoint) -> f64 {
+        let state = if self.contact.is_some() { p.contact_state() } else { p.state_closed() };
+        law.value(&self.contact_law, state, p)
+    }
+
+    /// `M`, `C(p)` and `K(p)`, both triangles stored.
+    ///
+    /// # Errors
+    /// [`ReductionError::Factorisation`] where memory does not suffice.
+    pub fn matrices_at(&self, p: &OperatingPoint) -> Result<[SparseMatrix; 3], ReductionError> {
+        let n = self.dimension();
+        let (mut mass, mut damping, mut stiffness) = (vec![], vec![], vec![]);
+        for (part, offset) in self.parts.iter().zip(self.offsets()) {
+            for (matrix, triplets) in [(&part.mass, &mut mass), (&part.stiffness, &mut stiffness)] {
+                triplets.extend(entries(matrix).map(|(i, j, value)| Triplet::new(offset + i, offset + j, value)));
+            }
+        }
+        for (terms, triplets) in [(&self.stiffness, &mut stiffness), (&self.damping, &mut damping)] {
+            for term in terms {
+                let factor = self.value(&term.law, p);
+                triplets.extend(entries(&term.matrix).map(|(i, j, value)| Triplet::new(i, j, factor * value)));
+            }
+        }
+        let [contact_stiffness, contact_damping] = self.contact_terms(p);
+        for (terms, triplets) in [(contact_stiffness, &mut stiffness), (contact_damping, &mut damping)] {
+            for term in &terms {
+                for ((left, weight), right) in term.left.iter().zip(&term.weights).zip(term.right) {
+                    for &(i, a) in left {
+                        triplets.extend(right.iter().map(|&(j, b)| Triplet::new(i, j, a * weight * b)));
+                    }
+                }
+            }
+        }
+        let build = |triplets: &[Triplet<usize, usize, f64>]| {
+            SparseMatrix::try_new_from_triplets(n, n, triplets).map_err(|error| ReductionError::Factorisation {
+                what: "full model".to_owned(),
+                reason: format!("could not be stored: {error:?}"),
+            })
+        };
+        Ok([build(&mass)?, build(&damping)?, build(&stiffness)?])
+    }
+
+    /// What the contact adds to `K` and to `C` at `p`, of low rank; nothing where its weights are 0.
+    fn contact_terms(&self, p: &OperatingPoint) -> [Vec<ContactTerm<'_>>; 2] {
+        let Some(contact) = &self.contact else { return [vec![], vec![]] };
+        let [kappa, damper, friction, slope, lateral] = [
+            Law::ContactStiffness,
+            Law::ContactDamping,
+            Law::FrictionDamping,
+            Law::FrictionSlope,
+            Law::LateralFriction,
+        ]
+        .map(|law| self.value(&law, p));
+        let pushed: Vec<SparseRow> = contact
+            .normal
+            .iter()
+            .zip(&contact.sliding)
+            .map(|(n, t)| n.iter().copied().chain(t.iter().map(|&(row, weight)| (row, friction * weight))).collect())
+            .collect();
+        let scaled = |values: &[f64], factor: f64| values.iter().map(|value| factor * value).collect::<Vec<f64>>();
+        let each = 1.0 / contact.normal.len().max(1) as f64;
+        let along = vec![each * slope * self.contact_law.slope_s_per_m; contact.normal.len()];
+        let across = if self.contact_law.lateral_damping {
+            contact.radius_m.iter().map(|radius_m| each * lateral / radius_m).collect()
+        } else {
+            vec![0.0; contact.normal.len()]
+        };
+        let some = |term: &ContactTerm<'_>| term.weights.iter().any(|weight| *weight != 0.0);
+        let stiffness = vec![ContactTerm {
+            left: pushed.clone(),
+            weights: scaled(&contact.stiffness_n_per_m, kappa),
+            right: &contact.normal,
+        }];
+        let damping = vec![
+            ContactTerm { left: pushed, weights: scaled(&contact.damping_n_s_per_m, damper), right: &contact.normal },
+            ContactTerm { left: contact.sliding.clone(), weights: along, right: &contact.sliding },
+            ContactTerm { left: contact.lateral.clone(), weights: across, right: &contact.lateral },
+        ];
+        [stiffness, damping].map(|terms| terms.into_iter().filter(some).collect())
+    }
+
+    /// The model on the span of `basis`, `n×k`, whose columns need only be independent.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Indefinite` where the columns depend on each other, `Factorisation`.
+    pub fn project(&self, basis: MatRef<'_, f64>) -> Result<Projected, ReductionError> {
+        let k = basis.ncols();
+        let (mut mass, mut stiffness) = (Mat::<f64>::zeros(k, k), Mat::<f64>::zeros(k, k));
+        for (part, offset) in self.parts.iter().zip(self.offsets()) {
+            let rows = basis.subrows(offset, part.mass.nrows());
+            mass += project_sparse(&part.mass, rows, true);
+            stiffness += project_sparse(&part.stiffness, rows, true);
+        }
+        let whitening = whiten("basis", mass.as_ref())?;
+        let (omega_squared, mut mixed) =
+            symmetric_eigen("basis", whitening.congruence(stiffness.as_ref(), true).as_ref())?;
+        whitening.back(&mut mixed);
+        let basis = basis * &mixed;
+        let terms = |terms: &[SparseTerm]| -> Vec<Term> {
+            terms
+                .iter()
+                .map(|term| Term {
+                    matrix: project_sparse(&term.matrix, basis.as_ref(), is_symmetric(&term.matrix)),
+                    law: term.law.clone(),
+                })
+                .collect()
+        };
+        let (stiffness, damping) = (terms(&self.stiffness), terms(&self.damping));
+        let contact = self.contact.as_ref().map(|contact| contact.on(basis.as_ref()));
+        Ok(Projected { basis, omega_squared, contact, stiffness, damping })
+    }
+
+    /// `M x` over all parts.
+    pub fn mass_times(&self, x: MatRef<'_, f64>) -> Mat<f64> {
+        let mut product = Mat::zeros(x.nrows(), x.ncols());
+        for (part, offset) in self.parts.iter().zip(self.offsets()) {
+            let n = part.mass.nrows();
+            product.subrows_mut(offset, n).copy_from(times(&part.mass, x.subrows(offset, n)));
+        }
+        product
+    }
+}
+
+impl FullContact {
+    /// The pairs in the coordinates of a basis, `n×k`.
+    pub fn on(&self, basis: MatRef<'_, f64>) -> ContactPairs {
+        let rows = |rows: &[SparseRow]| {
+            Mat::from_fn(rows.len(), basis.ncols(), |pair, column| {
+                rows[pair].iter().map(|&(row, weight)| weight * basis[(row, column)]).sum()
+            })
+        };
+        ContactPairs {
+            normal: rows(&self.normal),
+            sliding: rows(&self.sliding),
+            lateral: rows(&self.lateral),
+            stiffness_n_per_m: self.stiffness_n_per_m.clone(),
+            damping_n_s_per_m: self.damping_n_s_per_m.clone(),
+            radius_m: self.radius_m.clone(),
+        }
+    }
+}
+
+impl Projected {
+    /// The equation of motion in the coordinates of the basis, under `contact_law`.
+    ///
+    /// # Errors
+    /// Those of [`Model::new`] and [`Model::with_contact`].
+    pub fn model(&self, contact_law: ContactLaw) -> Result<Model, ModelError> {
+        let k = self.omega_squared.len();
+        let mut stiffness = self.stiffness.clone();
+        let free = Mat::from_fn(k, k, |i, j| if i == j { self.omega_squared[i] } else { 0.0 });
+        stiffness.insert(0, Term { matrix: free, law: Law::Constant });
+        let model = Model::new(k, stiffness, self.damping.clone(), contact_law, None)?;
+        match &self.contact {
+            Some(pairs) => model.with_contact(pairs),
+            None => Ok(model),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::physics::{Solver, Vectors};
+
+    fn sparse(n: usize, triplets: &[(usize, usize, f64)]) -> SparseMatrix {
+        let triplets: Vec<_> = triplets.iter().map(|&(i, j, value)| Triplet::new(i, j, value)).collect();
+        SparseMatrix::try_new_from_triplets(n, n, &triplets).unwrap()
+    }
+
+    /// Two held chains of three masses that touch at their ends along two directions.
+    fn two_chains() -> FullModel {
+        let part = |name: &str, spring: f64| FullPart {
+            name: name.to_owned(),
+            mass: sparse(3, &[(0, 0, 1.0), (1, 1, 2.0), (2, 2, 1.5), (0, 1, 0.1), (1, 0, 0.1)]),
+            stiffness: sparse(
+                3,
+                &[
+                    (0, 0, 2.0 * spring),
+                    (1, 1, 2.0 * spring),
+                    (2, 2, spring),
+                    (0, 1, -spring),
+                    (1, 0, -spring),
+                    (1, 2, -spring),
+                    (2, 1, -spring),
+                ],
+            ),
+        };
+        FullModel {
+            parts: vec![part("pad", 1e6), part("disc", 3e6)],
+            stiffness: vec![],
+            damping: vec![],
+            contact: Some(FullContact {
+                normal: vec![vec![(2, 1.0), (5, -1.0)], vec![(1, 1.0), (4, -0.5)]],
+                sliding: vec![vec![(1, 1.0), (4, -1.0)], vec![(0, 1.0), (3, -1.0)]],
+                lateral: vec![vec![(0, 1.0), (3, -1.0)], vec![(2, 1.0), (5, -1.0)]],
+                stiffness_n_per_m: vec![2e5, 3e5],
+                damping_n_s_per_m: vec![4.0, 5.0],
+                radius_m: vec![0.1, 0.2],
+            }),
+            contact_law: ContactLaw { exponent: 0.5, reference_n: 400.0, slope_s_per_m: -0.02, lateral_damping: true },
+        }
+    }
+
+    /// On a basis of as many vectors as there are degrees of freedom nothing is lost: the roots of the projected model
+    /// make the full matrices singular, turning either way, without sliding and without contact.
+    #[test]
+    fn a_whole_basis_loses_nothing() {
+        let full = two_chains();
+        let n = full.dimension();
+        let basis = Mat::from_fn(n, n, |i, j| if i == j { 1.0 } else { 0.1 * ((3 * i + 7 * j) as f64).sin() });
+        let projected = full.project(basis.as_ref()).unwrap();
+        let model = projected.model(full.contact_law).unwrap();
+        let mut solver = Solver::new(n);
+        for (normal_load_n, disc_speed_rad_s) in [(500.0, 13.0), (900.0, -2.0), (500.0, 0.0), (0.0, 13.0)] {
+            let p = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient: 0.4 };
+            let spectrum = solver.solve(&model, &p, Vectors::Right).unwrap();
+            let [mass, damping, stiffness] = full.matrices_at(&p).unwrap().map(|matrix| matrix.to_dense());
+            assert_eq!(spectrum.roots.len(), n);
+            for (k, root) in spectrum.roots.iter().enumerate() {
+                let lambda = root.lambda;
+                let y = &spectrum.shapes;
+                let x =
+                    Mat::from_fn(n, 1, |i, _| (0..n).map(|j| y[(j, k)] * projected.basis[(i, j)]).sum::<faer::c64>());
+                let parts = |matrix: &Mat<f64>, i: usize| (0..n).map(|j| x[(j, 0)] * matrix[(i, j)]).sum::<faer::c64>();
+                let residual = (0..n)
+                    .map(|i| {
+                        (lambda * lambda * parts(&mass, i) + lambda * parts(&damping, i) + parts(&stiffness, i)).norm()
+                    })
+                    .fold(0.0, f64::max);
+                // Rounding of a dense solve, relative to the stiffest entry.
+                assert!(residual < 1e-10 * stiffness.norm_max() * x.norm_max(), "{p:?} {lambda} {residual:e}");
+            }
+        }
+    }
+}
