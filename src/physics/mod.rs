@@ -6,6 +6,7 @@ pub mod chart;
 pub mod critical;
 pub mod ends;
 mod flexible_contact;
+pub mod identification;
 pub mod model;
 pub mod operating_point;
 pub mod reference;
