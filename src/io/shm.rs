@@ -51,7 +51,6 @@ const MAX_PUBLISHERS: usize = 8;
 const MAX_SUBSCRIBERS: usize = 32;
 const MAX_NODES: usize = 64;
 const HISTORY_SAMPLES: usize = 16;
-const BUFFER_SAMPLES: usize = 64;
 
 /// A reader looks for samples, and whether it should stop, at least this often; with events it wakes at once.
 const TICK: Duration = Duration::from_millis(50);
@@ -360,7 +359,7 @@ fn open_topic<F: Form>(
             .max_subscribers(MAX_SUBSCRIBERS)
             .max_nodes(MAX_NODES)
             .history_size(HISTORY_SAMPLES)
-            .subscriber_max_buffer_size(BUFFER_SAMPLES)
+            .subscriber_max_buffer_size(F::WAITING_SAMPLES)
             .create()
             .map_err(Error::PublishSubscribeCreateError),
         Err(other) => Err(Error::PublishSubscribeOpenError(other)),

@@ -264,6 +264,24 @@ impl Chart {
         Ok(())
     }
 
+    /// Whether `p` is in a box that converged.
+    pub fn covers(&self, p: &OperatingPoint) -> bool {
+        self.coordinates(p).is_ok_and(|x| self.find(&x).is_ok())
+    }
+
+    /// The coordinates of `p`.
+    fn coordinates(&self, p: &OperatingPoint) -> Result<[f64; MAX_AXES], NotCharted> {
+        let mut x = [0.0; MAX_AXES];
+        for (k, axis) in self.axes.iter().enumerate() {
+            x[k] = axis.coordinate(p);
+            // Written so that NaN is outside.
+            if !(x[k] >= self.low[k] && x[k] <= self.high[k]) {
+                return Err(NotCharted::Outside);
+            }
+        }
+        Ok(x)
+    }
+
     fn find(&self, x: &[f64; MAX_AXES]) -> Result<usize, NotCharted> {
         let mut at = 0;
         loop {
@@ -305,14 +323,7 @@ impl Chart {
 
     /// The leaf that holds `p`, with all of its channels evaluated there.
     fn expand(&self, p: &OperatingPoint, scratch: &mut Scratch) -> Result<&Leaf, NotCharted> {
-        let mut x = [0.0; MAX_AXES];
-        for (k, axis) in self.axes.iter().enumerate() {
-            x[k] = axis.coordinate(p);
-            // Written so that NaN is outside.
-            if !(x[k] >= self.low[k] && x[k] <= self.high[k]) {
-                return Err(NotCharted::Outside);
-            }
-        }
+        let x = self.coordinates(p)?;
         let leaf = &self.leaves[self.find(&x)?];
         let mut unit = [0.0; MAX_AXES];
         for (k, unit) in unit[..self.axes.len()].iter_mut().enumerate() {
