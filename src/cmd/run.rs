@@ -92,8 +92,8 @@ pub fn serve(
         if listening == Listening::ToTheBuses {
             let lost = &outputs.lost_inputs;
             let (inputs, lost_inputs) = (shortcut.clone(), lost.clone());
-            outputs.shm_input = Some(ShmInput::spawn(&shm, move |heard| {
-                lost_inputs.fetch_add(u64::from(!inputs.input(heard)), Ordering::Relaxed);
+            outputs.shm_input = Some(ShmInput::spawn_with_backlog(&shm, move |heard, more_waits| {
+                lost_inputs.fetch_add(u64::from(!inputs.input(heard, more_waits)), Ordering::Relaxed);
             })?);
             let vibration = hear(listening, &sender, lost, Incoming::Vibration);
             outputs.shm_vibration = Some(ShmVibrationInput::spawn(&shm, vibration)?);

@@ -181,7 +181,22 @@ impl<F: Form> ShmReader<F> {
     ///
     /// # Errors
     /// Whatever iceoryx2 refuses.
-    pub fn spawn(options: &ShmOptions, sink: impl FnMut(Heard<F::Message>) + Send + 'static) -> Result<Self, ShmError> {
+    pub fn spawn(
+        options: &ShmOptions,
+        mut sink: impl FnMut(Heard<F::Message>) + Send + 'static,
+    ) -> Result<Self, ShmError> {
+        Self::spawn_with_backlog(options, move |heard, _| sink(heard))
+    }
+
+    /// As [`ShmReader::spawn`]; `sink` is also told whether more is waiting to be read: one that takes its time with the last
+    /// message should not with those before it, or the oldest of them are lost.
+    ///
+    /// # Errors
+    /// Whatever iceoryx2 refuses.
+    pub fn spawn_with_backlog(
+        options: &ShmOptions,
+        sink: impl FnMut(Heard<F::Message>, bool) + Send + 'static,
+    ) -> Result<Self, ShmError> {
         let node = new_node(options)?;
         let Services { service, topic, event } = Services::<F>::open(&node, options)?;
         // The listener first: nothing can then come between that wakes nobody.
@@ -241,7 +256,7 @@ struct Reading<F: Form, S> {
     node: Node<Ipc>,
 }
 
-impl<F: Form, S: FnMut(Heard<F::Message>)> Reading<F, S> {
+impl<F: Form, S: FnMut(Heard<F::Message>, bool)> Reading<F, S> {
     fn run(mut self, listener: &Listener<Ipc>, ready: &crossbeam_channel::Sender<Result<(), ShmError>>) {
         let wait_set = match WaitSetBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled).create::<Ipc>() {
             Ok(wait_set) => wait_set,
@@ -299,7 +314,8 @@ impl<F: Form, S: FnMut(Heard<F::Message>)> Reading<F, S> {
             match form.to_message() {
                 Ok(message) => {
                     self.counters.heard(missed);
-                    (self.sink)(Heard::now(Bus::Shm, message));
+                    let more_waits = self.subscriber.has_samples().unwrap_or(true);
+                    (self.sink)(Heard::now(Bus::Shm, message), more_waits);
                 }
                 Err(_) => self.counters.malformed(),
             }

@@ -577,7 +577,7 @@ mod tests {
                 disc_speed_rad_s,
                 friction_coefficient: 0.3 + 1e-6 * seq as f64,
             };
-            assert!(shortcut.input(Heard::now(Bus::Shm, message)));
+            assert!(shortcut.input(Heard::now(Bus::Shm, message), seq % 7 == 0));
             seq += 1;
             at_once += u32::from(watch.snapshot().prediction.is_some_and(|answer| answer.input_seq == seq - 1));
             // No more than a few wait, so that none is passed over.

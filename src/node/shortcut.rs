@@ -32,11 +32,13 @@ impl Shortcut {
         Self { queue, place: Place::default() }
     }
 
-    /// Has an input predicted on this thread if nothing waits before it, the node is idle, and the prediction takes no dense
-    /// solve; otherwise queues it. Never waits. False where the queue is full: the input is lost.
-    pub fn input(&self, heard: Heard<wire::OperatingPoint>) -> bool {
+    /// Has an input predicted on this thread if nothing waits before it, nor on the bus behind it (`more_waits`), the node is
+    /// idle, and the prediction takes no dense solve; otherwise queues it. Never waits. False where the queue is full: the
+    /// input is lost.
+    pub fn input(&self, heard: Heard<wire::OperatingPoint>, more_waits: bool) -> bool {
         // What waits in the queue is taken out of it under the lock alone, so that no input overtakes another.
-        if let Ok(mut place) = self.place.0.try_lock()
+        if !more_waits
+            && let Ok(mut place) = self.place.0.try_lock()
             && self.queue.is_empty()
             && let Some(node) = place.as_mut()
             && node.answers_at_once(&heard.message)

@@ -131,7 +131,8 @@ pub trait Form: ZeroCopySend + Copy + std::fmt::Debug + Send + 'static {
     type Message: Clone + Send + 'static;
     /// The service that carries it; its event service has the same name.
     const SERVICE: &'static str;
-    /// Samples that may wait for a reader before the oldest are lost to it: a tenth of a second of the highest rate.
+    /// Samples that may wait for a reader before the oldest are lost to it: at least a tenth of a second of the
+    /// highest rate.
     const WAITING_SAMPLES: usize;
 
     /// The form of a message.
@@ -213,7 +214,8 @@ pub struct PredictionForm {
 impl Form for OperatingPointForm {
     type Message = OperatingPoint;
     const SERVICE: &'static str = "rig/operating_point";
-    const WAITING_SAMPLES: usize = 1024;
+    // A rig that was held up sends what it measured meanwhile all at once.
+    const WAITING_SAMPLES: usize = 4096;
 
     fn from_message(message: &OperatingPoint) -> Result<Self, FormError> {
         Ok(Self {
