@@ -4,6 +4,7 @@
 
 pub mod chart;
 pub mod critical;
+mod dense_eigen;
 pub mod ends;
 mod flexible_contact;
 pub mod identification;
