@@ -10,26 +10,29 @@
 //! systems of finite-element matrices: [`normal_modes`] by nested dissection, a supernodal `L Lᵀ` and shift-invert block
 //! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
 //! to the basis; [`residual()`] finds what the modes left out still do at the contact.
-//! A [`FullModel`] is what all of it starts from; [`full_order_roots`] solves the full system itself, to compare with.
+//! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare with.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
+mod contact_solver;
 mod dense;
 mod error;
 mod full_model;
 mod full_order;
+mod krylov_schur;
 mod lanczos;
 mod normal_modes;
 mod ordering;
 mod pencil;
 mod project;
 mod residual;
+mod schur;
 mod sparse;
 
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
-pub use full_order::{CoveredDisc, FullRoot, FullSpectrum, full_order_roots};
+pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
 pub use normal_modes::{Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use project::{project_dense, project_sparse};
 pub use residual::{Residual, residual};
