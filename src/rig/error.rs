@@ -29,6 +29,8 @@ pub enum RigError {
     Scale { file: String, field: String, value: String, reason: String, limit: String },
     #[error("{file}, line {line}: {field} {value}; expected {limit}")]
     MatrixMarket { file: String, line: usize, field: String, value: String, limit: String },
+    #[error("{file}, line {line}: {field} {value}; expected {limit}")]
+    Uff { file: String, line: usize, field: String, value: String, limit: String },
     #[error("{file}: array `{field}` {value}; expected {limit}")]
     Npz { file: String, field: String, value: String, limit: String },
     #[error(
