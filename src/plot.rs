@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
+use plotters::data::float::FloatPrettyPrinter;
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -422,6 +423,8 @@ fn axes<'a>(
         .map_err(failed)?;
     chart
         .configure_mesh()
+        .x_label_formatter(&|value| tick(*value, x))
+        .y_label_formatter(&|value| tick(*value, y))
         .axis_style(BLACK.stroke_width(FINE))
         .set_all_tick_mark_size(5 * FINE)
         .light_line_style(TRANSPARENT)
@@ -434,6 +437,12 @@ fn axes<'a>(
         .draw()
         .map_err(failed)?;
     Ok(chart)
+}
+
+/// The label of a tick. Rounding leaves a zero that is none, and may be negative.
+fn tick(value: f64, (low, high): (f64, f64)) -> String {
+    let value = if value.abs() < 1e-9 * (high - low) { 0.0 } else { value };
+    FloatPrettyPrinter { allow_scientific: false, min_decimal: 1, max_decimal: 5 }.print(value)
 }
 
 /// Smallest and largest of `values`; something to draw on where there is nothing.

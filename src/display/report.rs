@@ -10,7 +10,7 @@ use crate::html::{escaped, figure, page, section};
 use crate::plot;
 use crate::wire::{SessionEvent, event_kind, level};
 
-/// Moments whose stability map is drawn.
+/// Stability maps drawn.
 const WORST: usize = 3;
 /// Events listed; the rest is in the CSV file.
 const LISTED: usize = 500;
@@ -55,9 +55,15 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     html += &section("Prediction against measurement", &measured);
     html += &section("Maps, charts and settings during the session", &session_events(recorded, from_s));
     let mut maps = String::new();
+    let mut drawn = vec![];
     for event in worst(&recorded.events) {
         let at_s = event.onset_s;
         let number = recorded.map_number(event.end_s.unwrap_or(at_s)).max(1);
+        // One figure of each map, at its worst moment.
+        if drawn.len() == WORST || drawn.contains(&number) {
+            continue;
+        }
+        drawn.push(number);
         let Some(map) = recorded.stability_map(number) else { continue };
         let curves = Curves::new(&map, rig.band_max_hz);
         let caption = format!(
@@ -293,11 +299,10 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
     html
 }
 
-/// The events of the fastest growth.
+/// The events that grow, the fastest first.
 fn worst(events: &Events) -> Vec<&Event> {
     let mut squeals: Vec<&Event> = events.iter().filter(|event| event.growth_rate_per_s.is_some()).collect();
     squeals.sort_by(|a, b| b.growth_rate_per_s.unwrap_or(0.0).total_cmp(&a.growth_rate_per_s.unwrap_or(0.0)));
-    squeals.truncate(WORST);
     squeals
 }
 
@@ -326,7 +331,11 @@ fn error_bounds(recorded: &Recorded) -> String {
                     <th>growth rate, ± 1/s</th></tr></thead><tbody>\n"
         .to_owned();
     for (id, [residual, frequency, growth]) in &bounds {
-        let shown = |value: f64| if value.is_finite() { format!("{value:.2e}") } else { "not computed".to_owned() };
+        let shown = |value: f64| match value {
+            0.0 => "0".to_owned(),
+            _ if value.is_finite() => format!("{value:.2e}"),
+            _ => "not computed".to_owned(),
+        };
         let cells = [id.to_string(), shown(*residual), shown(*frequency), shown(*growth)];
         let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
         let _ = writeln!(html, "<tr>{cells}</tr>");
