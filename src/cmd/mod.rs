@@ -8,12 +8,14 @@ mod critical;
 mod demo;
 mod display;
 mod format;
+mod identify;
 mod import;
 mod live;
 mod predict;
 mod recover;
 mod replay;
 mod report;
+mod reproduce;
 mod run;
 mod signals;
 mod simulate;
@@ -53,8 +55,10 @@ enum Command {
     Import(import::Options),
     Recover(recover::Options),
     Check(check::Options),
+    Identify(identify::Options),
     Bench(bench::Options),
     Tribometer(tribometer::Options),
+    Reproduce(reproduce::Options),
     Completions(completions::Options),
 }
 
@@ -90,8 +94,10 @@ pub fn main() -> ExitCode {
         Command::Sweep(options) => options.run(),
         Command::Critical(options) => options.run(),
         Command::Check(options) => options.run(),
+        Command::Identify(options) => options.run(),
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),
+        Command::Reproduce(options) => options.run(),
         Command::Completions(options) => options.run(),
     };
     match result {

@@ -6,6 +6,7 @@ use crate::physics::{ContactLaw, OperatingPoint};
 use crate::reduction::ModeSelection;
 
 /// The common tables, checked.
+#[derive(Clone, Debug)]
 pub struct Settings {
     pub reference: OperatingPoint,
     pub band_max_hz: Option<f64>,
@@ -15,6 +16,13 @@ pub struct Settings {
     pub limits: Limits,
     pub warning: Warning,
     pub chart: ChartRange,
+}
+
+impl Settings {
+    /// The largest friction coefficient a prediction is made for: of the search and of the limits.
+    pub fn largest_friction(&self) -> f64 {
+        self.limits.friction_coefficient.iter().fold(self.mu_max, |largest, mu| largest.max(mu.abs()))
+    }
 }
 
 /// The kind of a rig, by the tables it has.
@@ -147,7 +155,7 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
             return mixed(&format!("{side}.mass"), "stands beside a modal pad", limit);
         }
         if modal && substructure.modal.is_none() {
-            return missing(&format!("{side}.modal"), "an .npz file");
+            return missing(&format!("{side}.modal"), "an .npz, .unv or .uff file");
         }
     }
     match (modal, &raw.contact, &raw.contact_patch) {
