@@ -8,6 +8,7 @@ mod critical;
 mod demo;
 mod display;
 mod format;
+mod full;
 mod import;
 mod live;
 mod predict;
@@ -19,6 +20,7 @@ mod signals;
 mod simulate;
 mod sweep;
 mod tribometer;
+mod verify;
 mod view;
 
 use std::io::Write;
@@ -55,6 +57,8 @@ enum Command {
     Check(check::Options),
     Bench(bench::Options),
     Tribometer(tribometer::Options),
+    Full(full::Options),
+    Verify(verify::Options),
     Completions(completions::Options),
 }
 
@@ -92,6 +96,8 @@ pub fn main() -> ExitCode {
         Command::Check(options) => options.run(),
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),
+        Command::Full(options) => options.run(),
+        Command::Verify(options) => options.run(),
         Command::Completions(options) => options.run(),
     };
     match result {
