@@ -8,6 +8,7 @@ mod critical;
 mod demo;
 mod display;
 mod format;
+mod full;
 mod identify;
 mod import;
 mod live;
@@ -21,6 +22,7 @@ mod signals;
 mod simulate;
 mod sweep;
 mod tribometer;
+mod verify;
 mod view;
 
 use std::io::Write;
@@ -58,6 +60,8 @@ enum Command {
     Identify(identify::Options),
     Bench(bench::Options),
     Tribometer(tribometer::Options),
+    Full(full::Options),
+    Verify(verify::Options),
     Reproduce(reproduce::Options),
     Completions(completions::Options),
 }
@@ -97,6 +101,8 @@ pub fn main() -> ExitCode {
         Command::Identify(options) => options.run(),
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),
+        Command::Full(options) => options.run(),
+        Command::Verify(options) => options.run(),
         Command::Reproduce(options) => options.run(),
         Command::Completions(options) => options.run(),
     };

@@ -13,8 +13,11 @@
 //! all parts of a model.
 //! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare with.
 //!
+//! [`compare_roots`] and [`full_windows`] say how far a reduced model is from it.
+//!
 //! Pure: no clock, file, bus, log or serialisation.
 
+mod compare;
 mod contact_solver;
 mod dense;
 mod error;
@@ -31,6 +34,9 @@ mod schur;
 mod sparse;
 mod substructures;
 
+pub use compare::{
+    CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
+};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
