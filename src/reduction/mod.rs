@@ -9,7 +9,8 @@
 //! by [`free_interface_modes`]; [`whiten`] makes `M = I` of a whole system without leaving anything out. Sparse, for
 //! systems of finite-element matrices: [`normal_modes`] by nested dissection, a supernodal `L Lᵀ` and shift-invert block
 //! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
-//! to the basis; [`residual()`] finds what the modes left out still do at the contact.
+//! to the basis; [`residual()`] finds what the modes left out still do at the contact; [`keep_modes`] does both for
+//! all parts of a model.
 //! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare with.
 //!
 //! [`compare_roots`] and [`full_windows`] say how far a reduced model is from it.
@@ -31,6 +32,7 @@ mod project;
 mod residual;
 mod schur;
 mod sparse;
+mod substructures;
 
 pub use compare::{
     CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
@@ -39,10 +41,11 @@ pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
 pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
-pub use normal_modes::{Progress, SparseModes, Wanted, lowest_modes, normal_modes};
+pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use project::{project_dense, project_sparse};
 pub use residual::{Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
+pub use substructures::{Kept, Substructure, keep_modes};
 
 /// Two mirrored entries of a symmetric matrix may differ by this times the largest entry: what printing with 13 digits
 /// leaves. Such matrices are taken as the mean of both triangles.
