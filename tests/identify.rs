@@ -32,7 +32,7 @@ fn the_stiffness_behind_known_frequencies_is_found() {
     assert!(figure.starts_with("<svg") && figure.contains("contact stiffness of a pair"), "{figure:.200}");
 
     // Of the lowest alone, which hardly know the contact, less is known: the range widens.
-    run(["identify", &rig, "--targets", &targets]).exits(0).says("1.000000e0 N/m a pair").says("5.4971");
+    run(["identify", &rig, "--targets", &targets]).exits(0).says("1.000000e0 N/m a pair").says("0.8749");
     let few = json(["identify", &rig, "--targets", &targets, "--json", "--first", "5"]);
     assert!((number(&few, "stiffness_factor") - 8.0).abs() < 1e-5, "{few}");
 }
@@ -49,8 +49,8 @@ fn what_cannot_be_fitted_is_refused() {
     refused("frequency_hz\n0.2\n-3\n", "line 3: frequency_hz is `-3`, expected a number above 0");
     refused("frequency_hz\n", "expected at least one");
     refused("frequency_hz\n1\n2\n3\n4\n5\n6\n7\n8\n9\n10\n", "9 natural frequencies, expected at least the 10");
-    // No stiffness within reach makes the highest that high.
-    refused("frequency_hz\n.1\n.2\n.3\n.4\n.5\n.6\n.7\n.8\n1e6\n", "the end of the search");
+    // No stiffness within reach makes frequencies that high.
+    refused(&("frequency_hz".to_owned() + &"\n1e6".repeat(9)), "the end of the search");
     let one = targets("frequency_hz\n0.2\n");
     run(["identify", &rig, "--targets", &one, "--first", "2"]).exits(1).complains("--first is 2, expected 1 to the 1");
     run(["identify", &rig, "--targets", "/none.csv"]).exits(1).complains("/none.csv");
