@@ -74,6 +74,8 @@ pub struct Against {
     /// Highest frequency, Hz, in place of the rig's or the full model's.
     pub band_hz: Option<f64>,
     pub memory_limit_bytes: Option<usize>,
+    /// Whether windows of instability are compared too.
+    pub windows: bool,
 }
 
 /// The errors at one operating point.
@@ -168,7 +170,7 @@ pub fn verify_against(
         windows: true,
     };
     let (mut windows, mut critical, mut missed, mut invented) = (vec![], None::<f64>, 0, 0);
-    for p in places(rig) {
+    for p in places(rig).into_iter().filter(|_| against.windows) {
         let told = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
         let of_full =
             full_windows(&full.model, &mut full_solver, &p, band_rad_s, &options, &mut |step| progress(&told, step))?;

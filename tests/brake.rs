@@ -101,6 +101,17 @@ fn the_full_brake_has_the_roots_of_its_reference() {
     assert!(number(&full, "covered_growth_per_s") > 500.0);
 }
 
+/// 150 modes of the whole are off by several 1/s, and by 100 1/s near 5.8 kHz: that is caught.
+#[test]
+fn the_brake_on_150_modes_is_found_out() {
+    let Some((_folder, rig)) = rig() else { return };
+    let args = ["verify", &rig, "--against", &rig, "--points", "1", "--no-windows", "--json"];
+    let found = run(args).exits(3).json();
+    let certificate = &found["certificate"];
+    assert_eq!(certificate["band_hz"], 6000.0);
+    assert!(number(certificate, "max_growth_error_per_s") > 5.0, "{certificate}");
+}
+
 #[test]
 fn the_brake_is_told_what_it_holds() {
     let Some((_folder, rig)) = rig() else { return };

@@ -34,6 +34,9 @@ pub struct Options {
     /// Highest frequency in Hz [default: the rig's band, else the full model's, else 5000]
     #[arg(long, value_name = "HZ", value_parser = positive)]
     band_hz: Option<f64>,
+    /// Compare roots only: the windows of a large damped model take long
+    #[arg(long)]
+    no_windows: bool,
     /// Refuse to start where more memory than this is needed
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
@@ -57,6 +60,7 @@ impl Options {
             points: self.points,
             seed: self.seed,
             band_hz: self.band_hz,
+            windows: !self.no_windows,
             memory_limit_bytes: self.memory_gib.map(|gib| (gib * GIB) as usize),
         };
         let found = verify_against(&rig, &full, &against, &mut |what, step| {

@@ -21,7 +21,7 @@ use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, Operating
 pub struct FullPart {
     /// `pad`, `disc` or `system`: how errors name it.
     pub name: String,
-    /// `M`, `n×n`, kg, symmetric and positive definite.
+    /// `M`, `n×n`, kg, symmetric, positive semidefinite with a positive diagonal.
     pub mass: SparseMatrix,
     /// Constant `K`, `n×n`, N/m, symmetric; without entries where all stiffness is in terms.
     pub stiffness: SparseMatrix,

@@ -736,12 +736,17 @@ impl<'a> Problem<'a> {
             None => Mat::zeros(n, 0),
             Some(left) => {
                 let mut of_left = listed(&left.theta);
-                let mut columns = vec![];
+                // Where roots merge, those of the transposed problem differ by the square root of rounding.
+                let (mut columns, mut own) = (vec![], vec![]);
                 for lambda in &lambdas {
                     let off = |other: &(c64, usize)| (other.0 - lambda).norm();
                     let nearest = (0..of_left.len()).min_by(|&a, &b| off(&of_left[a]).total_cmp(&off(&of_left[b])));
                     match nearest.filter(|&k| off(&of_left[k]) < SAME * lambda.norm().max(disc.shift_rad_s * SAME)) {
-                        Some(k) => columns.push(of_left.swap_remove(k).1),
+                        Some(k) => {
+                            let (lambda, column) = of_left.swap_remove(k);
+                            own.push(lambda);
+                            columns.push(column);
+                        }
                         None => {
                             return Err(ReductionError::MissedRoot {
                                 what: format!("{} (transposed)", self.what),
@@ -754,7 +759,7 @@ impl<'a> Problem<'a> {
                     }
                 }
                 let vectors = gathered(&left.vectors, &columns);
-                self.checked(&lambdas, &vectors, true)?;
+                self.checked(&own, &vectors, true)?;
                 // uᵀ Q = 0: yᴴ Q = 0 with y the conjugate of u.
                 Mat::from_fn(n, vectors.ncols(), |i, j| vectors[(i, j)].conj())
             }
@@ -786,7 +791,7 @@ fn times_transposed(matrix: &SparseMatrix, x: &Mat<f64>) -> Mat<f64> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::full_model::{FullContact, FullPart, SparseTerm};
     use super::*;
     use crate::physics::{ContactLaw, Law};
@@ -842,7 +847,7 @@ mod tests {
         vectors_belong(&model, &p, &found);
     }
 
-    fn point(friction_coefficient: f64) -> OperatingPoint {
+    pub(in crate::reduction) fn point(friction_coefficient: f64) -> OperatingPoint {
         OperatingPoint { normal_load_n: 600.0, disc_speed_rad_s: 7.0, friction_coefficient }
     }
 
@@ -863,7 +868,7 @@ mod tests {
 
     /// Two chains, each of `3·nodes` rows in three directions with springs of its own along them, that touch at every
     /// seventh node.
-    fn touching(nodes: usize, damping: f64, law: ContactLaw) -> FullModel {
+    pub(in crate::reduction) fn touching(nodes: usize, damping: f64, law: ContactLaw) -> FullModel {
         let part = |name: &str, spring: f64, first: f64| {
             let (mut mass, mut stiffness) = (vec![], vec![]);
             for node in 0..nodes {

@@ -448,6 +448,28 @@ mod tests {
         }
     }
 
+    /// Every other point without inertia of its own against its neighbour's: `M = [1 1; 1 1]` in pairs. Condensed by hand,
+    /// `M` acts on the sum of a pair alone: `K⁻¹ M` and its projection on the sums have the same eigenvalues `1/ω²`.
+    #[test]
+    fn a_semidefinite_mass_has_as_many_modes_as_its_rank() {
+        let (_, stiffness, _) = membrane(25, 1.0);
+        let n = 625;
+        let mut triplets = vec![];
+        for first in (0..n).step_by(2) {
+            let pair = if first + 1 < n { vec![first, first + 1] } else { vec![first] };
+            triplets.extend(pair.iter().flat_map(|&i| pair.iter().map(move |&j| Triplet::new(i, j, 1.0))));
+        }
+        let mass = SparseMatrix::try_new_from_triplets(n, n, &triplets).unwrap();
+        let found = lowest_modes("system", &mass, &stiffness, 20).unwrap();
+        let sums = Mat::from_fn(n, n.div_ceil(2), |i, j| if i / 2 == j { 1.0 } else { 0.0 });
+        let inverse = faer::linalg::solvers::Solve::solve(&stiffness.to_dense().partial_piv_lu(), &sums);
+        let condensed = sums.transpose() * inverse;
+        let (squares, _) = symmetric_eigen("condensed", condensed.as_ref()).unwrap();
+        for (square, inverse) in found.omega_squared.iter().zip(squares.iter().rev()) {
+            assert!((square * inverse - 1.0).abs() < 1e-10, "{square} {inverse}");
+        }
+    }
+
     #[test]
     fn an_indefinite_or_unsymmetric_matrix_is_named() {
         let (mut mass, stiffness, _) = membrane(25, 2.0);

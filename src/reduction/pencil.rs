@@ -18,7 +18,7 @@ use faer::{Accum, Conj, Mat, MatMut, Par, Side};
 
 use super::ordering::nested_dissection;
 use super::sparse::{entries, worst_asymmetry};
-use super::{DEFINITE_TOLERANCE, ReductionError, SparseMatrix};
+use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
 
 /// Steps of the Lanczos recurrence that looks for the smallest eigenvalue of a scaled mass matrix.
 const MASS_STEPS: usize = 40;
@@ -175,8 +175,9 @@ impl<'a> Pencil<'a> {
         Ok(forward(&self.symbolic).iter().copied().zip(factor.pivots()).collect())
     }
 
-    /// That `M` is positive definite. A mesh's mass matrix, scaled to a unit diagonal, has eigenvalues well away from
-    /// zero, which a short Lanczos recurrence shows; only where it does not, `M` is factored.
+    /// That `M` is positive semidefinite with a positive diagonal. A mesh's mass matrix, scaled to a unit diagonal, has
+    /// eigenvalues well away from zero, which a short Lanczos recurrence shows; only where it does not, `M` is factored,
+    /// its diagonal raised by [`SEMIDEFINITE_TOLERANCE`]: CalculiX gives the inner modes of its bricks a singular mass.
     fn check_mass(&self) -> Result<(), ReductionError> {
         let what = format!("{}.mass", self.what);
         let diagonal: Vec<f64> =
@@ -187,13 +188,15 @@ impl<'a> Pencil<'a> {
         if smallest_scaled(self.mass, &diagonal).is_some_and(|smallest| smallest > CLEARLY_DEFINITE) {
             return Ok(());
         }
-        for (row, value) in self.pivots(&self.sum(0.0, 1.0))? {
-            let limit = DEFINITE_TOLERANCE * diagonal[row];
-            if value.is_nan() || value <= limit {
-                return Err(ReductionError::Indefinite { what, row, value, limit });
-            }
+        let mut raised = self.sum(0.0, 1.0);
+        for (column, &start) in self.pattern.col_ptr()[..self.dimension()].iter().enumerate() {
+            // The lower triangle of a column begins on its diagonal.
+            raised[start] += SEMIDEFINITE_TOLERANCE * diagonal[column];
         }
-        Ok(())
+        match self.pivots(&raised)?.into_iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
+            Some((row, value)) => Err(ReductionError::Indefinite { what, row, value, limit: 0.0 }),
+            None => Ok(()),
+        }
     }
 
     /// Zeros, if there is memory for them.
