@@ -13,7 +13,7 @@ use faer::{Mat, MatRef};
 
 use super::dense::symmetric_eigen;
 use super::sparse::{SparseMatrix, entries, is_symmetric, times};
-use super::{ReductionError, project_sparse, whiten};
+use super::{ReductionError, project_dense, project_sparse, whiten};
 use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Term};
 
 /// A part of a full model: a substructure with its contact interface free, or a whole system.
@@ -245,6 +245,48 @@ impl FullContact {
 }
 
 impl Projected {
+    /// The same on the span of `coefficients`, `k×r`: columns, independent, in the coordinates of this basis.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Indefinite` where the columns depend on each other, `Factorisation`.
+    pub fn restricted(&self, coefficients: MatRef<'_, f64>) -> Result<Self, ReductionError> {
+        let free = Mat::from_fn(coefficients.nrows(), coefficients.ncols(), |i, j| {
+            self.omega_squared[i] * coefficients[(i, j)]
+        });
+        let stiffness = coefficients.transpose() * &free;
+        // M is the unit matrix here.
+        let gram = coefficients.transpose() * coefficients;
+        let symmetric = |m: &Mat<f64>| Mat::from_fn(m.nrows(), m.ncols(), |i, j| m[(i.max(j), i.min(j))]);
+        let whitening = whiten("basis", symmetric(&gram).as_ref())?;
+        let (omega_squared, mut mixed) =
+            symmetric_eigen("basis", whitening.congruence(symmetric(&stiffness).as_ref(), true).as_ref())?;
+        whitening.back(&mut mixed);
+        let turn = coefficients * &mixed;
+        let terms = |terms: &[Term]| -> Vec<Term> {
+            let is_symmetric = |m: &Mat<f64>| (0..m.ncols()).all(|j| (0..j).all(|i| m[(i, j)] == m[(j, i)]));
+            terms
+                .iter()
+                .map(|term| Term {
+                    matrix: project_dense(term.matrix.as_ref(), turn.as_ref(), is_symmetric(&term.matrix)),
+                    law: term.law.clone(),
+                })
+                .collect()
+        };
+        let contact = self.contact.as_ref().map(|pairs| ContactPairs {
+            normal: &pairs.normal * &turn,
+            sliding: &pairs.sliding * &turn,
+            lateral: &pairs.lateral * &turn,
+            ..pairs.clone()
+        });
+        Ok(Self {
+            basis: &self.basis * &turn,
+            omega_squared,
+            contact,
+            stiffness: terms(&self.stiffness),
+            damping: terms(&self.damping),
+        })
+    }
+
     /// The equation of motion in the coordinates of the basis, under `contact_law`.
     ///
     /// # Errors

@@ -14,23 +14,33 @@
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
+mod comparison;
 mod dense;
+mod eigenpair;
 mod error;
 mod full_model;
 mod full_order;
 mod lanczos;
 mod normal_modes;
+mod operating_box;
 mod ordering;
+mod parametric;
 mod pencil;
 mod project;
 mod residual;
 mod sparse;
 
+pub use comparison::{Comparison, Judged, compare_roots};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
+pub use eigenpair::{Eigenpair, Quadratic, SparseSource};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
 pub use full_order::{CoveredDisc, FullRoot, FullSpectrum, full_order_roots};
 pub use normal_modes::{Progress, SparseModes, Wanted, lowest_modes, normal_modes};
+pub use operating_box::OperatingBox;
+pub use parametric::{
+    FullSource, HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
+};
 pub use project::{project_dense, project_sparse};
 pub use residual::{Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
