@@ -9,15 +9,16 @@ mod embedded;
 mod error;
 mod inline;
 mod interpolation;
+pub(crate) mod lines;
 pub mod matrix_market;
 mod modal;
 pub mod npz;
-mod patch;
-mod raw;
+pub(crate) mod patch;
+pub(crate) mod raw;
 pub mod scale;
-mod settings;
+pub(crate) mod settings;
 mod source;
-mod system;
+pub(crate) mod system;
 
 use faer::Mat;
 
@@ -25,6 +26,8 @@ use crate::physics::{Model, OperatingPoint};
 
 pub use embedded::EMBEDDED;
 pub use error::RigError;
+pub use patch::Pair;
+pub use settings::Settings;
 
 use source::Source;
 
@@ -158,7 +161,7 @@ impl Rig {
     }
 
     fn build(rig_file: RigFile, read: &dyn Fn(&str) -> Result<Vec<u8>, String>, limit: &str) -> Result<Self, RigError> {
-        let raw = raw::parse(&rig_file.name, &rig_file.bytes)?;
+        let raw: raw::RawRig = raw::parse(&rig_file.name, &rig_file.bytes)?;
         let mut source = Source::new(rig_file, read, limit);
         let settings = settings::check(&source.rig_file, &raw)?;
         let built = match settings::kind(&source.rig_file, &raw)? {
