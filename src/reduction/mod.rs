@@ -9,7 +9,8 @@
 //! by [`free_interface_modes`]; [`whiten`] makes `M = I` of a whole system without leaving anything out. Sparse, for
 //! systems of finite-element matrices: [`normal_modes`] by nested dissection, a supernodal `L Lᵀ` and shift-invert block
 //! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
-//! to the basis; [`residual()`] finds what the modes left out still do at the contact.
+//! to the basis; [`residual()`] finds what the modes left out still do at the contact; [`keep_modes`] does both for
+//! all parts of a model.
 //! A [`FullModel`] is what all of it starts from; [`full_order_roots`] solves the full system itself, to compare with.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
@@ -29,6 +30,7 @@ mod pencil;
 mod project;
 mod residual;
 mod sparse;
+mod substructures;
 
 pub use comparison::{Comparison, Judged, compare_roots};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
@@ -36,7 +38,7 @@ pub use eigenpair::{Eigenpair, Quadratic, SparseSource};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
 pub use full_order::{CoveredDisc, FullRoot, FullSpectrum, full_order_roots};
-pub use normal_modes::{Progress, SparseModes, Wanted, lowest_modes, normal_modes};
+pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use operating_box::OperatingBox;
 pub use parametric::{
     FullSource, HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
@@ -44,6 +46,7 @@ pub use parametric::{
 pub use project::{project_dense, project_sparse};
 pub use residual::{Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
+pub use substructures::{Kept, Substructure, keep_modes};
 
 /// Two mirrored entries of a symmetric matrix may differ by this times the largest entry: what printing with 13 digits
 /// leaves. Such matrices are taken as the mean of both triangles.

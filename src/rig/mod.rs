@@ -1,7 +1,7 @@
 //! Rig files: raw form, validation, embedded rigs.
 //!
 //! A rig file is TOML (`raw`), says which of three kinds it is by the tables it has, and is built into a [`Rig`]:
-//! `inline` substructures, `modal` substructures of a finite-element program (`npz`, touching in a `patch`), or a
+//! `inline` substructures, `modal` substructures of a finite-element program (`npz` or `uff`, touching in a `patch`), or a
 //! `system` of matrices (`matrix_market`, times a `scale`). What it refers to is read by name through `source`, so
 //! that a recording's attachments serve as well as a directory.
 
@@ -12,13 +12,16 @@ mod interpolation;
 pub(crate) mod lines;
 pub mod matrix_market;
 mod modal;
+mod modal_data;
 pub mod npz;
 pub(crate) mod patch;
 pub(crate) mod raw;
+mod residual;
 pub mod scale;
 pub(crate) mod settings;
 mod source;
 pub(crate) mod system;
+pub mod uff;
 
 use faer::Mat;
 
@@ -26,6 +29,7 @@ use crate::physics::{Model, OperatingPoint};
 
 pub use embedded::EMBEDDED;
 pub use error::RigError;
+pub use modal_data::{ModalData, Residual};
 pub use patch::Pair;
 pub use settings::Settings;
 
@@ -40,7 +44,7 @@ pub struct Rig {
     pub model: Model,
     /// `[reference]`: the operating point used where none is given.
     pub reference: OperatingPoint,
-    /// `[band] max_hz`: modes above are neither listed nor judged.
+    /// `[band] max_hz`: modes above are neither listed nor judged. At most the cut-off of a rig with residual flexibility.
     pub band_max_hz: Option<f64>,
     /// `[search] mu_max`: windows of instability are sought in `[0, mu_max]`.
     pub mu_max: f64,
@@ -166,18 +170,16 @@ impl Rig {
         let settings = settings::check(&source.rig_file, &raw)?;
         let built = match settings::kind(&source.rig_file, &raw)? {
             settings::Kind::Inline { pad, disc, contacts } => {
-                inline::build(&source.rig_file, pad, disc, contacts, settings.contact_law)?
+                inline::build(&source.rig_file, pad, disc, contacts, &settings)?
             }
-            settings::Kind::Modal { pad, disc, patches } => {
-                modal::build(&mut source, pad, disc, patches, settings.contact_law)?
-            }
+            settings::Kind::Modal { pad, disc, patches } => modal::build(&mut source, pad, disc, patches, &settings)?,
             settings::Kind::System(system) => system::build(&mut source, system, &settings)?,
         };
         Ok(Self {
             name: raw.name,
             model: built.model,
             reference: settings.reference,
-            band_max_hz: settings.band_max_hz,
+            band_max_hz: built.band_max_hz,
             mu_max: settings.mu_max,
             instability_threshold: settings.instability_threshold,
             limits: settings.limits,
@@ -216,4 +218,6 @@ struct Built {
     model: Model,
     contents: Vec<String>,
     shapes: Vec<SideShapes>,
+    /// `[band] max_hz`, lower where the model ends below.
+    band_max_hz: Option<f64>,
 }

@@ -3,13 +3,14 @@
 use faer::Mat;
 
 use super::inline::{Side, assemble};
-use super::npz::{self, ModalData};
+use super::modal_data::ModalData;
 use super::patch::{self, Pair};
 use super::raw::{RawPatch, RawSubstructure};
-use super::settings::{spread, within};
+use super::residual::{self, SideResidual};
+use super::settings::{Settings, spread, within};
 use super::source::Source;
 use super::{Built, RigError};
-use crate::physics::{ContactLaw, ContactPairs};
+use crate::physics::ContactPairs;
 use crate::reduction::Modes;
 
 /// A substructure with the modes that were selected, ascending in frequency.
@@ -28,7 +29,7 @@ pub(super) fn build(
     pad: &RawSubstructure,
     disc: Option<&RawSubstructure>,
     patches: &[RawPatch],
-    contact_law: ContactLaw,
+    settings: &Settings,
 ) -> Result<Built, RigError> {
     let pad = part(source, "pad", pad)?;
     let disc = disc.map(|disc| part(source, "disc", disc)).transpose()?;
@@ -56,14 +57,22 @@ pub(super) fn build(
         damping_n_s_per_m,
         radius_m: pairs.iter().map(|pair| pair.radius_m).collect(),
     };
+    let pad_residual = pad.residual("pad", &file)?;
+    let disc_residual = disc.as_ref().map(|disc| disc.residual("disc", &file)).transpose()?;
+    let residual = residual::between(&pairs, &pad_residual, disc_residual.as_ref(), settings.band_max_hz);
     let mut built = assemble(
         &file,
         "modal substructures (kind 2)",
         &pad.side,
         disc.as_ref().map(|disc| &disc.side),
         &contact,
-        contact_law,
+        settings,
+        residual.as_ref().map(|residual| &residual.flexibility),
     )?;
+    if let Some(residual) = residual {
+        built.contents.push(residual.told);
+        built.band_max_hz = Some(residual.band_max_hz);
+    }
     for (shapes, part) in built.shapes.iter_mut().zip(std::iter::once(&pad).chain(&disc)) {
         let rows = 3 * part.data.nodes_m.len();
         let entry = |row: usize, mode: usize| part.data.shape(row / 3, part.selected[mode])[row % 3];
@@ -80,14 +89,28 @@ pub(super) fn build(
     Ok(built)
 }
 
+impl Part {
+    /// What the modes that do not take part still do at the contact.
+    fn residual(&self, name: &'static str, file: &str) -> Result<SideResidual, RigError> {
+        let residual = self.data.residual_beyond(&self.selected).map_err(|mode| RigError::Range {
+            file: file.to_owned(),
+            field: format!("{name}.modes"),
+            value: format!("a selection without mode {mode} of {} rad/s", self.data.omega_rad_s[mode]),
+            limit: "one with every rigid-body motion: they have no residual flexibility".to_owned(),
+        })?;
+        let highest = self.side.modes.omega_rad_s.iter().copied().fold(0.0, f64::max);
+        Ok(SideResidual { name, residual, cutoff_hz: highest / std::f64::consts::TAU })
+    }
+}
+
 /// Reads one side and selects its modes.
 fn part(source: &mut Source<'_>, key: &str, raw: &RawSubstructure) -> Result<Part, RigError> {
     let file = source.rig_file.clone();
     let Some(name) = &raw.modal else {
-        let (field, limit) = (format!("{key}.modal"), "an .npz file".to_owned());
+        let (field, limit) = (format!("{key}.modal"), "an .npz, .unv or .uff file".to_owned());
         return Err(RigError::MissingKey { file, field, limit });
     };
-    let data = npz::read(name, source.read(&format!("{key}.modal"), name)?)?;
+    let data = ModalData::read(name, source.read(&format!("{key}.modal"), name)?)?;
     let mut ascending: Vec<usize> = (0..data.omega_rad_s.len()).collect();
     ascending.sort_by(|&a, &b| data.omega_rad_s[a].total_cmp(&data.omega_rad_s[b]));
     let selected: Vec<usize> = raw

@@ -18,6 +18,13 @@ pub struct Settings {
     pub chart: ChartRange,
 }
 
+impl Settings {
+    /// The largest friction coefficient a prediction is made for: of the search and of the limits.
+    pub fn largest_friction(&self) -> f64 {
+        self.limits.friction_coefficient.iter().fold(self.mu_max, |largest, mu| largest.max(mu.abs()))
+    }
+}
+
 /// The kind of a rig, by the tables it has.
 pub enum Kind<'a> {
     Inline { pad: &'a RawSubstructure, disc: Option<&'a RawSubstructure>, contacts: &'a [RawContact] },
@@ -148,7 +155,7 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
             return mixed(&format!("{side}.mass"), "stands beside a modal pad", limit);
         }
         if modal && substructure.modal.is_none() {
-            return missing(&format!("{side}.modal"), "an .npz file");
+            return missing(&format!("{side}.modal"), "an .npz, .unv or .uff file");
         }
     }
     match (modal, &raw.contact, &raw.contact_patch) {
