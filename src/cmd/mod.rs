@@ -10,6 +10,7 @@ mod display;
 mod format;
 mod import;
 mod live;
+mod on_basis;
 mod predict;
 mod recover;
 mod replay;

@@ -14,7 +14,7 @@ use crate::reduction::{Kept, Residual};
 use crate::rig::RigFile;
 
 /// Digits of a hash that a name carries.
-const HASH_DIGITS: usize = 12;
+pub(super) const HASH_DIGITS: usize = 12;
 
 /// One side of a rig of kind 2.
 #[derive(Clone, Debug)]

@@ -138,9 +138,17 @@ impl FullSource for SparseSource<'_> {
         Ok(found.roots.iter().map(|root| root.lambda).filter(|lambda| lambda.im > 0.0).collect())
     }
 
-    fn pairs(&mut self, p: &OperatingPoint, roots: &[c64]) -> Result<Vec<Eigenpair>, ReductionError> {
+    fn pairs(
+        &mut self,
+        p: &OperatingPoint,
+        band_rad_s: f64,
+        wanted: &dyn Fn(c64) -> bool,
+    ) -> Result<(Vec<c64>, Vec<Eigenpair>), ReductionError> {
+        let roots = self.roots(p, band_rad_s)?;
         let quadratic = Quadratic::new("full model", self.full.matrices_at(p)?)?;
-        roots.iter().map(|&root| quadratic.near(root, None)).collect()
+        let pairs = roots.iter().filter(|root| wanted(**root)).map(|root| quadratic.near(*root, None));
+        let pairs = pairs.collect::<Result<_, _>>()?;
+        Ok((roots, pairs))
     }
 }
 

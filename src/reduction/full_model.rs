@@ -101,6 +101,23 @@ impl FullModel {
             .collect()
     }
 
+    /// Whether load and speed change anything beyond opening, stopping and reversing.
+    pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
+        let (mut load, mut speed) = (false, false);
+        for term in self.stiffness.iter().chain(&self.damping) {
+            if let Law::Custom(custom) = &term.law {
+                load |= custom.depends_on_load;
+                speed |= custom.depends_on_speed;
+            }
+        }
+        if self.contact.is_some() {
+            let law = &self.contact_law;
+            load |= law.exponent != 0.0 || law.slope_s_per_m != 0.0 || law.lateral_damping;
+            speed |= law.lateral_damping;
+        }
+        (load, speed)
+    }
+
     /// What `law` is at `p`; a model without contact pairs never opens.
     fn value(&self, law: &Law, p: &OperatingPoint) -> f64 {
         let state = if self.contact.is_some() { p.contact_state() } else { p.state_closed() };

@@ -31,6 +31,7 @@ mod project;
 mod residual;
 mod sparse;
 mod substructures;
+mod undamped_parts;
 
 pub use comparison::{Comparison, Judged, compare_roots};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
@@ -47,6 +48,7 @@ pub use project::{project_dense, project_sparse};
 pub use residual::{Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 pub use substructures::{Kept, Substructure, keep_modes};
+pub use undamped_parts::{PartPencils, UndampedParts};
 
 /// Two mirrored entries of a symmetric matrix may differ by this times the largest entry: what printing with 13 digits
 /// leaves. Such matrices are taken as the mean of both triangles.

@@ -52,11 +52,16 @@ pub trait FullSource {
     /// [`ReductionError`].
     fn roots(&mut self, p: &OperatingPoint, band_rad_s: f64) -> Result<Vec<c64>, ReductionError>;
 
-    /// These roots at `p` with their right and left vectors.
+    /// The same, and those that are `wanted` with their right and left vectors.
     ///
     /// # Errors
     /// [`ReductionError`].
-    fn pairs(&mut self, p: &OperatingPoint, roots: &[c64]) -> Result<Vec<Eigenpair>, ReductionError>;
+    fn pairs(
+        &mut self,
+        p: &OperatingPoint,
+        band_rad_s: f64,
+        wanted: &dyn Fn(c64) -> bool,
+    ) -> Result<(Vec<c64>, Vec<Eigenpair>), ReductionError>;
 }
 
 /// What is asked of a parametric basis.
@@ -219,6 +224,12 @@ impl Metric {
         times(&self.stiffness, x) + faer::Scale(self.sigma) * times(&self.mass, x)
     }
 
+    /// `Xᵀ S X`, exactly symmetric.
+    fn gram(&self, x: &Mat<f64>) -> Mat<f64> {
+        let gram = x.transpose() * self.times(x.as_ref());
+        Mat::from_fn(gram.nrows(), gram.ncols(), |i, j| 0.5 * (gram[(i, j)] + gram[(j, i)]))
+    }
+
     fn factor(&self) -> Result<Pencil<'_>, ReductionError> {
         Pencil::new("full model", &self.mass, &self.stiffness)
     }
@@ -268,12 +279,13 @@ impl Building<'_> {
     ) -> Result<(), ReductionError> {
         let judged = self.request.judged;
         progress(ParametricStep::Sampling { point, sample: self.sampled.len() + 1 });
-        let roots = self.source.roots(&point, BAND_MARGIN * judged.band_rad_s)?;
         let wanted = Judged {
             band_rad_s: BAND_MARGIN * judged.band_rad_s,
             growth_floor_per_s: judged.growth_floor_per_s - (FLOOR_MARGIN - 1.0) * judged.growth_floor_per_s.abs(),
         };
-        let counting: Vec<c64> = roots.iter().copied().filter(|lambda| wanted.counts(*lambda)).collect();
+        let counts = |lambda: c64| wanted.counts(lambda);
+        let (roots, pairs) = self.source.pairs(&point, wanted.band_rad_s, &counts)?;
+        let counting: Vec<c64> = pairs.iter().map(|pair| pair.lambda).collect();
         let mut ratio = f64::NAN;
         for (reduced, estimate) in estimates.unwrap_or_default() {
             let nearest = counting.iter().map(|root| (root - reduced).norm() / root.norm()).fold(f64::INFINITY, f64::min);
@@ -282,7 +294,6 @@ impl Building<'_> {
                 ratio = ratio.max(nearest / estimate);
             }
         }
-        let pairs = self.source.pairs(&point, &counting)?;
         let columns = self.columns(&point, &pairs)?;
         self.extend(columns)?;
         if ratio.is_finite() {
@@ -347,7 +358,7 @@ impl Building<'_> {
             coefficients += step;
         }
         let weighted = self.metric.times(rest.as_ref());
-        let gram = rest.transpose() * &weighted;
+        let gram = self.metric.gram(&rest);
         let (squares, vectors) = symmetric_eigen("parametric basis", gram.as_ref())?;
         let least = NEGLIGIBLE * self.request.tolerance.sqrt();
         let kept: Vec<usize> = (0..squares.len()).rev().filter(|&k| squares[k] > least * least).collect();
@@ -361,7 +372,7 @@ impl Building<'_> {
         for _ in 0..2 {
             let step = self.span.transpose() * self.metric.times(added.as_ref());
             added -= &self.span * &step;
-            let gram = added.transpose() * self.metric.times(added.as_ref());
+            let gram = self.metric.gram(&added);
             super::whiten("parametric basis", gram.as_ref())?.right(&mut added);
         }
         let more = added.transpose() * &weighted;
