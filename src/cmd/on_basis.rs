@@ -83,7 +83,9 @@ pub fn reduce_on_basis(
     for (part, geometry) in full.model.parts.iter().zip(&full.geometry) {
         if let Some(ratio) = geometry.damping_ratio {
             let name = &part.name;
-            bail!("{path}: `{name}.damping_ratio` is {ratio}; expected none: only modes of a part have one, see --modes");
+            bail!(
+                "{path}: `{name}.damping_ratio` is {ratio}; expected none: only modes of a part have one, see --modes"
+            );
         }
     }
     let settings = &full.settings;
@@ -134,7 +136,9 @@ fn told(step: ParametricStep) -> String {
         )
     };
     match step {
-        ParametricStep::Sampling { point, sample } => format!("sample {sample}: solving the full model at {}", at(point)),
+        ParametricStep::Sampling { point, sample } => {
+            format!("sample {sample}: solving the full model at {}", at(point))
+        }
         ParametricStep::Sampled { roots, vectors, .. } => format!("{roots} roots there, {vectors} vectors in all"),
         ParametricStep::Estimated { worst, vectors } => {
             format!("worst estimate of |dlambda|/|lambda| with {vectors} vectors: {worst:.1e}")

@@ -1,6 +1,6 @@
 //! Reduced models to rig files: modal data as archives under names with their hash, then the rig file that names them.
 
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::path::Path;
 
 use anyhow::Context;
@@ -9,7 +9,6 @@ use npyz::WriterBuilder;
 use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
-use crate::io::whole_file::write_whole;
 use crate::reduction::{Kept, Residual};
 use crate::rig::RigFile;
 
@@ -122,15 +121,4 @@ pub fn modal_rig(
     let mut files = vec![RigFile { name: file.to_owned(), bytes: text.into_bytes() }];
     files.extend(archives);
     Ok(files)
-}
-
-/// Writes the files of a rig into `folder`, each whole or not at all, the rig file (first of `files`) last.
-///
-/// # Errors
-/// A file that cannot be written.
-pub fn write_rig(folder: &Path, files: &[RigFile]) -> anyhow::Result<()> {
-    for file in files.iter().skip(1).chain(files.first()) {
-        write_whole(&folder.join(&file.name), |out| out.write_all(&file.bytes))?;
-    }
-    Ok(())
 }

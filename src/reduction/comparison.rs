@@ -81,7 +81,8 @@ mod tests {
     fn errors_missed_and_invented_roots_are_told_apart() {
         let root = |sigma: f64, omega: f64| c64::new(sigma, omega);
         let full = [root(1.0, 100.0), root(-3.0, 100.0), root(-500.0, 900.0), root(0.0, 2000.0), root(2.0, 1000.0)];
-        let reduced = [root(-3.0, 100.001), root(1.0, 100.0), root(5.0, 700.0), root(-19.0, 2020.0), root(-1.0, 3000.0)];
+        let reduced =
+            [root(-3.0, 100.001), root(1.0, 100.0), root(5.0, 700.0), root(-19.0, 2020.0), root(-1.0, 3000.0)];
         let judged = Judged { band_rad_s: 2010.0, growth_floor_per_s: -20.0 };
         let found = compare_roots(&full, &reduced, judged);
         // The root at 2000 decays a little faster on the other side of the band's end: the same root, 0.0138 apart is not.

@@ -31,6 +31,8 @@ mod project;
 mod residual;
 mod sparse;
 mod substructures;
+#[cfg(test)]
+mod test_models;
 mod undamped_parts;
 
 pub use comparison::{Comparison, Judged, compare_roots};
@@ -41,9 +43,7 @@ pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, Spa
 pub use full_order::{CoveredDisc, FullRoot, FullSpectrum, full_order_roots};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use operating_box::OperatingBox;
-pub use parametric::{
-    FullSource, HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
-};
+pub use parametric::{FullSource, HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
 pub use project::{project_dense, project_sparse};
 pub use residual::{Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};

@@ -134,7 +134,10 @@ mod tests {
         for (wrong, what) in [
             (OperatingBox { normal_load_n: [0.0, 10.0], ..BOX }, "normal_load_n is 0 to 10, expected more than 0"),
             (OperatingBox { disc_speed_rad_s: [-1.0, 1.0], ..BOX }, "disc_speed_rad_s is -1 to 1, expected a range"),
-            (OperatingBox { friction_coefficient: [1.0, 0.5], ..BOX }, "friction_coefficient is 1 to 0.5, expected two"),
+            (
+                OperatingBox { friction_coefficient: [1.0, 0.5], ..BOX },
+                "friction_coefficient is 1 to 0.5, expected two",
+            ),
             (OperatingBox { friction_coefficient: [0.0, f64::NAN], ..BOX }, "friction_coefficient is 0 to NaN"),
         ] {
             let told = wrong.check().unwrap_err().to_string();

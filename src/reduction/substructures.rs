@@ -112,7 +112,11 @@ fn side_by_side<T: Sync, R: Send>(
             .map(|(index, item)| {
                 let told = told.clone();
                 // Nobody hears it any more: nothing is lost with it.
-                scope.spawn(move || work(item, &mut |p| drop(told.send((index, p)))))
+                scope.spawn(move || {
+                    work(item, &mut |p| {
+                        let _ = told.send((index, p));
+                    })
+                })
             })
             .collect();
         drop(told);

@@ -124,12 +124,7 @@ impl<'a> UndampedParts<'a> {
     }
 
     /// Every `κ` with `|κ + s|` at most what the band asks for, and its vectors of one side, in the norm of `M`.
-    fn eigen(
-        &self,
-        at: &At<'_>,
-        band_rad_s: f64,
-        transposed: bool,
-    ) -> Result<Vec<(c64, Mat<c64>)>, ReductionError> {
+    fn eigen(&self, at: &At<'_>, band_rad_s: f64, transposed: bool) -> Result<Vec<(c64, Mat<c64>)>, ReductionError> {
         let full = self.full;
         let n = full.dimension();
         let failed = |reason: String| ReductionError::Factorisation { what: "full model".to_owned(), reason };
@@ -175,15 +170,15 @@ impl<'a> UndampedParts<'a> {
                 tail < CONVERGED * theta[*k].norm()
             };
             let good = order.iter().take_while(|k| converged(k)).count();
-            let reached = if good == n { f64::INFINITY } else { order.get(good).map_or(0.0, |&k| 1.0 / theta[k].norm()) };
+            let reached =
+                if good == n { f64::INFINITY } else { order.get(good).map_or(0.0, |&k| 1.0 / theta[k].norm()) };
             if reached > wanted {
                 return Ok(order[..good]
                     .iter()
                     .filter(|&&k| 1.0 / theta[k].norm() <= wanted)
                     .map(|&k| {
-                        let parts = Mat::from_fn(last, 2, |i, j| {
-                            if j == 0 { vectors[(i, k)].re } else { vectors[(i, k)].im }
-                        });
+                        let parts =
+                            Mat::from_fn(last, 2, |i, j| if j == 0 { vectors[(i, k)].re } else { vectors[(i, k)].im });
                         let parts = &basis * &parts;
                         let shape = Mat::from_fn(n, 1, |i, _| c64::new(parts[(i, 0)], parts[(i, 1)]));
                         (1.0 / theta[k] - self.shift, shape)
@@ -269,4 +264,44 @@ fn root(kappa: c64) -> c64 {
 /// A matrix of sparse rows times `x`.
 fn rows_times(rows: &[SparseRow], x: MatRef<'_, f64>) -> Mat<f64> {
     Mat::from_fn(rows.len(), x.ncols(), |pair, j| rows[pair].iter().map(|&(i, weight)| weight * x[(i, j)]).sum())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::physics::ContactLaw;
+    use crate::reduction::SparseSource;
+    use crate::reduction::eigenpair::tests::residuals;
+    use crate::reduction::test_models::chains;
+
+    /// The same roots as by sparse factors of the whole, with flutter among them, whatever load and direction; both
+    /// vectors satisfy their equation.
+    #[test]
+    fn the_same_roots_as_of_the_whole() {
+        let full = chains(0.0, ContactLaw { exponent: 0.5, ..Default::default() });
+        assert!(UndampedParts::fits(&full));
+        assert!(!UndampedParts::fits(&chains(1.0, ContactLaw::default())));
+        let pencils = PartPencils::new(&full).unwrap();
+        let mut source = UndampedParts::new(&full, &pencils, 300.0).unwrap();
+        let (band, mut growing) = (1500.0, 0);
+        for (normal_load_n, disc_speed_rad_s, friction_coefficient) in
+            [(500.0, 13.0, 0.0), (500.0, 13.0, 0.9), (2000.0, -5.0, 0.7), (60.0, 13.0, 1.0)]
+        {
+            let p = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient };
+            let expected = SparseSource { full: &full }.roots(&p, band).unwrap();
+            let (roots, pairs) = source.pairs(&p, band, &|_| true).unwrap();
+            let inside: Vec<c64> = roots.into_iter().filter(|root| root.im <= band).collect();
+            assert!(expected.len() > 8 && inside.len() == expected.len(), "{} {}", inside.len(), expected.len());
+            for lambda in expected {
+                growing += usize::from(lambda.re > 1.0);
+                let nearest = inside.iter().map(|root| (root - lambda).norm()).fold(f64::INFINITY, f64::min);
+                assert!(nearest < 1e-9 * lambda.norm(), "{p:?} {lambda}: {nearest:e}");
+            }
+            for pair in &pairs {
+                let [right, left] = residuals(&full, &p, pair);
+                assert!(right < 1e-11 && left < 1e-11, "{p:?} {}: {right:e} {left:e}", pair.lambda);
+            }
+        }
+        assert!(growing > 0, "no flutter in this test");
+    }
 }

@@ -29,13 +29,19 @@ pub(super) fn build(
         let (file, field, value, limit) = (file.to_owned(), field.to_owned(), value.to_owned(), limit.to_owned());
         Err(RigError::Kind { file, field, value, limit })
     };
-    let Some(disc) = disc else { return refuse("basis.shared", "is true beside a rigid disc", "[disc], or no [basis]") };
+    let Some(disc) = disc else {
+        return refuse("basis.shared", "is true beside a rigid disc", "[disc], or no [basis]");
+    };
     for (name, part) in [("pad", pad), ("disc", disc)] {
         if part.selected.len() != part.data.omega_rad_s.len() {
             return refuse(&format!("{name}.modes"), "leaves out coordinates of a shared basis", "all of them");
         }
         if part.side.damping_ratio.iter().any(|ratio| *ratio != 0.0) {
-            return refuse(&format!("{name}.damping_ratio"), "is given for a shared basis", "modes of the part, or none");
+            return refuse(
+                &format!("{name}.damping_ratio"),
+                "is given for a shared basis",
+                "modes of the part, or none",
+            );
         }
         if part.data.residual.is_some() {
             return refuse(&format!("{name}.modal"), "holds a residual beside a shared basis", "modes of the part");
