@@ -12,7 +12,7 @@ use program::{run, text};
 use squealcast::export::{ModalSide, modal_rig};
 use squealcast::full_model::FullModelFile;
 use squealcast::physics::{OperatingPoint, Solver, Vectors};
-use squealcast::reduction::{FullSource, Judged, PartPencils, UndampedParts, compare_roots};
+use squealcast::reduction::{FullSolver, FullVectors, Judged, compare_roots};
 use squealcast::rig::{Rig, RigFile};
 
 const NODES_M: [[f64; 3]; 4] = [[0.1, 0.0, 0.0], [0.12, 0.0, 0.01], [0.1, 0.0, 0.02], [0.09, 0.0, -0.01]];
@@ -158,13 +158,13 @@ fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
     let rig = Rig::load(&text(&to)).unwrap();
     assert!(rig.model.dimension() <= 60, "{}", rig.model.dimension());
     let full = FullModelFile::load(&banded).unwrap();
-    let pencils = PartPencils::new(&full.model).unwrap();
-    let mut source = UndampedParts::new(&full.model, &pencils, TAU * 200.0).unwrap();
+    let mut solver = FullSolver::new("tribometer", &full.model, None, &mut |_| {}).unwrap();
     let judged = Judged { band_rad_s: TAU * band_hz, growth_floor_per_s: -20.0 };
     let mut growing = 0;
     for mu in [0.0, 0.21, 0.58, 0.77] {
         let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: mu };
-        let truth = source.roots(&p, 1.1 * TAU * band_hz).unwrap();
+        let found = solver.roots(&p, 1.1 * TAU * band_hz, FullVectors::None, &mut |_| {}).unwrap();
+        let truth: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
         growing += truth.iter().filter(|root| root.re > 1.0).count();
         let found = compare_roots(&truth, &modes(&rig, &p), judged);
         assert!(found.errors.len() > 8 && found.worst() < 1e-6, "{mu}: {} {:e}", found.errors.len(), found.worst());

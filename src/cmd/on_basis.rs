@@ -6,10 +6,7 @@ use anyhow::bail;
 
 use crate::export::basis_rig;
 use crate::full_model::FullModelFile;
-use crate::reduction::{
-    FullSource, Judged, OperatingBox, ParametricRequest, ParametricStep, PartPencils, SparseSource, UndampedParts,
-    parametric_basis,
-};
+use crate::reduction::{FullSolver, Judged, OperatingBox, ParametricRequest, ParametricStep, parametric_basis};
 use crate::rig::RigFile;
 
 /// Largest `|Δλ|/|λ|` where nothing else is asked for.
@@ -24,10 +21,6 @@ const HELD_OUT: usize = 3;
 const MOST_SAMPLES: usize = 40;
 /// Vectors after which it is given up: beyond, modes of the parts are as good.
 const MOST_VECTORS: usize = 500;
-/// The shift that makes free parts definite, relative to the band.
-const SHIFT: f64 = 0.1;
-/// Degrees of freedom above which a sparse factor without symmetry takes too much memory.
-const MOST_UNSYMMETRIC: usize = 60_000;
 
 /// Ranges as they were asked for.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -74,6 +67,7 @@ pub fn reduce_on_basis(
     full: &FullModelFile,
     tolerance: f64,
     ranges: Ranges,
+    memory_limit_bytes: Option<usize>,
     say: &mut dyn FnMut(&str),
 ) -> anyhow::Result<Vec<RigFile>> {
     let path = full.path.display();
@@ -113,17 +107,9 @@ pub fn reduce_on_basis(
         most_vectors: MOST_VECTORS,
         split: false,
     };
-    let n = full.model.dimension();
-    let mut tell = |step: ParametricStep| say(&told(step));
-    let basis = if UndampedParts::fits(&full.model) {
-        let pencils = PartPencils::new(&full.model)?;
-        let mut source = UndampedParts::new(&full.model, &pencils, SHIFT * TAU * band_hz)?;
-        parametric_basis(&full.model, &mut source as &mut dyn FullSource, &request, &mut tell)?
-    } else if n <= MOST_UNSYMMETRIC {
-        parametric_basis(&full.model, &mut SparseSource { full: &full.model }, &request, &mut tell)?
-    } else {
-        bail!("{path}: {n} degrees of freedom with damping or unsymmetric terms; expected at most {MOST_UNSYMMETRIC}");
-    };
+    say("ordering and analysing");
+    let mut solver = FullSolver::new(&full.name, &full.model, memory_limit_bytes, &mut |_| {})?;
+    let basis = parametric_basis(&full.model, &mut solver, &request, &mut |step| say(&told(step)))?;
     // What does not matter holds over all of the range that was asked for.
     basis_rig(file, full, &ParametricRequest { range: asked, ..request }, &basis)
 }

@@ -85,9 +85,10 @@ impl Options {
         steps.say(&format!("reading {}", self.full.display()));
         let full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
+        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
         if self.modes.is_none() && self.cutoff_hz.is_none() && !self.no_residual {
             let (tolerance, range) = (self.tolerance.unwrap_or(TOLERANCE), self.range.unwrap_or_default());
-            let files = reduce_on_basis(&file, &full, tolerance, range, &mut |text| steps.say(text))?;
+            let files = reduce_on_basis(&file, &full, tolerance, range, limit, &mut |text| steps.say(text))?;
             return self.finish(steps, &unfinished, &files);
         }
         if full.geometry.is_empty() {
@@ -109,7 +110,6 @@ impl Options {
                 wanted,
             })
             .collect();
-        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
         let names: Vec<&str> = parts.iter().map(|part| part.name).collect();
         let kept =
             keep_modes(&parts, !self.no_residual, limit, &mut |part, what| tell(&mut steps, part, names[part], what))?;

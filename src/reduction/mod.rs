@@ -11,16 +11,18 @@
 //! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
 //! to the basis; [`residual()`] finds what the modes left out still do at the contact; [`keep_modes`] does both for
 //! all parts of a model.
-//! A [`FullModel`] is what all of it starts from; [`full_order_roots`] solves the full system itself, to compare with.
+//! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare
+//! with and to make a [`parametric_basis`] of, on which it keeps them.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
 mod comparison;
+mod contact_solver;
 mod dense;
-mod eigenpair;
 mod error;
 mod full_model;
 mod full_order;
+mod krylov_schur;
 mod lanczos;
 mod normal_modes;
 mod operating_box;
@@ -29,26 +31,24 @@ mod parametric;
 mod pencil;
 mod project;
 mod residual;
+mod schur;
 mod sparse;
 mod substructures;
 #[cfg(test)]
 mod test_models;
-mod undamped_parts;
 
 pub use comparison::{Comparison, Judged, compare_roots};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
-pub use eigenpair::{Eigenpair, Quadratic, SparseSource};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
-pub use full_order::{CoveredDisc, FullRoot, FullSpectrum, full_order_roots};
+pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use operating_box::OperatingBox;
-pub use parametric::{FullSource, HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
+pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
 pub use project::{project_dense, project_sparse};
 pub use residual::{Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 pub use substructures::{Kept, Substructure, keep_modes};
-pub use undamped_parts::{PartPencils, UndampedParts};
 
 /// Two mirrored entries of a symmetric matrix may differ by this times the largest entry: what printing with 13 digits
 /// leaves. Such matrices are taken as the mean of both triangles.

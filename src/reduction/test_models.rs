@@ -1,6 +1,5 @@
 //! Small full models, shared by the tests of this folder.
 
-use faer::Mat;
 use faer::sparse::Triplet;
 
 use super::{FullContact, FullModel, FullPart, SparseMatrix};
@@ -39,9 +38,4 @@ pub fn chains(damping: f64, contact_law: ContactLaw) -> FullModel {
         }),
         contact_law,
     }
-}
-
-/// The unit matrix.
-pub fn unit(n: usize) -> Mat<f64> {
-    Mat::from_fn(n, n, |i, j| f64::from(u8::from(i == j)))
 }
