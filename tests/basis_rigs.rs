@@ -11,7 +11,7 @@ use faer::{Mat, c64};
 use program::{run, text};
 use squealcast::export::{ModalSide, modal_rig};
 use squealcast::full_model::FullModelFile;
-use squealcast::physics::{OperatingPoint, Solver, Vectors};
+use squealcast::physics::{OperatingPoint, Solver, Spectrum, Vectors};
 use squealcast::reduction::{FullSolver, FullVectors, Judged, compare_roots};
 use squealcast::rig::{Rig, RigFile};
 
@@ -22,7 +22,8 @@ fn shape(rows: usize, columns: usize, seed: f64) -> Mat<f64> {
 }
 
 fn side(name: &str, omega_rad_s: Vec<f64>, phi: Mat<f64>) -> ModalSide<'_> {
-    ModalSide { name, nodes_m: NODES_M.to_vec(), omega_rad_s, phi, residual: None, damping_ratio: None }
+    let nodes_m = NODES_M.to_vec();
+    ModalSide { name, nodes_m, omega_rad_s, phi, residual: None, damping_ratio: None, mass_share: None }
 }
 
 /// A rig of two sides, `more` beside the patch.
@@ -33,9 +34,12 @@ fn rig_of(more: &str, sides: &[ModalSide<'_>]) -> Vec<RigFile> {
     modal_rig("rig.toml", "test", &[], &more.parse().unwrap(), &patches["contact_patch"], sides).unwrap()
 }
 
+fn spectrum(rig: &Rig, p: &OperatingPoint) -> Spectrum {
+    Solver::new(rig.model.dimension()).solve(&rig.model, p, Vectors::Right).unwrap()
+}
+
 fn modes(rig: &Rig, p: &OperatingPoint) -> Vec<c64> {
-    let spectrum = Solver::new(rig.model.dimension()).solve(&rig.model, p, Vectors::Right).unwrap();
-    spectrum.modes().iter().map(|root| root.lambda).collect()
+    spectrum(rig, p).modes().iter().map(|root| root.lambda).collect()
 }
 
 /// Sides with modes of their own are a special case of a shared basis: `[Φ_p 0]` and `[0 Φ_d]`.
@@ -51,16 +55,19 @@ fn a_shared_basis_of_both_sides_modes_is_the_same_rig() {
         let inside = |j: usize| j.checked_sub(first).filter(|j| *j < phi.ncols());
         Mat::from_fn(12, 5, |i, j| inside(j).map_or(0.0, |j| phi[(i, j)]))
     };
-    let sides = [side("pad", all.clone(), wide(&pad, 0)), side("disc", all, wide(&disc, 3))];
+    let mut sides = [side("pad", all.clone(), wide(&pad, 0)), side("disc", all, wide(&disc, 3))];
+    sides[0].mass_share = Some(Mat::from_fn(5, 5, |i, j| f64::from(u8::from(i == j && i < 3))));
     let shared = Rig::from_files(&rig_of(&format!("{law}[basis]\nshared = true\n"), &sides)).unwrap();
     assert!(shared.describe().contains("shared basis (kind 2)"), "{}", shared.describe());
     for (normal_load_n, disc_speed_rad_s, friction_coefficient) in [(500.0, 13.0, 0.0), (900.0, -4.0, 0.8)] {
         let p = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient };
-        let (expected, found) = (modes(&apart, &p), modes(&shared, &p));
-        assert_eq!(expected.len(), 5);
-        for (a, b) in expected.iter().zip(&found) {
+        let (expected, found) = (spectrum(&apart, &p), spectrum(&shared, &p));
+        assert_eq!(expected.modes().len(), 5);
+        for (a, b) in expected.modes().iter().zip(found.modes()) {
             // The same sums in another order.
-            assert!((a - b).norm() < 1e-11 * a.norm(), "{p:?}: {a} {b}");
+            assert!((a.lambda - b.lambda).norm() < 1e-11 * a.lambda.norm(), "{p:?}: {a:?} {b:?}");
+            let shares = [a.pad_participation, b.pad_participation];
+            assert!((shares[0] - shares[1]).abs() < 1e-9 && (0.0..=1.0).contains(&shares[1]), "{p:?}: {shares:?}");
         }
     }
     assert_eq!(shared.shapes.len(), 2);

@@ -10,7 +10,7 @@ use super::matrix_market::write_array;
 use super::rig::{HASH_DIGITS, ModalSide, modal_rig};
 use crate::full_model::{FullModelFile, PartGeometry};
 use crate::physics::{Law, Term};
-use crate::reduction::{ParametricBasis, ParametricRequest};
+use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
 use crate::rig::RigFile;
 
 /// The files of a rig on `basis`: the rig file, called `file`, first, then what it names.
@@ -55,6 +55,10 @@ pub fn basis_rig(
                 }),
                 residual: None,
                 damping_ratio: None,
+                mass_share: (part.name == "pad").then(|| {
+                    let rows = projected.basis.subrows(offset, part.mass.nrows());
+                    project_sparse(&part.mass, rows, true)
+                }),
             }
         })
         .collect();

@@ -30,6 +30,8 @@ pub struct ModalSide<'a> {
     pub residual: Option<&'a Residual>,
     /// Of every mode.
     pub damping_ratio: Option<f64>,
+    /// This side's part of the unit mass matrix, where the columns of `phi` move the other side too.
+    pub mass_share: Option<Mat<f64>>,
 }
 
 impl<'a> ModalSide<'a> {
@@ -50,6 +52,7 @@ impl<'a> ModalSide<'a> {
             phi: Mat::from_fn(rows.len(), phi.ncols(), |i, mode| rows[i].map_or(0.0, |row| phi[(row, mode)])),
             residual: kept.residual.as_ref(),
             damping_ratio,
+            mass_share: None,
         }
     }
 
@@ -70,6 +73,10 @@ impl<'a> ModalSide<'a> {
         let rows = (0..3 * count).flat_map(|row| (0..modes).map(move |mode| phi[(row, mode)]));
         write("phi", &[count, 3, modes], &mut { rows })?;
         write("nodes_m", &[count, 3], &mut self.nodes_m.iter().flatten().copied())?;
+        if let Some(share) = &self.mass_share {
+            let entries = (0..modes).flat_map(|row| (0..modes).map(move |column| share[(row, column)]));
+            write("mass_share", &[modes, modes], &mut { entries })?;
+        }
         if let Some(residual) = self.residual {
             let matrices = [("residual_flexibility", &residual.flexibility), ("residual_inertia", &residual.inertia)];
             for (name, matrix) in matrices {

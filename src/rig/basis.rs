@@ -76,6 +76,11 @@ pub(super) fn build(
     let law = settings.contact_law;
     let model = Model::new(k, vec![free], vec![], law, None)
         .and_then(|model| model.with_contact(&contact))
+        .and_then(|model| match &pad.data.mass_share {
+            // In the order in which the coordinates are taken: ascending in frequency.
+            Some(share) => model.with_pad_mass(Mat::from_fn(k, k, |i, j| share[(pad.selected[i], pad.selected[j])])),
+            None => Ok(model),
+        })
         .map_err(|source| RigError::Model { file: file.to_owned(), source })?;
     let contents = vec![
         "kind       pad and disc on a shared basis (kind 2)".to_owned(),
