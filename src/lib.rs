@@ -3,6 +3,8 @@
 #[cfg(feature = "node")]
 pub mod bench;
 #[cfg(feature = "node")]
+pub mod certificate;
+#[cfg(feature = "node")]
 pub mod cmd;
 #[cfg(feature = "node")]
 pub mod display;

@@ -12,7 +12,7 @@ use program::{run, text};
 use squealcast::export::{ModalSide, modal_rig};
 use squealcast::full_model::FullModelFile;
 use squealcast::physics::{OperatingPoint, Solver, Spectrum, Vectors};
-use squealcast::reduction::{FullSolver, FullVectors, Judged, compare_roots};
+use squealcast::reduction::{Counted, FullSolver, FullVectors, match_roots};
 use squealcast::rig::{Rig, RigFile};
 
 const NODES_M: [[f64; 3]; 4] = [[0.1, 0.0, 0.0], [0.12, 0.0, 0.01], [0.1, 0.0, 0.02], [0.09, 0.0, -0.01]];
@@ -134,10 +134,10 @@ fn a_system_on_its_basis_has_the_roots_it_has() {
     eprintln!("{}", told.stdout);
     let (whole, rig) = (Rig::load(&text(&full)).unwrap(), Rig::load(&text(&to)).unwrap());
     assert!(rig.model.dimension() < n, "{}", rig.model.dimension());
-    let judged = Judged { band_rad_s: 320.0 * TAU, growth_floor_per_s: -20.0 };
+    let counted = Counted { band_rad_s: 320.0 * TAU, growth_floor_per_s: -20.0 };
     for (disc_speed_rad_s, friction_coefficient) in [(2.0, 0.8), (5.0, 0.33), (20.0, 0.0), (11.0, 0.61)] {
         let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s, friction_coefficient };
-        let found = compare_roots(&modes(&whole, &p), &modes(&rig, &p), judged);
+        let found = match_roots(&modes(&whole, &p), &modes(&rig, &p), counted);
         // Not among the points that were held out: the tolerance is what was found at those, not a bound.
         assert!(found.errors.len() > 5 && found.worst() < 1e-6, "{p:?}: {} {:e}", found.errors.len(), found.worst());
     }
@@ -166,14 +166,14 @@ fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
     assert!(rig.model.dimension() <= 60, "{}", rig.model.dimension());
     let full = FullModelFile::load(&banded).unwrap();
     let mut solver = FullSolver::new("tribometer", &full.model, None, &mut |_| {}).unwrap();
-    let judged = Judged { band_rad_s: TAU * band_hz, growth_floor_per_s: -20.0 };
+    let counted = Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: -20.0 };
     let mut growing = 0;
     for mu in [0.0, 0.21, 0.58, 0.77] {
         let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: mu };
         let found = solver.roots(&p, 1.1 * TAU * band_hz, FullVectors::None, &mut |_| {}).unwrap();
         let truth: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
         growing += truth.iter().filter(|root| root.re > 1.0).count();
-        let found = compare_roots(&truth, &modes(&rig, &p), judged);
+        let found = match_roots(&truth, &modes(&rig, &p), counted);
         assert!(found.errors.len() > 8 && found.worst() < 1e-6, "{mu}: {} {:e}", found.errors.len(), found.worst());
     }
     assert!(growing > 0, "no flutter among the conditions of this test");

@@ -8,6 +8,7 @@ mod critical;
 mod demo;
 mod display;
 mod format;
+mod full;
 mod import;
 mod live;
 mod on_basis;
@@ -22,6 +23,7 @@ mod simulate;
 mod steps;
 mod sweep;
 mod tribometer;
+mod verify;
 mod view;
 
 use std::io::Write;
@@ -59,6 +61,8 @@ enum Command {
     Bench(bench::Options),
     Tribometer(tribometer::Options),
     Reduce(reduce::Options),
+    Full(full::Options),
+    Verify(verify::Options),
     Completions(completions::Options),
 }
 
@@ -97,6 +101,8 @@ pub fn main() -> ExitCode {
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),
         Command::Reduce(options) => options.run(),
+        Command::Full(options) => options.run(),
+        Command::Verify(options) => options.run(),
         Command::Completions(options) => options.run(),
     };
     match result {

@@ -6,7 +6,7 @@ use anyhow::bail;
 
 use crate::export::basis_rig;
 use crate::full_model::FullModelFile;
-use crate::reduction::{FullSolver, Judged, OperatingBox, ParametricRequest, ParametricStep, parametric_basis};
+use crate::reduction::{Counted, FullSolver, OperatingBox, ParametricRequest, ParametricStep, parametric_basis};
 use crate::rig::RigFile;
 
 /// Largest `|Δλ|/|λ|` where nothing else is asked for.
@@ -99,7 +99,7 @@ pub fn reduce_on_basis(
     let matters = 1 + usize::from(load) + usize::from(speed);
     let request = ParametricRequest {
         range: asked.without(!load, !speed),
-        judged: Judged { band_rad_s: TAU * band_hz, growth_floor_per_s: GROWTH_FLOOR_PER_S },
+        counted: Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: GROWTH_FLOOR_PER_S },
         tolerance,
         training: TRAINING * matters,
         held_out: HELD_OUT * matters,

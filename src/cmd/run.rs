@@ -81,6 +81,9 @@ pub fn serve(
     listening: Listening,
     (sender, receiver): (Sender<Incoming>, Receiver<Incoming>),
 ) -> anyhow::Result<Outcome> {
+    if let Some(known) = &rig.reduction {
+        eprintln!("{}", known.told());
+    }
     let mut initial = Settings::for_rig(rig);
     let addresses = options.display.addresses()?;
     let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;

@@ -130,7 +130,7 @@ fn record(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricB
     table.insert("friction_coefficient".to_owned(), range(request.range.friction_coefficient));
     table.insert("normal_load_n".to_owned(), range(request.range.normal_load_n));
     table.insert("disc_speed_rad_s".to_owned(), range(request.range.disc_speed_rad_s));
-    table.insert("growth_floor_per_s".to_owned(), request.judged.growth_floor_per_s.into());
+    table.insert("growth_floor_per_s".to_owned(), request.counted.growth_floor_per_s.into());
     table.insert("tolerance".to_owned(), request.tolerance.into());
     table.insert("held_out".to_owned(), (basis.held_out.len() as i64).into());
     table.insert("largest_error".to_owned(), basis.worst().into());

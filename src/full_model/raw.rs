@@ -107,6 +107,7 @@ impl RawFullModel {
             contact_patch: None,
             system: None,
             basis: None,
+            reduction: None,
         };
         (common, own)
     }

@@ -50,8 +50,11 @@ const MOST_SHIFTS: usize = 200;
 const MOST_KEPT: usize = 4;
 /// Imaginary part, relative to `|λ|`, below which a root does not oscillate.
 const REAL: f64 = 1e-9;
-/// Distance, relative to `|λ|`, at which two roots found are the same: the square root of rounding, for where they merge.
-const SAME: f64 = 1e-6;
+/// Distance, relative to `|λ|`, at which two roots found are the same: ten times the square root of the residual of a
+/// pair, for where roots merge.
+const SAME: f64 = 1e-5;
+/// `|λ²|`, relative to that of the shift, of a body that floats freely.
+const FLOATING: f64 = 1e-10;
 /// Below this many degrees of freedom a dense solve is faster.
 const DENSE_BELOW: usize = 240;
 /// Columns that residuals are computed of at once.
@@ -350,7 +353,7 @@ fn agree(what: &str, found: &[Found]) -> Result<(), ReductionError> {
     for (a, b) in found.iter().zip(found.iter().skip(1)).flat_map(|(a, b)| [(a, b), (b, a)]) {
         let mut free: Vec<c64> = b.roots.iter().map(|root| root.lambda).collect();
         for root in a.roots.iter().filter(|root| a.disc.holds(root.lambda) && b.disc.holds(root.lambda)) {
-            let near = |lambda: &c64| (*lambda - root.lambda).norm() < SAME * root.lambda.norm();
+            let near = |lambda: &c64| (*lambda - root.lambda).norm() <= SAME * root.lambda.norm();
             match free.iter().position(near) {
                 Some(index) => {
                     free.swap_remove(index);
@@ -392,7 +395,7 @@ fn assemble(found: &[Found], band_rad_s: f64) -> FullSpectrum {
             }
             // One on the border may have been found just before it too.
             let again = |other: &(FullRoot, usize, usize)| {
-                other.1 != index && (other.0.lambda - root.lambda).norm() < SAME * root.lambda.norm()
+                other.1 != index && (other.0.lambda - root.lambda).norm() <= SAME * root.lambda.norm()
             };
             if (omega - from).abs() > SAME * from || !chosen.iter().any(again) {
                 chosen.push((*root, index, k));
@@ -599,7 +602,11 @@ impl<'a> Problem<'a> {
         let disc = CoveredDisc { shift_rad_s: omega, radius, squared: true };
         // Both of ±λ have the same vector; those that oscillate are listed once.
         let lambdas_of = |theta: c64| {
-            let root = (-(1.0 / theta + square)).sqrt();
+            let kappa = 1.0 / theta + square;
+            if kappa.norm() < FLOATING * square {
+                return vec![ZERO];
+            }
+            let root = (-kappa).sqrt();
             let root = if root.im < 0.0 { -root } else { root };
             if root.im > REAL * root.norm() {
                 vec![root]
@@ -927,7 +934,9 @@ mod tests {
                 left.swap_remove(index);
             }
             vectors_belong(&model, &p, &found);
-            // Other conditions with the same factors.
+            // Apart from each other, and other conditions with the same factors.
+            let open = OperatingPoint { normal_load_n: 0.0, ..p };
+            assert!(solver.roots(&open, band, FullVectors::None, &mut |_| {}).unwrap().roots.len() > 60);
             let factors = solver.kept.len();
             solver.roots(&point(0.2), band, FullVectors::None, &mut |_| {}).unwrap();
             assert!(factors > 0 && solver.kept.len() <= MOST_KEPT);

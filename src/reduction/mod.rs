@@ -14,9 +14,11 @@
 //! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare
 //! with and to make a [`parametric_basis`] of, on which it keeps them.
 //!
+//! [`compare_roots`] and [`full_windows`] say how far a reduced model is from it.
+//!
 //! Pure: no clock, file, bus, log or serialisation.
 
-mod comparison;
+mod compare;
 mod contact_solver;
 mod dense;
 mod error;
@@ -24,6 +26,7 @@ mod full_model;
 mod full_order;
 mod krylov_schur;
 mod lanczos;
+mod matching;
 mod normal_modes;
 mod operating_box;
 mod ordering;
@@ -37,11 +40,14 @@ mod substructures;
 #[cfg(test)]
 mod test_models;
 
-pub use comparison::{Comparison, Judged, compare_roots};
+pub use compare::{
+    CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
+};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
 pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
+pub use matching::{Counted, RootMatch, match_roots};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use operating_box::OperatingBox;
 pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};

@@ -23,9 +23,9 @@
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef, c64};
 
-use super::comparison::{Comparison, Judged, compare_roots};
 use super::dense::symmetric_eigen;
 use super::full_model::{FullModel, Projected};
+use super::matching::{Counted, RootMatch, match_roots};
 use super::operating_box::OperatingBox;
 use super::pencil::{Llt, Pencil};
 use super::sparse::{SparseMatrix, times, transposed};
@@ -48,7 +48,7 @@ const MOST_ROUNDS: usize = 4;
 #[derive(Clone, Debug)]
 pub struct ParametricRequest {
     pub range: OperatingBox,
-    pub judged: Judged,
+    pub counted: Counted,
     /// Largest `|Δλ|/|λ|` of a root that counts.
     pub tolerance: f64,
     /// Points at which the estimate is computed, beside the corners of the box and its middle.
@@ -84,7 +84,7 @@ pub enum ParametricStep {
 #[derive(Clone, Debug)]
 pub struct HeldOut {
     pub point: OperatingPoint,
-    pub comparison: Comparison,
+    pub comparison: RootMatch,
 }
 
 /// A basis and how good it is.
@@ -157,11 +157,11 @@ pub fn parametric_basis(
         let mut held_out = vec![];
         let mut worst = 0.0_f64;
         for point in request.range.spread(first, request.held_out) {
-            let band_rad_s = BAND_MARGIN * request.judged.band_rad_s;
+            let band_rad_s = BAND_MARGIN * request.counted.band_rad_s;
             let full = build.solver.roots(&point, band_rad_s, FullVectors::None, &mut |_| {})?;
             let roots = full.roots.iter().map(|root| root.lambda).filter(|lambda| lambda.im > 0.0).collect::<Vec<_>>();
             let reduced = oscillating(&build.solve(&model, &point, Vectors::None)?);
-            let comparison = compare_roots(&roots, &reduced, request.judged);
+            let comparison = match_roots(&roots, &reduced, request.counted);
             worst = worst.max(comparison.worst());
             progress(ParametricStep::HeldOut { point, worst: comparison.worst() });
             held_out.push(HeldOut { point, comparison });
@@ -194,7 +194,7 @@ impl Metric {
         let middle = request.range.at([0.5; 3]).with_friction(0.0);
         let [mass, _, stiffness] = full.matrices_at(&middle)?;
         let stiffness = weighted_sum(full.dimension(), &[(0.5, &stiffness), (0.5, &transposed(&stiffness)?)])?;
-        let sigma = (SHIFT * request.judged.band_rad_s).powi(2);
+        let sigma = (SHIFT * request.counted.band_rad_s).powi(2);
         Ok(Self { mass, stiffness, sigma })
     }
 
@@ -255,11 +255,11 @@ impl Building<'_, '_> {
         estimates: Option<&[(c64, f64)]>,
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<(), ReductionError> {
-        let judged = self.request.judged;
+        let counted = self.request.counted;
         progress(ParametricStep::Sampling { point, sample: self.sampled.len() + 1 });
-        let wanted = Judged {
-            band_rad_s: BAND_MARGIN * judged.band_rad_s,
-            growth_floor_per_s: judged.growth_floor_per_s - (FLOOR_MARGIN - 1.0) * judged.growth_floor_per_s.abs(),
+        let wanted = Counted {
+            band_rad_s: BAND_MARGIN * counted.band_rad_s,
+            growth_floor_per_s: counted.growth_floor_per_s - (FLOOR_MARGIN - 1.0) * counted.growth_floor_per_s.abs(),
         };
         let spectrum = self.solver.roots(&point, wanted.band_rad_s, FullVectors::Both, &mut |_| {})?;
         let roots: Vec<c64> = spectrum.roots.iter().map(|root| root.lambda).collect();
@@ -425,7 +425,7 @@ impl Building<'_, '_> {
     ) -> Result<Vec<(c64, f64)>, ReductionError> {
         let [mass, damping, stiffness] = self.full.matrices_at(&spectrum.point)?;
         let wanted: Vec<usize> =
-            (0..spectrum.mode_count).filter(|&k| self.request.judged.counts(spectrum.roots[k].lambda)).collect();
+            (0..spectrum.mode_count).filter(|&k| self.request.counted.counts(spectrum.roots[k].lambda)).collect();
         let (n, m, size) = (self.full.dimension(), wanted.len(), projected.omega_squared.len());
         // Real and imaginary parts of all right, then all left vectors.
         let parts = Mat::from_fn(size, 4 * m, |i, j| {
@@ -498,7 +498,7 @@ impl Building<'_, '_> {
             let mut worst = 0.0_f64;
             for (point, roots) in &references {
                 let reduced = oscillating(&self.solve(&model, point, Vectors::None)?);
-                worst = worst.max(compare_roots(roots, &reduced, self.request.judged).worst());
+                worst = worst.max(match_roots(roots, &reduced, self.request.counted).worst());
                 if worst == f64::INFINITY {
                     break;
                 }
@@ -509,8 +509,8 @@ impl Building<'_, '_> {
         };
         let limit = 0.5 * self.request.tolerance;
         let (mut enough, mut found) = (size, None);
-        let judged = self.request.judged;
-        let counting = |roots: &Vec<c64>| roots.iter().filter(|lambda| judged.counts(**lambda)).count();
+        let counted = self.request.counted;
+        let counting = |roots: &Vec<c64>| roots.iter().filter(|lambda| counted.counts(**lambda)).count();
         // Fewer vectors than roots cannot do.
         let mut few = self.known.iter().map(|(_, roots)| counting(roots)).max().unwrap_or(0).min(size - 1);
         while enough > few + 1 {
@@ -572,7 +572,7 @@ mod tests {
                 normal_load_n: [100.0, 1000.0],
                 disc_speed_rad_s: [5.0, 20.0],
             },
-            judged: Judged { band_rad_s: 900.0, growth_floor_per_s: -20.0 },
+            counted: Counted { band_rad_s: 900.0, growth_floor_per_s: -20.0 },
             tolerance,
             training: 10,
             held_out: 4,
@@ -612,7 +612,7 @@ mod tests {
             for held in &basis.held_out {
                 assert!(held.comparison.errors.len() > 5, "{:?}", held.comparison);
                 let reduced = Solver::new(count).solve(&model, &held.point, Vectors::None).unwrap();
-                for lambda in oscillating(&reduced).into_iter().filter(|lambda| request.judged.counts(*lambda)) {
+                for lambda in oscillating(&reduced).into_iter().filter(|lambda| request.counted.counts(*lambda)) {
                     let error = newton_step(&full, &held.point, lambda) / lambda.norm();
                     // A root just above the floor is held like any other; Newton's step is first order in the error.
                     assert!(error <= 1.1e-6, "{:?} {lambda}: {error:e}", held.point);

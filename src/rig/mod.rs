@@ -26,6 +26,7 @@ pub mod uff;
 
 use faer::Mat;
 
+use crate::certificate::Certificate;
 use crate::physics::{Model, OperatingPoint};
 
 pub use embedded::EMBEDDED;
@@ -65,6 +66,8 @@ pub struct Rig {
     pub files: Vec<RigFile>,
     /// What the rig is made of, a line each, for [`Rig::describe`].
     pub contents: Vec<String>,
+    /// `[reduction]`: how far it is from the full model it was reduced from.
+    pub reduction: Option<Certificate>,
     /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
     pub shapes: Vec<SideShapes>,
 }
@@ -195,7 +198,8 @@ impl Rig {
             path: None,
             content_hash: source.content_hash(),
             files: source.into_files(),
-            contents: built.contents,
+            contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::told)).collect(),
+            reduction: raw.reduction,
             shapes: built.shapes,
         })
     }
