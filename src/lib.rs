@@ -14,6 +14,8 @@ pub mod fem;
 #[cfg(feature = "node")]
 pub mod full_model;
 #[cfg(feature = "node")]
+pub mod html;
+#[cfg(feature = "node")]
 pub mod io;
 #[cfg(feature = "node")]
 pub mod node;
@@ -23,6 +25,8 @@ pub mod physics;
 #[cfg(feature = "node")]
 pub mod plot;
 pub mod reduction;
+#[cfg(feature = "node")]
+pub mod reproduce;
 #[cfg(feature = "node")]
 pub mod rig;
 #[cfg(feature = "node")]

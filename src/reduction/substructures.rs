@@ -111,7 +111,7 @@ fn side_by_side<T: Sync, R: Send>(
             .enumerate()
             .map(|(index, item)| {
                 let told = told.clone();
-                // Nobody hears it any more: nothing is lost with it.
+                // Where nobody hears it any more nothing is lost with it.
                 scope.spawn(move || {
                     work(item, &mut |p| {
                         let _ = told.send((index, p));
