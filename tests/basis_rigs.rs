@@ -31,7 +31,7 @@ fn rig_of(more: &str, sides: &[ModalSide<'_>]) -> Vec<RigFile> {
     let patch = "[[contact_patch]]\naxis_point_m = [0.0, 0.0, 0.0]\naxis_direction = [0.0, 1.0, 0.0]\n\
                  normal = [0.0, 1.0, 0.0]\nstiffness_n_per_m = 2e5\n";
     let patches: toml::Table = patch.parse().unwrap();
-    modal_rig("rig.toml", "test", &[], &more.parse().unwrap(), &patches["contact_patch"], sides).unwrap()
+    modal_rig("rig.toml", "test", &[], &more.parse().unwrap(), &patches["contact_patch"], None, sides).unwrap()
 }
 
 fn spectrum(rig: &Rig, p: &OperatingPoint) -> Spectrum {

@@ -4,10 +4,10 @@ use std::f64::consts::TAU;
 
 use anyhow::bail;
 
-use crate::export::basis_rig;
 use crate::full_model::FullModelFile;
-use crate::reduction::{Counted, FullSolver, OperatingBox, ParametricRequest, ParametricStep, parametric_basis};
-use crate::rig::RigFile;
+use crate::reduction::{
+    Counted, FullSolver, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
+};
 
 /// Largest `|Δλ|/|λ|` where nothing else is asked for.
 pub const TOLERANCE: f64 = 1e-6;
@@ -58,18 +58,17 @@ pub fn ranges(text: &str) -> Result<Ranges, String> {
     Ok(ranges)
 }
 
-/// The files of the rig `file`; `say` hears what is being done.
+/// What is asked of a basis of `full`, and the basis; `say` hears what is being done.
 ///
 /// # Errors
 /// A full model that is no case for it, a tolerance that cannot be held.
-pub fn reduce_on_basis(
-    file: &str,
+pub fn basis_of(
     full: &FullModelFile,
     tolerance: f64,
     ranges: Ranges,
     memory_limit_bytes: Option<usize>,
     say: &mut dyn FnMut(&str),
-) -> anyhow::Result<Vec<RigFile>> {
+) -> anyhow::Result<(ParametricRequest, ParametricBasis)> {
     let path = full.path.display();
     let Some(band_hz) = full.settings.band_max_hz else {
         bail!("{path}: `band.max_hz` is missing; expected it: a basis holds the roots of a band");
@@ -111,7 +110,7 @@ pub fn reduce_on_basis(
     let mut solver = FullSolver::new(&full.name, &full.model, memory_limit_bytes, &mut |_| {})?;
     let basis = parametric_basis(&full.model, &mut solver, &request, &mut |step| say(&told(step)))?;
     // What does not matter holds over all of the range that was asked for.
-    basis_rig(file, full, &ParametricRequest { range: asked, ..request }, &basis)
+    Ok((ParametricRequest { range: asked, ..request }, basis))
 }
 
 fn told(step: ParametricStep) -> String {

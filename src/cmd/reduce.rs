@@ -5,17 +5,20 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Context, bail};
 use clap::Args;
 
-use super::on_basis::{Ranges, TOLERANCE, ranges, reduce_on_basis};
+use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
 use super::steps::{GIB, Steps};
 use super::{Outcome, positive, print};
-use crate::export::{ModalSide, modal_rig};
+use crate::certificate::{Against, Certificate, verify_against};
+use crate::export::{ModalSide, basis_rig, modal_rig};
 use crate::full_model::{FullModelFile, PartGeometry};
 use crate::io::memory::available_bytes;
 use crate::io::whole_file::{beside, write_whole};
 use crate::reduction::{Kept, Progress, Substructure, Wanted, keep_modes};
 use crate::rig::{Rig, RigFile};
 
+/// Remarks on where the full model is from, before those on what was kept of it.
+const REMARKS_OF_SOURCE: usize = 2;
 /// The cut-off of the modes kept, relative to the band, where nothing else is asked for.
 const CUTOFF: f64 = 2.5;
 
@@ -23,8 +26,8 @@ const CUTOFF: f64 = 2.5;
 ///
 /// On a basis of the full model's own vectors over a range of conditions, so that every root in the band that grows, or
 /// decays by less than 20 1/s, is within a tolerance; or, with --modes or --cutoff-hz, on the lowest modes of pad and disc,
-/// their contact interface free, and what the modes left out still do at the contact. The arrays are written beside the
-/// rig file under names with their hash, the rig file last.
+/// their contact interface free, and what the modes left out still do at the contact. What is left is compared with the full model at held-out operating points, which the rig file then says. The
+/// arrays are written beside the rig file under names with their hash, the rig file last.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Full model
@@ -45,6 +48,9 @@ pub struct Options {
     /// Leave out what the modes left out do at the contact
     #[arg(long)]
     no_residual: bool,
+    /// Held-out operating points at which the rig is compared with the full model; 0 leaves the comparison out
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    points: usize,
     /// Memory that may be used [default: what the machine has to spare]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
@@ -88,8 +94,10 @@ impl Options {
         let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
         if self.modes.is_none() && self.cutoff_hz.is_none() && !self.no_residual {
             let (tolerance, range) = (self.tolerance.unwrap_or(TOLERANCE), self.range.unwrap_or_default());
-            let files = reduce_on_basis(&file, &full, tolerance, range, limit, &mut |text| steps.say(text))?;
-            return self.finish(steps, &unfinished, &files);
+            let (request, basis) = basis_of(&full, tolerance, range, limit, &mut |text| steps.say(text))?;
+            let method = format!("{} vectors of the full model", basis.projected.omega_squared.len());
+            let make = |known: Option<&Certificate>| basis_rig(&file, &full, &request, &basis, known);
+            return self.finish(steps, &unfinished, &full, limit, method, &make);
         }
         if full.geometry.is_empty() {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
@@ -126,14 +134,41 @@ impl Options {
             .collect();
         let patches = contact_patches(&full.path)?;
         let remarks = remarks(&full, &names, &kept);
-        let files = modal_rig(&file, &full.name, &remarks, &full.common_tables, &patches, &sides)?;
-        self.finish(steps, &unfinished, &files)
+        let make = |known: Option<&Certificate>| {
+            modal_rig(&file, &full.name, &remarks, &full.common_tables, &patches, known, &sides)
+        };
+        self.finish(steps, &unfinished, &full, limit, remarks[REMARKS_OF_SOURCE..].join("; "), &make)
     }
 
-    /// Writes the files of the rig, if it is one, and says what it is.
-    fn finish(&self, mut steps: Steps, unfinished: &Unfinished, files: &[RigFile]) -> anyhow::Result<Outcome> {
-        let rig = Rig::from_files(files).context("what is left of the full model is not a rig")?;
-        unfinished.write(self.output.parent().unwrap_or(Path::new("")), files)?;
+    /// Compares what is left with the full model, and writes the files of the rig with what was found.
+    fn finish(
+        &self,
+        mut steps: Steps,
+        unfinished: &Unfinished,
+        full: &FullModelFile,
+        limit: Option<usize>,
+        method: String,
+        files_of: &dyn Fn(Option<&Certificate>) -> anyhow::Result<Vec<RigFile>>,
+    ) -> anyhow::Result<Outcome> {
+        let make = |known: Option<&Certificate>| -> anyhow::Result<(Vec<RigFile>, Rig)> {
+            let files = files_of(known)?;
+            let rig = Rig::from_files(&files).context("what is left of the full model is not a rig")?;
+            Ok((files, rig))
+        };
+        let (mut files, mut rig) = make(None)?;
+        if self.points > 0 {
+            if full.geometry.iter().any(|geometry| geometry.damping_ratio.is_some_and(|ratio| ratio != 0.0)) {
+                steps.say("not compared: a damping ratio of modes has no meaning for the full model");
+            } else {
+                let against = Against { points: self.points, seed: 1, band_hz: None, memory_limit_bytes: limit };
+                let found = verify_against(&rig, full, &against, &mut |what, step| {
+                    steps.say(&format!("compared with the full model, {what}: {}", super::full::told(step)));
+                })
+                .context("the comparison with the full model failed; --points 0 leaves it out")?;
+                (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?;
+            }
+        }
+        unfinished.write(self.output.parent().unwrap_or(Path::new("")), &files)?;
         steps.say(&format!("{} written", self.output.display()));
         drop(steps);
         print(&format!("{}\n", rig.describe()))?;

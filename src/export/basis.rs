@@ -8,6 +8,7 @@ use sha2::{Digest, Sha256};
 
 use super::matrix_market::write_array;
 use super::rig::{HASH_DIGITS, ModalSide, modal_rig};
+use crate::certificate::Certificate;
 use crate::full_model::{FullModelFile, PartGeometry};
 use crate::physics::{Law, Term};
 use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
@@ -22,12 +23,17 @@ pub fn basis_rig(
     full: &FullModelFile,
     request: &ParametricRequest,
     basis: &ParametricBasis,
+    known: Option<&Certificate>,
 ) -> anyhow::Result<Vec<RigFile>> {
     let remarks = remarks(full, request, basis);
-    let mut common = full.common_tables.clone();
+    let mut common = within(&full.common_tables, request);
     let mut record = record(full, request, basis);
     if full.geometry.is_empty() {
         common.insert("basis".to_owned(), record.into());
+        if let Some(known) = known {
+            let known = toml::Value::try_from(known).context("the comparison cannot be put into words of TOML")?;
+            common.insert("reduction".to_owned(), known);
+        }
         return system_rig(file, full, basis, &remarks, &common);
     }
     record.insert("shared".to_owned(), true.into());
@@ -62,7 +68,29 @@ pub fn basis_rig(
             }
         })
         .collect();
-    modal_rig(file, &full.name, &remarks, &common, patches, &sides)
+    modal_rig(file, &full.name, &remarks, &common, patches, known, &sides)
+}
+
+/// The common tables of the full model, what a rig searches and prepares cut down to what the basis was made for.
+fn within(common: &toml::Table, request: &ParametricRequest) -> toml::Table {
+    let mut tables = common.clone();
+    let mut set = |table: &str, key: &str, value: toml::Value| {
+        let table = tables.entry(table.to_owned()).or_insert_with(|| toml::Table::new().into());
+        if let Some(table) = table.as_table_mut() {
+            table.insert(key.to_owned(), value);
+        }
+    };
+    let range = request.range;
+    if range.friction_coefficient[1] > 0.0 {
+        set("search", "mu_max", range.friction_coefficient[1].into());
+    }
+    for (key, [low, high]) in [("normal_load_n", range.normal_load_n), ("disc_speed_rad_s", range.disc_speed_rad_s)] {
+        // A chart wants a range, of positive numbers.
+        if 0.0 < low && low < high {
+            set("chart", key, vec![low, high].into());
+        }
+    }
+    tables
 }
 
 /// The rows of x, y and z of every interface node; `None` where a direction is held.
