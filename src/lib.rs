@@ -10,6 +10,8 @@ pub mod display;
 pub mod export;
 pub mod fem;
 #[cfg(feature = "node")]
+pub mod full_model;
+#[cfg(feature = "node")]
 pub mod io;
 #[cfg(feature = "node")]
 pub mod node;

@@ -262,7 +262,7 @@ fn bad_files_of_kind_3() {
     );
     told!(
         system("x", "x", UNIT, &UNIT.replace("1 1 1", "1 1 nan")),
-        RigError::MatrixMarket { line: 3, .. },
+        RigError::Line { line: 3, .. },
         "K.mtx, line 3: value is `nan`; expected a finite number"
     );
     // A header that claims a great many rows asks for no memory.

@@ -12,11 +12,13 @@ mod import;
 mod live;
 mod predict;
 mod recover;
+mod reduce;
 mod replay;
 mod report;
 mod run;
 mod signals;
 mod simulate;
+mod steps;
 mod sweep;
 mod tribometer;
 mod view;
@@ -55,6 +57,7 @@ enum Command {
     Check(check::Options),
     Bench(bench::Options),
     Tribometer(tribometer::Options),
+    Reduce(reduce::Options),
     Completions(completions::Options),
 }
 
@@ -92,6 +95,7 @@ pub fn main() -> ExitCode {
         Command::Check(options) => options.run(),
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),
+        Command::Reduce(options) => options.run(),
         Command::Completions(options) => options.run(),
     };
     match result {

@@ -10,5 +10,5 @@ mod vtk;
 pub use calculix::write_deck;
 pub use full_model::write_full_model;
 pub use matrix_market::write_symmetric;
-pub use rig::{ModalSide, modal_rig, write_rig};
+pub use rig::{ModalSide, modal_rig};
 pub use vtk::write_mesh;

@@ -1,15 +1,15 @@
 //! Reduced models to rig files: modal data as archives under names with their hash, then the rig file that names them.
 
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::path::Path;
 
 use anyhow::Context;
 use faer::Mat;
 use npyz::WriterBuilder;
+use npyz::zip::DateTime;
 use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
-use crate::io::whole_file::write_whole;
 use crate::reduction::{Kept, Residual};
 use crate::rig::RigFile;
 
@@ -60,7 +60,9 @@ impl<'a> ModalSide<'a> {
         let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
         let mut write = |name: &str, shape: &[usize], values: &mut dyn Iterator<Item = f64>| -> std::io::Result<()> {
             let shape: Vec<u64> = shape.iter().map(|&length| length as u64).collect();
-            let array = archive.array(name, FileOptions::default()).map_err(std::io::Error::other)?;
+            // The time of writing would make the same modes another archive.
+            let options = FileOptions::default().last_modified_time(DateTime::default());
+            let array = archive.array(name, options).map_err(std::io::Error::other)?;
             let mut writer = array.default_dtype().shape(&shape).begin_nd()?;
             writer.extend(values)?;
             writer.finish()
@@ -122,15 +124,4 @@ pub fn modal_rig(
     let mut files = vec![RigFile { name: file.to_owned(), bytes: text.into_bytes() }];
     files.extend(archives);
     Ok(files)
-}
-
-/// Writes the files of a rig into `folder`, each whole or not at all, the rig file (first of `files`) last.
-///
-/// # Errors
-/// A file that cannot be written.
-pub fn write_rig(folder: &Path, files: &[RigFile]) -> anyhow::Result<()> {
-    for file in files.iter().skip(1).chain(files.first()) {
-        write_whole(&folder.join(&file.name), |out| out.write_all(&file.bytes))?;
-    }
-    Ok(())
 }

@@ -34,7 +34,7 @@ pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, Spa
 pub use full_order::{CoveredDisc, FullRoot, FullSpectrum, full_order_roots};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use project::{project_dense, project_sparse};
-pub use residual::{Residual, residual};
+pub use residual::{InertiaBy, Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 pub use substructures::{Kept, Substructure, keep_modes};
 

@@ -9,17 +9,18 @@ mod embedded;
 mod error;
 mod inline;
 mod interpolation;
+pub(crate) mod lines;
 pub mod matrix_market;
 mod modal;
 mod modal_data;
 pub mod npz;
-mod patch;
-mod raw;
+pub(crate) mod patch;
+pub(crate) mod raw;
 mod residual;
 pub mod scale;
-mod settings;
+pub(crate) mod settings;
 mod source;
-mod system;
+pub(crate) mod system;
 pub mod uff;
 
 use faer::Mat;
@@ -29,6 +30,8 @@ use crate::physics::{Model, OperatingPoint};
 pub use embedded::EMBEDDED;
 pub use error::RigError;
 pub use modal_data::{ModalData, Residual};
+pub use patch::Pair;
+pub use settings::Settings;
 
 use source::Source;
 
@@ -162,7 +165,7 @@ impl Rig {
     }
 
     fn build(rig_file: RigFile, read: &dyn Fn(&str) -> Result<Vec<u8>, String>, limit: &str) -> Result<Self, RigError> {
-        let raw = raw::parse(&rig_file.name, &rig_file.bytes)?;
+        let raw: raw::RawRig = raw::parse(&rig_file.name, &rig_file.bytes)?;
         let mut source = Source::new(rig_file, read, limit);
         let settings = settings::check(&source.rig_file, &raw)?;
         let built = match settings::kind(&source.rig_file, &raw)? {

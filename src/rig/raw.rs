@@ -179,11 +179,11 @@ fn one() -> String {
     "1".to_owned()
 }
 
-/// Reads the text of a rig file.
+/// Reads the text of a rig file, or of another file of tables.
 ///
 /// # Errors
 /// [`RigError::Syntax`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
-pub fn parse(file: &str, bytes: &[u8]) -> Result<RawRig, RigError> {
+pub fn parse<T: serde::de::DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, RigError> {
     let text = std::str::from_utf8(bytes).map_err(|error| {
         let line = 1 + bytes.iter().take(error.valid_up_to()).filter(|byte| **byte == b'\n').count();
         let value = format!("bytes that are not UTF-8 ({error})");

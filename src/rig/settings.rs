@@ -6,6 +6,7 @@ use crate::physics::{ContactLaw, OperatingPoint};
 use crate::reduction::ModeSelection;
 
 /// The common tables, checked.
+#[derive(Clone, Debug)]
 pub struct Settings {
     pub reference: OperatingPoint,
     pub band_max_hz: Option<f64>,

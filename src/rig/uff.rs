@@ -49,8 +49,9 @@ struct Lines<'a> {
 /// Reads a Universal File.
 ///
 /// # Errors
-/// [`RigError::Uff`], naming the line, what stands there and what was expected.
+/// [`RigError::Line`], naming the line, what stands there and what was expected.
 pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
+    let bytes = bytes.strip_suffix(b"\n").unwrap_or(bytes);
     let lines = bytes.split(|byte| *byte == b'\n').map(String::from_utf8_lossy).collect();
     let mut lines = Lines { file, lines, next: 0, dataset: String::new() };
     let (mut nodes, mut modes) = (Vec::<Node>::new(), Vec::<Mode>::new());
@@ -117,7 +118,7 @@ impl Lines<'_> {
     /// An error at a line, counted from 1.
     fn refused(&self, line: usize, field: &str, value: &str, limit: &str) -> RigError {
         let (file, field, value, limit) = (self.file.to_owned(), field.to_owned(), value.to_owned(), limit.to_owned());
-        RigError::Uff { file, line, field, value, limit }
+        RigError::Line { file, line, field, value, limit }
     }
 
     /// An error at the line read last.
