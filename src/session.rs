@@ -200,6 +200,11 @@ impl Session {
         &self.prediction
     }
 
+    /// Whether the prediction for `point` takes no dense solve, unless the chart's own check fails there.
+    pub fn answers_at_once(&self, point: &OperatingPoint) -> bool {
+        self.reuses(point) || self.usable_chart(point).is_some_and(|chart| chart.covers(point))
+    }
+
     /// One step. After the first of its kind a step allocates nothing on the chart's route.
     ///
     /// # Errors
@@ -250,7 +255,7 @@ impl Session {
             self.fault(header, seq, format_args!("{reason}"));
             return None;
         }
-        if self.last.is_some_and(|last| within_dead_band(&last, &point, &self.settings)) {
+        if self.reuses(&point) {
             self.counters.reused += 1;
             (self.prediction.header, self.prediction.input_seq, self.prediction.reused) = (header, seq, true);
             return None;
@@ -336,13 +341,20 @@ impl Session {
         Ok(())
     }
 
+    /// Whether `point` is within the dead-band of the latest prediction.
+    fn reuses(&self, point: &OperatingPoint) -> bool {
+        self.last.is_some_and(|last| within_dead_band(&last, point, &self.settings))
+    }
+
+    /// The chart, where it may be asked: it holds one direction of rotation.
+    fn usable_chart(&self, point: &OperatingPoint) -> Option<&Arc<Chart>> {
+        let sliding = self.rig.model.contact_state(point) == ContactState::Sliding;
+        self.chart.as_ref().filter(|_| sliding && point.disc_speed_rad_s >= 0.0)
+    }
+
     /// Takes what the chart says at `point`; false where there is none, or where it does not answer.
     fn charted_at(&mut self, point: &OperatingPoint) -> bool {
-        let Some(chart) = &self.chart else { return false };
-        // A chart holds one direction of rotation.
-        if self.rig.model.contact_state(point) != ContactState::Sliding || point.disc_speed_rad_s < 0.0 {
-            return false;
-        }
+        let Some(chart) = self.usable_chart(point).cloned() else { return false };
         self.charted.clear();
         let traces = self.traces.at(&self.rig.model, point);
         let (scratch, charted) = (&mut self.scratch, &mut self.charted);

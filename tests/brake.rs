@@ -68,6 +68,39 @@ fn the_brake_on_150_modes_squeals_where_its_reference_does() {
     assert!(modes.iter().all(|mode| mode["pad_participation"].is_null()));
 }
 
+/// The values of the data's own README: shift-invert and Newton refinement to a residual near rounding.
+#[test]
+fn the_full_brake_has_the_roots_of_its_reference() {
+    let Some((_folder, rig)) = rig() else { return };
+    let reference = [
+        (-2.119574, 1409.278878),
+        (-1.486195, 3337.130354),
+        (2.076338, 4920.344220),
+        (-0.000024, 5130.604422),
+        (69.474050, 17429.059590),
+        (110.335711, 26296.217773),
+        (3.171295, 36409.822478),
+    ];
+    let started = Instant::now();
+    let full = json(["full", &rig, "--json"]);
+    eprintln!("solved in {:.1} s", started.elapsed().as_secs_f64());
+    let roots = full["roots"].as_array().expect("roots");
+    // The reference lists what it found above -2.2 1/s.
+    let found: Vec<(f64, f64)> = roots
+        .iter()
+        .map(|root| (number(root, "growth_rate_per_s"), number(root, "omega_rad_s")))
+        .filter(|(growth, omega)| *growth > -2.2 && *omega > 0.0)
+        .collect();
+    eprintln!("{} roots, covered growth {} 1/s", roots.len(), full["covered_growth_per_s"]);
+    assert_eq!(found.len(), reference.len(), "{found:?}");
+    for ((growth, omega), (expected_growth, expected_omega)) in found.into_iter().zip(reference) {
+        let off = (growth - expected_growth).hypot(omega - expected_omega);
+        assert!(off < 1e-8 * expected_omega, "{growth} + {omega}i is {off:e} off");
+    }
+    assert!(roots.iter().all(|root| number(root, "residual") < 1e-12));
+    assert!(number(&full, "covered_growth_per_s") > 500.0);
+}
+
 #[test]
 fn the_brake_is_told_what_it_holds() {
     let Some((_folder, rig)) = rig() else { return };

@@ -2,64 +2,20 @@
 //! in `tests/peers`.
 #![cfg(feature = "node")]
 
+mod bus;
+
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crossbeam_channel::{Receiver, Sender, unbounded};
-use squealcast::io::clock;
+use bus::{PATIENCE, answer, into, next, point, shm, wait_until};
+use crossbeam_channel::unbounded;
 use squealcast::io::heard::{Bus, Heard};
 use squealcast::io::ros_args::RosArgs;
 use squealcast::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::io::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, ShmVibrationInput, ShmVibrationSource};
-use squealcast::wire::{Header, Mode, OperatingPoint, Prediction, RigInfo, Time, Vibration, level};
-
-const PATIENCE: Duration = Duration::from_secs(60);
-
-fn point(seq: u64) -> OperatingPoint {
-    OperatingPoint {
-        header: Header { stamp: Time { sec: 1_000, nanosec: seq as u32 }, frame_id: String::new() },
-        seq,
-        normal_load_n: 500.0,
-        disc_speed_rad_s: 13.0,
-        friction_coefficient: 0.35 + seq as f64 * 1e-6,
-    }
-}
-
-/// What a node would answer; as many modes as a message holds.
-fn answer(point: &OperatingPoint) -> Prediction {
-    Prediction {
-        header: point.header.clone(),
-        input_seq: point.seq,
-        level: level::WARN,
-        reused: point.seq % 2 == 1,
-        friction_margin: point.friction_coefficient,
-        reason: "margin below 0.05 µ".to_owned(),
-        modes: (0..64).map(|id| Mode { id, frequency_hz: f64::from(id) * 10.0, ..Mode::default() }).collect(),
-        ..Prediction::default()
-    }
-}
-
-fn into<M: Send + 'static>(sender: Sender<Heard<M>>) -> impl FnMut(Heard<M>) + Send + 'static {
-    move |heard| drop(sender.send(heard))
-}
-
-fn next<M>(receiver: &Receiver<Heard<M>>) -> Heard<M> {
-    receiver.recv_timeout(PATIENCE).expect("heard in time")
-}
-
-fn wait_until(what: &str, condition: impl Fn() -> bool) {
-    let started = Instant::now();
-    while !condition() {
-        assert!(started.elapsed() < PATIENCE, "waited too long: {what}");
-        thread::sleep(Duration::from_millis(5));
-    }
-}
-
-fn shm(name: &str) -> ShmOptions {
-    ShmOptions { service_prefix: format!("test-{}-{name}/", std::process::id()), file_prefix: None }
-}
+use squealcast::wire::{OperatingPoint, Prediction, RigInfo, Vibration};
 
 /// A domain of its own for each test: not 0, the default, and below 102, where ports of other programs begin.
 fn ros_options(offset: u16) -> Ros2Options {
@@ -568,184 +524,4 @@ fn peer_on_ros2() {
         source.publish(&point(seq)).expect("published");
         thread::sleep(Duration::from_millis(2));
     }
-}
-
-/// Median and 99th percentile of round trips in us.
-fn median_and_p99(mut times: Vec<Duration>) -> [f64; 2] {
-    times.sort_unstable();
-    [times.len() / 2, times.len() * 99 / 100].map(|k| times[k].as_secs_f64() * 1e6)
-}
-
-/// A node of a synthetic rig of 80 + 80 modes on shared memory, its chart over the friction coefficient built already.
-struct NodeOnShm {
-    stop: Sender<squealcast::node::Incoming>,
-    thread: Option<thread::JoinHandle<squealcast::node::Outputs>>,
-    watch: squealcast::node::Watch,
-}
-
-impl NodeOnShm {
-    fn start(options: &ShmOptions, rig: Arc<squealcast::rig::Rig>, ready: Vec<squealcast::node::Incoming>) -> Self {
-        use squealcast::node::{Incoming, Node, Outputs, Watch};
-        let (sender, receiver) = squealcast::node::channel();
-        let mut outputs = Outputs { shm: Some(ShmOutput::new(options).expect("output")), ..Default::default() };
-        let inputs = sender.clone();
-        let input = ShmInput::spawn(options, move |heard| inputs.send(Incoming::Input(heard)).expect("room"));
-        outputs.shm_input = Some(input.expect("input"));
-        // Between its blocks nothing is heard, and that is no fault.
-        let settings = squealcast::settings::Settings::for_rig(&rig);
-        let settings = squealcast::settings::Settings { silence_timeout_s: 1e6, ..settings };
-        let watch = Watch::default();
-        let node = Node::new(rig, settings, outputs, sender.clone(), watch.clone());
-        for event in ready {
-            sender.send(event).expect("room");
-        }
-        let thread = thread::spawn(move || node.run(&receiver));
-        Self { stop: sender, thread: Some(thread), watch }
-    }
-}
-
-impl Drop for NodeOnShm {
-    fn drop(&mut self) {
-        let _ = self.stop.send(squealcast::node::Incoming::Stop);
-        if let Some(thread) = self.thread.take() {
-            let _ = thread.join();
-        }
-    }
-}
-
-fn rig_of_160_modes() -> Arc<squealcast::rig::Rig> {
-    use squealcast::physics::synthetic::{Synthetic, rig};
-    let contact_law = squealcast::physics::ContactLaw::default();
-    let model = rig(&Synthetic { modes: 160, pairs: 48, damping_ratio: 0.0, contact_law, seed: 1 });
-    let like = squealcast::rig::Rig::load("nine-dof-case-2").expect("embedded");
-    Arc::new(squealcast::rig::Rig {
-        model: model.expect("well formed"),
-        band_max_hz: Some(5000.0),
-        mu_max: 1.0,
-        ..like
-    })
-}
-
-/// The node at the speed of the bus: at 1 kHz, alternating in blocks with a bare round trip over the same bus; then
-/// 10 kHz for a minute. `SQUEALCAST_MEASURE=1 cargo test --release --test buses -- --exact speed_of_the_bus --nocapture`.
-#[test]
-fn speed_of_the_bus() {
-    use squealcast::node::{Incoming, session_chart};
-    if std::env::var_os("SQUEALCAST_MEASURE").is_none() {
-        eprintln!("skipped: it measures times; SQUEALCAST_MEASURE=1 runs it");
-        return;
-    }
-    const BLOCKS: usize = 10;
-    const BLOCK: u64 = 1000;
-    let rig = rig_of_160_modes();
-    let first_prediction = {
-        // Nothing is cached, nothing is charted: a session's first step.
-        let settings = squealcast::settings::Settings::for_rig(&rig);
-        let mut session = squealcast::session::Session::new(rig.clone(), settings);
-        let begun = Instant::now();
-        session.step(squealcast::session::Event::Input(point(1))).expect("no setting").publish.expect("answered");
-        begun.elapsed()
-    };
-    let building = Instant::now();
-    let chart = Arc::new(session_chart(&rig, 2, &|| true).expect("charted"));
-    println!("first prediction {first_prediction:.1?}; chart of the friction coefficient {:.1?}", building.elapsed());
-
-    let (node_bus, bare_bus) = (shm("speed-node"), shm("speed-bare"));
-    let node = NodeOnShm::start(&node_bus, rig.clone(), vec![Incoming::Chart(Ok(chart.clone()))]);
-    let bare = ShmOutput::new(&bare_bus).expect("output");
-    let _echo = ShmInput::spawn(&bare_bus, move |heard: Heard<OperatingPoint>| {
-        bare.publish(&answer(&heard.message)).expect("published");
-    })
-    .expect("input");
-    let source_and_sink = |options: &ShmOptions| {
-        let (predictions, heard) = unbounded();
-        let sink = ShmSink::spawn(options, into(predictions)).expect("sink");
-        (ShmSource::new(options).expect("source"), heard, sink)
-    };
-    let (node_source, node_heard, node_sink) = source_and_sink(&node_bus);
-    let (bare_source, bare_heard, _bare_sink) = source_and_sink(&bare_bus);
-    let mut seq = 0;
-    let mut block = |source: &ShmSource, heard: &Receiver<Heard<Prediction>>, times: &mut Vec<Duration>| {
-        for _ in 0..BLOCK {
-            seq += 1;
-            let (sent, sent_ns) = (Instant::now(), clock::monotonic_ns());
-            source.publish(&wave(seq)).expect("published");
-            let answered = next(heard);
-            times.push(Duration::from_nanos(answered.at.monotonic_ns - sent_ns));
-            assert_eq!(answered.message.input_seq, seq);
-            thread::sleep(Duration::from_millis(1).saturating_sub(sent.elapsed()));
-        }
-    };
-    // The first block lets the node compute its map.
-    block(&node_source, &node_heard, &mut vec![]);
-    wait_until("the map", || node.watch.snapshot().map.is_some());
-    let (mut through_node, mut through_bus) = (vec![], vec![]);
-    for _ in 0..BLOCKS {
-        block(&node_source, &node_heard, &mut through_node);
-        block(&bare_source, &bare_heard, &mut through_bus);
-    }
-    let (node_times, bus_times) = (median_and_p99(through_node), median_and_p99(through_bus));
-    println!(
-        "1 kHz, 80 + 80 modes, median and p99 in us: node {node_times:.1?}, bare {bus_times:.1?}, ratio {:.2}",
-        node_times[0] / bus_times[0]
-    );
-
-    // With a chart being built beside it.
-    let building = Arc::new(std::sync::atomic::AtomicBool::new(true));
-    let builder = {
-        let (rig, building) = (rig.clone(), building.clone());
-        thread::spawn(move || {
-            let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
-            while building.load(std::sync::atomic::Ordering::Relaxed) {
-                let _ = session_chart(&rig, 1, &|| building.load(std::sync::atomic::Ordering::Relaxed));
-            }
-        })
-    };
-    let (mut through_node, mut through_bus) = (vec![], vec![]);
-    for _ in 0..3 {
-        block(&node_source, &node_heard, &mut through_node);
-        block(&bare_source, &bare_heard, &mut through_bus);
-    }
-    let (with_build, bus_with_build) = (median_and_p99(through_node), median_and_p99(through_bus));
-    println!(
-        "the same while a chart is built: node {with_build:.1?}, bare {bus_with_build:.1?}, ratio {:.2}",
-        with_build[0] / bus_with_build[0]
-    );
-    building.store(false, std::sync::atomic::Ordering::Relaxed);
-    builder.join().expect("it ended");
-
-    // 10 kHz for a minute: every answer in its order, none missing.
-    const COUNT: u64 = 600_000;
-    let begun = Instant::now();
-    let (mut last, mut heard_count, mut gaps) = (seq, 0, 0);
-    let mut take = |prediction: Prediction| {
-        gaps += prediction.input_seq - last - 1;
-        last = prediction.input_seq;
-        heard_count += 1;
-    };
-    for k in 0..COUNT {
-        let due = Duration::from_micros(100 * k);
-        while begun.elapsed() < due {
-            match node_heard.recv_timeout(due.saturating_sub(begun.elapsed())) {
-                Ok(heard) => take(heard.message),
-                Err(_) => break,
-            }
-        }
-        node_source.publish(&wave(seq + 1 + k)).expect("published");
-    }
-    let sent_in = begun.elapsed();
-    while let Ok(heard) = node_heard.recv_timeout(Duration::from_secs(1)) {
-        take(heard.message);
-    }
-    println!("10 kHz: {COUNT} sent in {sent_in:.1?}, {heard_count} answered, {gaps} missing");
-    let seen = node.watch.snapshot();
-    println!("{:?}, {} passed over; sink {:?}", seen.counters, seen.passed_over, node_sink.counts());
-    assert_eq!((heard_count, gaps), (COUNT, 0));
-    assert!(node_times[0] <= 2.0 * bus_times[0], "the node takes more than twice a bare round trip");
-    assert!(first_prediction < Duration::from_millis(50), "{first_prediction:?}");
-}
-
-/// Conditions all over the chart, none like the one before.
-fn wave(seq: u64) -> OperatingPoint {
-    OperatingPoint { friction_coefficient: 0.5 + 0.49 * (0.01 * seq as f64).sin(), ..point(seq) }
 }

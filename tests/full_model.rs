@@ -113,3 +113,175 @@ fn what_is_wrong_is_told_with_file_line_and_value() {
     std::fs::remove_file(folder.join("m.mtx")).unwrap();
     run(["check", &toml]).exits(1).complains("one.toml: pad.mass = \"m.mtx\" cannot be read");
 }
+
+/// The lines of a matrix of CalculiX: row, column, value.
+fn listed(path: &Path) -> Vec<(usize, usize, String)> {
+    let text = std::fs::read_to_string(path).unwrap();
+    text.lines()
+        .map(|line| {
+            let words: Vec<&str> = line.split_whitespace().collect();
+            (words[0].parse().unwrap(), words[1].parse().unwrap(), words[2].to_owned())
+        })
+        .collect()
+}
+
+/// The lowest modes of the disc of a full model.
+fn modes(path: &str) -> Vec<f64> {
+    let full = FullModelFile::load(Path::new(path)).unwrap_or_else(|error| panic!("{error}"));
+    let disc = &full.model.parts[1];
+    squealcast::reduction::lowest_modes("disc", &disc.mass, &disc.stiffness, 12).unwrap().omega_squared
+}
+
+/// The disc of the tribometer by CalculiX itself; the same matrices as Matrix Market and as Abaqus lists them.
+#[test]
+fn calculix_abaqus_and_matrix_market_give_the_same_modes() {
+    let ccx = std::process::Command::new("ccx").arg("-v").output();
+    if ccx.is_err() {
+        assert!(std::env::var_os("SQUEALCAST_PEERS").is_none(), "no ccx, but SQUEALCAST_PEERS asks for every peer");
+        eprintln!("skipped: no ccx (Debian package calculix-ccx)");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    run(["tribometer", "--dof", "5000", "-o", &text(folder)]).exits(0);
+    let deck = std::fs::read_to_string(folder.join("disc.inp")).unwrap();
+    assert!(deck.contains("*FREQUENCY\n"));
+    write(folder, "stored.inp", &deck.replace("*FREQUENCY\n", "*FREQUENCY, SOLVER=MATRIXSTORAGE\n"));
+    let ended = std::process::Command::new("ccx").arg("stored").current_dir(folder).output().unwrap();
+    assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stdout));
+
+    let toml: toml::Table = std::fs::read_to_string(folder.join("tribometer.toml")).unwrap().parse().unwrap();
+    let with_disc = |name: &str, files: [&str; 4], from: usize| {
+        let mut toml = toml.clone();
+        let disc = toml["disc"].as_table_mut().unwrap();
+        for (key, file) in ["stiffness", "mass", "nodes", "rows"].into_iter().zip(files) {
+            disc.insert(key.to_owned(), file.into());
+        }
+        if files[3].is_empty() {
+            disc.remove("rows");
+        }
+        // Decks count nodes from 1.
+        let interface = disc["interface_nodes"].as_array().unwrap().clone();
+        let counted = interface.iter().map(|node| toml::Value::from(node.as_integer().unwrap() + from as i64));
+        disc.insert("interface_nodes".to_owned(), counted.collect::<Vec<_>>().into());
+        write(folder, name, &toml.to_string())
+    };
+    let calculix = with_disc("calculix.toml", ["stored.sti", "stored.mas", "disc.inp", "stored.dof"], 1);
+    run(["check", &calculix]).exits(0).says("294 of coincident nodes");
+    let expected = modes(&calculix);
+
+    // Matrix Market lists the lower triangle, CalculiX the upper one.
+    let dof = std::fs::read_to_string(folder.join("stored.dof")).unwrap();
+    let labels: Vec<(u64, usize)> = dof
+        .lines()
+        .map(|line| line.trim().split_once('.').map(|(n, d)| (n.parse().unwrap(), d.parse().unwrap())).unwrap())
+        .collect();
+    let mut nodes = String::from("node,x_m,y_m,z_m\n");
+    let mut known = 0;
+    for (index, line) in std::fs::read_to_string(folder.join("disc-nodes.csv")).unwrap().lines().skip(1).enumerate() {
+        nodes += &format!("{},{line}\n", index + 1);
+        known = index + 1;
+    }
+    // Nodes of the elements' inner modes, anywhere.
+    let inner: std::collections::BTreeSet<u64> = labels.iter().map(|(n, _)| *n).filter(|n| *n > known as u64).collect();
+    assert!(!inner.is_empty(), "CalculiX has nodes of its own for incompatible modes");
+    inner.iter().for_each(|node| nodes += &format!("{node},0,0,0\n"));
+    write(folder, "labelled.csv", &nodes);
+    let mut rows = String::from("node,direction\n");
+    labels.iter().for_each(|(node, d)| rows += &format!("{node},{}\n", ["x", "y", "z"][d - 1]));
+    write(folder, "rows.csv", &rows);
+    for (what, file) in [("sti", "k"), ("mas", "m")] {
+        let entries = listed(&folder.join(format!("stored.{what}")));
+        let mut market =
+            format!("%%MatrixMarket matrix coordinate real symmetric\n{0} {0} {1}\n", labels.len(), entries.len());
+        let (mut labelled, mut numbered) = (String::from("** from CalculiX\n*MATRIX, TYPE=SYMMETRIC\n"), String::new());
+        for (row, column, value) in &entries {
+            let (low, high) = (row.min(column), row.max(column));
+            market += &format!("{high} {low} {value}\n");
+            let ((n, d), (m, e)) = (labels[row - 1], labels[column - 1]);
+            labelled += &format!("{n},{d}, {m},{e}, {value}\n");
+            numbered += &format!("{row:10} {column:10} {}\n", value.replace(['e', 'E'], "D"));
+            if row != column {
+                numbered += &format!("{column:10} {row:10} {}\n", value.replace(['e', 'E'], "D"));
+            }
+        }
+        // A boundary condition as Abaqus writes it.
+        labelled += &format!("{known},1, {known},1, {}\n", if file == "k" { "1.0e36" } else { "0.0" });
+        let held = !labels.contains(&(known as u64, 1));
+        if !held {
+            labelled = labelled.lines().filter(|line| !line.ends_with("1.0e36")).map(|l| format!("{l}\n")).collect();
+        }
+        write(folder, &format!("{file}.mtx"), &market);
+        write(folder, &format!("{file}-labels.txt"), &labelled);
+        write(folder, &format!("{file}-numbers.txt"), &numbered);
+    }
+    for (name, files) in [
+        ("market.toml", ["k.mtx", "m.mtx", "labelled.csv", "rows.csv"]),
+        ("labels.toml", ["k-labels.txt", "m-labels.txt", "labelled.csv", ""]),
+        ("numbers.toml", ["k-numbers.txt", "m-numbers.txt", "labelled.csv", "rows.csv"]),
+    ] {
+        for (found, expected) in modes(&with_disc(name, files, 1)).iter().zip(&expected) {
+            // The same numbers in another order: rounding of the largest ω² of a mesh, 1e4 times these, in the factor.
+            assert!((found / expected - 1.0).abs() < 1e-10, "{name}: {found} {expected}");
+        }
+    }
+    // And our own bricks, with another mass of the incompatible modes: within half a per cent in frequency.
+    for (ours, theirs) in modes(&text(&folder.join("tribometer.toml"))).iter().zip(&expected) {
+        assert!(((ours / theirs).sqrt() - 1.0).abs() < 0.005, "{ours} {theirs}");
+    }
+    // Truncated, out of range, no number.
+    for (file, content, told) in [
+        ("stored.sti", "1 1 2.0\n2 2\n", "stored.sti, line 2: entry is `2 2`"),
+        ("stored.sti", "1 1 2.0\n99999999 2 1.0\n", "stored.sti, line 2: row is `99999999`"),
+        ("stored.mas", "1 1 2.0\n1 2 x\n", "stored.mas, line 2: value is `x`"),
+        ("stored.dof", "1.1\n1.9\n", "stored.dof, line 2: row is `1.9`"),
+    ] {
+        let before = std::fs::read(folder.join(file)).unwrap();
+        write(folder, file, content);
+        run(["check", &calculix]).exits(1).complains(told);
+        std::fs::write(folder.join(file), before).unwrap();
+    }
+}
+
+/// The full tribometer at 5000 degrees of freedom: the roots of `full` are those that a dense solve of the model on its
+/// own lowest modes comes near to from above, with residuals at rounding; turning the other way is the negative friction.
+#[test]
+fn the_full_tribometer_is_solved() {
+    let folder = tempfile::tempdir().unwrap();
+    run(["tribometer", "--dof", "5000", "-o", &text(folder.path())]).exits(0);
+    let path = text(&folder.path().join("tribometer.toml"));
+    let started = std::time::Instant::now();
+    let at_rest = program::json(["full", &path, "--mu", "0", "--json"]);
+    eprintln!("solved in {:.1} s", started.elapsed().as_secs_f64());
+    let roots = |value: &serde_json::Value| -> Vec<(f64, f64)> {
+        let roots = value["roots"].as_array().unwrap();
+        assert!(roots.iter().all(|root| program::number(root, "residual") < 1e-12));
+        let both = |root| (program::number(root, "growth_rate_per_s"), program::number(root, "omega_rad_s"));
+        roots.iter().map(both).collect()
+    };
+    // Without friction the whole is symmetric: its modes by Lanczos, counted by their inertia.
+    let full = FullModelFile::load(Path::new(&path)).unwrap();
+    let point = OperatingPoint { friction_coefficient: 0.0, ..full.settings.reference };
+    let [mass, _, stiffness] = full.model.matrices_at(&point).unwrap();
+    let found = roots(&at_rest);
+    let band = 2.0 * std::f64::consts::PI * 5000.0;
+    let wanted = squealcast::reduction::Wanted::Below(band);
+    let modes = squealcast::reduction::normal_modes("whole", &mass, &stiffness, wanted, None, &mut |_| {}).unwrap();
+    assert_eq!(found.len(), modes.omega_squared.len());
+    for ((growth, omega), square) in found.iter().zip(&modes.omega_squared) {
+        // Both are good to rounding of the stiffest row, 1e-16 of an ω² of 1e13, near an ω² of 1e7.
+        assert!(
+            (omega * omega / square - 1.0).abs() < 1e-9 && growth.abs() < 1e-6 * omega,
+            "{growth} {omega} {square}"
+        );
+    }
+    let forward = roots(&program::json(["full", &path, "--mu", "0.4", "--json"]));
+    let backward = roots(&program::json(["full", &path, "--mu", "-0.4", "--speed", "-13", "--json"]));
+    assert_eq!(forward.len(), backward.len());
+    assert!(forward.len() == found.len(), "{} roots with friction, {} without", forward.len(), found.len());
+    for (a, b) in forward.iter().zip(&backward) {
+        assert!((a.1 - b.1).abs() < 1e-9 * a.1 + 1e-9 && (a.0.abs() - b.0.abs()).abs() < 1e-7 * a.1, "{a:?} {b:?}");
+    }
+    run(["full", &path, "--memory-gib", "0.01"]).exits(1).complains("more than the 0.01 GiB allowed");
+    run(["full", &path, "--mu", "0.4"]).exits(0).says("covered: 0 to 5000 Hz");
+}

@@ -10,7 +10,7 @@ use program::{command, files_below, run, text, write};
 use squealcast::full_model::FullModelFile;
 use squealcast::node::session_map;
 use squealcast::physics::{OperatingPoint, Solver, Vectors, WindowKind};
-use squealcast::reduction::{full_order_roots, lowest_modes};
+use squealcast::reduction::{FullSolver, FullVectors, lowest_modes};
 use squealcast::rig::Rig;
 
 /// The band that is judged, Hz.
@@ -26,7 +26,7 @@ fn tribometer(folder: &Path, dof: usize) -> String {
 }
 
 fn reduced(full: &str, modes: &str, to: &Path) -> Rig {
-    let run = run(["reduce", full, "--modes", modes, "-o", &text(to)]).exits(0);
+    let run = run(["reduce", full, "--modes", modes, "--points", "1", "-o", &text(to)]).exits(0);
     eprintln!("{}{}", run.stderr, run.stdout);
     Rig::load(to.to_str().unwrap()).unwrap_or_else(|error| panic!("{error}"))
 }
@@ -41,10 +41,9 @@ fn at_rest(rig: &Rig) -> Vec<f64> {
 }
 
 /// Roots of the full model in the band at a friction coefficient, `λ²`.
-fn full_squares(full: &FullModelFile, mu: f64) -> Vec<faer::c64> {
+fn full_squares(full: &FullModelFile, solver: &mut FullSolver<'_>, mu: f64) -> Vec<faer::c64> {
     let point = OperatingPoint { friction_coefficient: mu, ..full.settings.reference };
-    let [mass, damping, stiffness] = full.model.matrices_at(&point).unwrap();
-    let found = full_order_roots("full", [&mass, &damping, &stiffness], TAU * BAND_HZ, &mut |_, _| {}).unwrap();
+    let found = solver.roots(&point, TAU * BAND_HZ, FullVectors::None, &mut |_| {}).unwrap();
     found.roots.iter().map(|root| root.lambda * root.lambda).collect()
 }
 
@@ -74,6 +73,13 @@ fn the_tribometer_in_modes_with_residuals_against_its_full_model() {
         let found = at_rest(&rig);
         let errors: Vec<f64> =
             exact.iter().zip(&found).map(|(exact, found)| 100.0 * (found / exact - 1.0).abs()).collect();
+        // What reduce itself found at a held-out point is in the rig file.
+        let known = rig.reduction.clone().unwrap();
+        assert!(
+            known.full_model_hash == full.content_hash && known.points == 1 && known.band_hz == BAND_HZ,
+            "{known:?}"
+        );
+        assert!(known.missed == 0 && known.invented == 0 && known.max_frequency_error < 1e-4, "{known:?}");
         let mean = errors.iter().sum::<f64>() / errors.len() as f64;
         eprintln!("{modes}: mean {mean:.2e} %, largest {:.2e} %", errors.iter().fold(0.0, |a: f64, b| a.max(*b)));
         assert!(mean < limit_percent, "{modes}: {errors:?}");
@@ -83,6 +89,7 @@ fn the_tribometer_in_modes_with_residuals_against_its_full_model() {
     let mut solver = Solver::new(rig.model.dimension());
     let map = session_map(&rig, &mut solver, &rig.reference).unwrap();
     assert!(map.complete && !map.windows.is_empty());
+    let mut exact_solver = FullSolver::new("full", &full.model, None, &mut |_| {}).unwrap();
     for window in &map.windows {
         assert_eq!(window.kind, WindowKind::Coalescence);
         for mu in [Some(window.mu_from), window.mu_to].into_iter().flatten() {
@@ -91,7 +98,8 @@ fn the_tribometer_in_modes_with_residuals_against_its_full_model() {
             let merged = spectrum.roots.iter().min_by(|a, b| hz(a).total_cmp(&hz(b))).unwrap().square;
             // The discriminant of the full model's pair on both sides, and where the line through them is zero.
             let step = 0.003;
-            let [low, high] = [mu - step, mu + step].map(|mu| pair(&full_squares(&full, mu), merged)[1].re);
+            let [low, high] =
+                [mu - step, mu + step].map(|mu| pair(&full_squares(&full, &mut exact_solver, mu), merged)[1].re);
             let exact = mu - step + 2.0 * step * low / (low - high);
             eprintln!("merging at {:.1} Hz: {mu:.6}, of the full model {exact:.6}", window.frequency_hz);
             assert!((mu - exact).abs() < (0.005 * exact).max(0.003), "{mu} {exact}");
@@ -109,7 +117,7 @@ fn the_tribometer_in_modes_with_residuals_against_its_full_model() {
             hz.sort_by(f64::total_cmp);
             hz
         };
-        let exact = growing(&full_squares(&full, mu));
+        let exact = growing(&full_squares(&full, &mut exact_solver, mu));
         let spectrum = solver.solve(&rig.model, &rig.reference.with_friction(mu), Vectors::Right).unwrap();
         let found = growing(&spectrum.roots.iter().map(|root| root.square).collect::<Vec<_>>());
         eprintln!("growing or decaying at {mu}: {found:?} Hz, of the full model {exact:?} Hz");
@@ -123,7 +131,7 @@ fn the_rig_file_names_archives_by_their_hash_and_hands_on_the_tables() {
     let folder = tempfile::tempdir().unwrap();
     let path = tribometer(folder.path(), 5000);
     let to = folder.path().join("out.toml");
-    let first = run(["reduce", &path, "--modes", "12+9", "-o", &text(&to)]).exits(0);
+    let first = run(["reduce", &path, "--modes", "12+9", "--points", "0", "-o", &text(&to)]).exits(0);
     // Plain lines where nobody looks on: what is done, with time and memory.
     for told in ["degrees of freedom read", "pad: ordering and analysing", "disc: factored", "GiB]", "out.toml written"]
     {
@@ -143,10 +151,10 @@ fn the_rig_file_names_archives_by_their_hash_and_hands_on_the_tables() {
     // The same again is the same to the last bit; other modes are another archive.
     let names = |rig: &Rig| rig.files.iter().skip(1).map(|file| file.name.clone()).collect::<Vec<_>>();
     assert!(names(&rig)[0].starts_with("out-pad-") && names(&rig)[1].starts_with("out-disc-"), "{:?}", names(&rig));
-    run(["reduce", &path, "--modes", "12+9", "-o", &text(&to)]).exits(0);
+    run(["reduce", &path, "--modes", "12+9", "--points", "0", "-o", &text(&to)]).exits(0);
     assert_eq!(Rig::load(to.to_str().unwrap()).unwrap().content_hash, rig.content_hash);
     // Below a cut-off, every mode and no other.
-    run(["reduce", &path, "--cutoff-hz", "4000", "--no-residual", "-o", &text(&to)]).exits(0);
+    run(["reduce", &path, "--cutoff-hz", "4000", "--no-residual", "--points", "0", "-o", &text(&to)]).exits(0);
     let below = Rig::load(to.to_str().unwrap()).unwrap();
     assert_ne!(names(&below), names(&rig));
     let omega: Vec<f64> = (0..2)
@@ -184,7 +192,7 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
         .complains("`band.max_hz` is missing; expected it, --cutoff-hz or --modes");
     run(["reduce", "none.toml", "-o", &to]).exits(1).complains("none.toml");
     let nowhere = text(&folder.path().join("none/rig.toml"));
-    run(["reduce", &path, "--modes", "5+5", "-o", &nowhere]).exits(1).complains("cannot write");
+    run(["reduce", &path, "--modes", "5+5", "--points", "0", "-o", &nowhere]).exits(1).complains("cannot write");
     assert_eq!(files_below(folder.path()), before);
 }
 

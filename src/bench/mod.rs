@@ -30,6 +30,8 @@ pub enum Kind {
     Undamped,
     /// No damping, a contact that stiffens with the cube root of the load
     Hertzian,
+    /// Modal damping of 0.5 %, friction that damps across the sliding: friction coefficient and load over speed matter
+    Lateral,
     /// Modal damping of 0.5 %, friction that falls with speed and damps across it, a stiffening contact: everything matters
     Damped,
 }
@@ -219,7 +221,7 @@ fn conditions(plan: &Plan, merging: &[f64], reference: &OperatingPoint) -> Vec<O
 }
 
 /// Rigs are drawn until one has merging points, this many times at most.
-const MOST_SEEDS: u64 = 20;
+const MOST_SEEDS: u64 = 40;
 
 /// The first rig, from the plan's seed on, that has merging points in the band at the load and speed of `reference`, with its seed and
 /// them; the last one drawn where none has any.
@@ -247,11 +249,12 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> anyhow::Result<Model> {
     let contact_law = match plan.kind {
         Kind::Undamped => ContactLaw::default(),
         Kind::Hertzian => ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() },
+        Kind::Lateral => ContactLaw { lateral_damping: true, ..ContactLaw::default() },
         Kind::Damped => {
             ContactLaw { exponent: 1.0 / 3.0, reference_n: 500.0, slope_s_per_m: -0.02, lateral_damping: true }
         }
     };
-    let damping_ratio = if plan.kind == Kind::Damped { 5e-3 } else { 0.0 };
+    let damping_ratio = if matches!(plan.kind, Kind::Damped | Kind::Lateral) { 5e-3 } else { 0.0 };
     Ok(rig(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })?)
 }
 

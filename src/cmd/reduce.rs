@@ -5,9 +5,11 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Context, bail};
 use clap::Args;
 
+use super::full;
 use super::signals::on_stop;
 use super::steps::{GIB, Steps};
 use super::{Outcome, positive, print};
+use crate::certificate::{Against, Certificate, verify_against};
 use crate::export::{ModalSide, modal_rig};
 use crate::full_model::{FullModelFile, PartGeometry};
 use crate::io::memory::available_bytes;
@@ -15,13 +17,16 @@ use crate::io::whole_file::{beside, write_whole};
 use crate::reduction::{Kept, Progress, Substructure, Wanted, keep_modes};
 use crate::rig::{Rig, RigFile};
 
+/// Remarks on where the full model is from, before those on what was kept of it.
+const REMARKS_OF_SOURCE: usize = 2;
 /// The cut-off of the modes kept, relative to the band, where nothing else is asked for.
 const CUTOFF: f64 = 2.5;
 
 /// Reduce a full model to a rig file the node can run
 ///
 /// Keeps the lowest modes of pad and disc, their contact interface free, and what the modes left out still do at the
-/// contact. The arrays are written beside the rig file under names with their hash, the rig file last.
+/// contact. What is left is compared with the full model at held-out operating points, which the rig file then says. The
+/// arrays are written beside the rig file under names with their hash, the rig file last.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Full model
@@ -35,6 +40,9 @@ pub struct Options {
     /// Leave out what the modes left out do at the contact
     #[arg(long)]
     no_residual: bool,
+    /// Held-out operating points at which the rig is compared with the full model; 0 leaves the comparison out
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    points: usize,
     /// Memory that may be used [default: what the machine has to spare]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
@@ -111,8 +119,25 @@ impl Options {
             .collect();
         let patches = contact_patches(&full.path)?;
         let remarks = remarks(&full, &names, &kept);
-        let files = modal_rig(&file, &full.name, &remarks, &full.common_tables, &patches, &sides)?;
-        let rig = Rig::from_files(&files).context("what is left of the full model is not a rig")?;
+        let make = |known: Option<&Certificate>| -> anyhow::Result<(Vec<RigFile>, Rig)> {
+            let files = modal_rig(&file, &full.name, &remarks, &full.common_tables, &patches, known, &sides)?;
+            let rig = Rig::from_files(&files).context("what is left of the full model is not a rig")?;
+            Ok((files, rig))
+        };
+        let (mut files, mut rig) = make(None)?;
+        if self.points > 0 {
+            if full.geometry.iter().any(|geometry| geometry.damping_ratio.is_some_and(|ratio| ratio != 0.0)) {
+                steps.say("not compared: a damping ratio of modes has no meaning for the full model");
+            } else {
+                let against = Against { points: self.points, seed: 1, band_hz: None, memory_limit_bytes: limit };
+                let found = verify_against(&rig, &full, &against, &mut |what, step| {
+                    steps.say(&format!("compared with the full model, {what}: {}", full::told(step)));
+                })
+                .context("the comparison with the full model failed; --points 0 leaves it out")?;
+                let method = remarks[REMARKS_OF_SOURCE..].join("; ");
+                (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?;
+            }
+        }
         unfinished.write(self.output.parent().unwrap_or(Path::new("")), &files)?;
         steps.say(&format!("{} written", self.output.display()));
         drop(steps);

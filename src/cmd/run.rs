@@ -10,13 +10,14 @@ use crossbeam_channel::{Receiver, Sender};
 use super::buses::BusOptions;
 use super::display::{self, DisplayOptions, ThresholdOption};
 use super::{Outcome, live, signals};
+use crate::display::server::Server;
 use crate::io::chart_file::ChartFile;
 use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig};
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::{Parameters, Ros2};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
-use crate::node::{self, Incoming, Node, Outputs, Watch};
+use crate::node::{self, Incoming, Node, Outputs, Shortcut, Watch};
 use crate::rig::Rig;
 use crate::session::Counters;
 use crate::settings::{self, Settings};
@@ -81,16 +82,23 @@ pub fn serve(
     listening: Listening,
     (sender, receiver): (Sender<Incoming>, Receiver<Incoming>),
 ) -> anyhow::Result<Outcome> {
+    if let Some(known) = &rig.reduction {
+        eprintln!("{}", known.told());
+    }
     let mut initial = Settings::for_rig(rig);
     let addresses = options.display.addresses()?;
     let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
     let mut outputs = Outputs { recorder: recorder.as_ref().map(Recorder::handle), ..Default::default() };
+    let shortcut = Shortcut::new(sender.clone());
     if let Some(shm) = buses.shm() {
         outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
         outputs.shm_sensitivity = Some(ShmSensitivity::new(&shm)?);
         if listening == Listening::ToTheBuses {
             let lost = &outputs.lost_inputs;
-            outputs.shm_input = Some(ShmInput::spawn(&shm, hear(listening, &sender, lost, Incoming::Input))?);
+            let (inputs, lost_inputs) = (shortcut.clone(), lost.clone());
+            outputs.shm_input = Some(ShmInput::spawn_with_backlog(&shm, move |heard, more_waits| {
+                lost_inputs.fetch_add(u64::from(!inputs.input(heard, more_waits)), Ordering::Relaxed);
+            })?);
             let vibration = hear(listening, &sender, lost, Incoming::Vibration);
             outputs.shm_vibration = Some(ShmVibrationInput::spawn(&shm, vibration)?);
         }
@@ -124,8 +132,8 @@ pub fn serve(
     signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let watch = Watch::default();
     let display = display::of_node(&addresses, rig, &watch, options.threshold);
-    let shown = live::show(frame(rig, sender.clone()), watch.clone(), options.plain);
-    let node = Node::new(rig.clone(), initial, outputs, sender.clone(), watch);
+    let shown = live::show(frame(rig, display.as_ref(), sender.clone()), watch.clone(), options.plain);
+    let node = Node::new(rig.clone(), initial, outputs, sender.clone(), watch).with_shortcut(&shortcut);
     let kept = || ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);
     let kept = if options.no_chart_cache { None } else { kept() };
     let node = if options.no_chart { node } else { node.with_chart(kept, sender) };
@@ -138,10 +146,12 @@ pub fn serve(
     outcome
 }
 
-/// What is around the table of a node for `rig`.
-fn frame(rig: &Rig, node: Sender<Incoming>) -> live::Frame {
+/// What is around the table of a node for `rig`; what was said before it is covered by it, so that it says again where
+/// the page is.
+fn frame(rig: &Rig, display: Option<&Server>, node: Sender<Incoming>) -> live::Frame {
+    let page = display.map(|display| format!("  http://{}/", display.address()));
     live::Frame {
-        title: rig.name.clone(),
+        title: format!("{}{}", rig.name, page.unwrap_or_default()),
         instability_threshold: rig.instability_threshold,
         foot: Box::new(|snapshot| {
             let Counters { solved, charted, reused, faults, .. } = snapshot.counters;

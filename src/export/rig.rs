@@ -10,6 +10,7 @@ use npyz::zip::DateTime;
 use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
+use crate::certificate::Certificate;
 use crate::reduction::{Kept, Residual};
 use crate::rig::RigFile;
 
@@ -89,7 +90,8 @@ impl<'a> ModalSide<'a> {
 /// The files of a rig of kind 2: the rig file, called `file`, first, then the archives it names.
 ///
 /// `common` are the tables that full models and rigs share; `patches` is `contact_patch` with nodes counted as in the
-/// sides; `remarks` are lines of comment at the top.
+/// sides; `reduction`, where it is known, is how far the rig is from its full model; `remarks` are lines of comment at the
+/// top.
 ///
 /// # Errors
 /// What could not be put into words of TOML or into an archive.
@@ -99,6 +101,7 @@ pub fn modal_rig(
     remarks: &[String],
     common: &toml::Table,
     patches: &toml::Value,
+    reduction: Option<&Certificate>,
     sides: &[ModalSide<'_>],
 ) -> anyhow::Result<Vec<RigFile>> {
     let stem = Path::new(file).file_stem().map_or(file.into(), |stem| stem.to_string_lossy());
@@ -119,6 +122,10 @@ pub fn modal_rig(
         archives.push(RigFile { name: archive, bytes });
     }
     table.insert("contact_patch".to_owned(), patches.clone());
+    if let Some(reduction) = reduction {
+        let known = toml::Value::try_from(reduction).context("the comparison cannot be put into words of TOML")?;
+        table.insert("reduction".to_owned(), known);
+    }
     let mut text: String = remarks.iter().map(|line| format!("# {line}\n")).collect();
     text += &toml::to_string(&table).context("the rig cannot be put into words of TOML")?;
     let mut files = vec![RigFile { name: file.to_owned(), bytes: text.into_bytes() }];

@@ -4,6 +4,7 @@
 //! `[system]` as in rig files of kind 3. Matrices are read line by line into 16 bytes for each entry listed (`entries`);
 //! what is kept of the files is their hash (`files`).
 
+mod coordinates;
 mod entries;
 mod files;
 mod part;
@@ -49,12 +50,15 @@ pub struct FullModelFile {
     pub contents: Vec<String>,
 }
 
+/// The node of a row that belongs to no node: an inner degree of freedom of an element.
+pub const INTERNAL: usize = usize::MAX;
+
 /// Where the rows of a part are.
 #[derive(Clone, Debug)]
 pub struct PartGeometry {
     /// Positions of all nodes, m.
     pub nodes_m: Vec<[f64; 3]>,
-    /// Node and direction of every row: 0 to 2 displacements along x, y, z; 3 to 5 rotations about them.
+    /// Node, or [`INTERNAL`], and direction of every row: 0 to 2 displacements along x, y, z; 3 to 5 rotations about them.
     pub rows: Vec<(usize, usize)>,
     /// Nodes of the contact interface, as listed.
     pub interface: Vec<usize>,
@@ -122,6 +126,25 @@ impl FullModelFile {
             content_hash: files.content_hash(),
             contents,
         })
+    }
+
+    /// That no part has a damping ratio of its modes: the full matrices do not have them.
+    ///
+    /// # Errors
+    /// [`RigError::Kind`].
+    pub fn refuse_modal_damping(&self) -> Result<(), RigError> {
+        let damped = self.geometry.iter().zip(&self.model.parts).find_map(|(geometry, part)| {
+            geometry.damping_ratio.filter(|ratio| *ratio != 0.0).map(|ratio| (part.name.clone(), ratio))
+        });
+        match damped {
+            None => Ok(()),
+            Some((part, ratio)) => Err(RigError::Kind {
+                file: self.path.display().to_string(),
+                field: format!("{part}.damping_ratio"),
+                value: format!("is {ratio}: damping of modes is no matrix of the full model"),
+                limit: "0, or none, to solve the full model".to_owned(),
+            }),
+        }
     }
 
     /// What the full model is and holds, a few lines for people.
@@ -270,7 +293,8 @@ fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Resul
         for (index, raw) in raw.iter().enumerate() {
             let field = |name: &str| format!("system.{key}[{index}].{name}");
             let (law, _) = system::checked_law(&file, &field("scale"), &raw.scale, &settings.reference)?;
-            let matrix = part::matrix(files, &field("matrix"), &raw.matrix, 1.0, Some((n, "system.mass")))?;
+            let expected = part::Expected { rows: n, told: "system.mass", row_of: &HashMap::new() };
+            let matrix = part::matrix(files, &field("matrix"), &raw.matrix, 1.0, Some(expected))?;
             let symmetry = if crate::reduction::is_symmetric(&matrix) { "symmetric" } else { "unsymmetric" };
             let entries = matrix.compute_nnz();
             contents.push(format!("{key:<10} {} times {}, {symmetry}, {entries} entries", raw.matrix, raw.scale));

@@ -2,12 +2,14 @@
 
 use std::collections::HashMap;
 use std::io::BufRead;
+use std::path::Path;
 
-use super::PartGeometry;
+use super::coordinates::{self, Label};
 use super::entries::{Entries, MOST_ROWS};
 use super::files::Files;
 use super::raw::RawPart;
 use super::tables::{self, Nodes};
+use super::{INTERNAL, PartGeometry};
 use crate::reduction::{FullPart, SYMMETRY_TOLERANCE, SparseMatrix};
 use crate::rig::settings::within;
 use crate::rig::{RigError, lines, matrix_market};
@@ -25,6 +27,17 @@ struct Read<'a> {
     field: String,
     file: &'a str,
     matrix: SparseMatrix,
+    row_of: &'a HashMap<Label, usize>,
+}
+
+/// What is known of a matrix before it is read.
+#[derive(Clone, Copy)]
+pub struct Expected<'a> {
+    pub rows: usize,
+    /// What says so.
+    pub told: &'a str,
+    /// The row of every label.
+    pub row_of: &'a HashMap<Label, usize>,
 }
 
 /// Reads the part called `name`.
@@ -34,22 +47,27 @@ struct Read<'a> {
 pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigError> {
     let toml = files.toml.clone();
     let field = |key: &str| format!("{name}.{key}");
-    let nodes =
-        files.read(&field("nodes"), &raw.nodes, |input| tables::nodes(&raw.nodes, input, raw.units.of_lengths()))?;
-    let (rows_field, rows_file) = match &raw.rows {
-        Some(file) => (field("rows"), file.as_str()),
-        None => {
-            let limit = "a table of node and direction of every row".to_owned();
-            return Err(RigError::MissingKey { file: toml, field: field("rows"), limit });
-        }
+    let scale = raw.units.of_lengths();
+    let nodes = files.read(&field("nodes"), &raw.nodes, |input| match extension(&raw.nodes).as_str() {
+        "inp" => coordinates::deck_nodes(&raw.nodes, input, scale),
+        _ => tables::nodes(&raw.nodes, input, scale),
+    })?;
+    let rows_file = raw.rows.as_deref().unwrap_or(&raw.stiffness);
+    let labels = match &raw.rows {
+        Some(file) => files.read(&field("rows"), file, |input| match extension(file).as_str() {
+            "dof" => coordinates::dof(file, input),
+            _ => tables::rows(file, input),
+        })?,
+        None => files.read(&field("stiffness"), rows_file, |input| coordinates::rows_of(rows_file, input))?,
     };
-    let labels = files.read(&rows_field, rows_file, |input| tables::rows(rows_file, input))?;
-    let (rows, row_of) = placed(rows_file, &labels, &nodes, &raw.nodes)?;
+    let row_of_label: HashMap<Label, usize> = labels.iter().enumerate().map(|(row, label)| (*label, row)).collect();
+    let internal = extension(rows_file) == "dof";
+    let (rows, row_of) = placed(rows_file, &labels, &nodes, &raw.nodes, internal)?;
     let mut matrix = |key: &str, file: &str| -> Result<SparseMatrix, RigError> {
         let field = field(key);
-        let expected = Some((rows.len(), rows_file));
-        let matrix = self::matrix(files, &field, file, raw.units.of_matrices(), expected)?;
-        let read = Read { field, file, matrix };
+        let expected = Expected { rows: rows.len(), told: rows_file, row_of: &row_of_label };
+        let matrix = self::matrix(files, &field, file, raw.units.of_matrices(), Some(expected))?;
+        let read = Read { field, file, matrix, row_of: &row_of_label };
         read.check(files, key == "mass")?;
         Ok(read.matrix)
     };
@@ -70,15 +88,27 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
 type Rows = (Vec<(usize, usize)>, HashMap<(usize, usize), usize>);
 
 /// Every row with the place of its node instead of its label.
-fn placed(file: &str, labels: &[(u64, usize)], nodes: &Nodes, nodes_file: &str) -> Result<Rows, RigError> {
+fn placed(
+    file: &str,
+    labels: &[(u64, usize)],
+    nodes: &Nodes,
+    nodes_file: &str,
+    internal: bool,
+) -> Result<Rows, RigError> {
     let (mut rows, mut row_of) = (vec![], HashMap::new());
     for (row, &(label, direction)) in labels.iter().enumerate() {
         let refuse = |value: String, limit: String| {
             let (file, field) = (file.to_owned(), format!("row {row}"));
             Err(RigError::Range { file, field, value, limit })
         };
-        let Some(node) = nodes.place(label) else {
-            return refuse(format!("at node {label}"), format!("a node of {nodes_file}"));
+        let node = match nodes.place(label) {
+            Some(node) => node,
+            // CalculiX gives the incompatible modes of its bricks nodes of their own.
+            None if internal => {
+                rows.push((INTERNAL, direction));
+                continue;
+            }
+            None => return refuse(format!("at node {label}"), format!("a node of {nodes_file}")),
         };
         if let Some(before) = row_of.insert((node, direction), row) {
             return refuse(format!("node {label} again, as row {before}"), "every direction of a node once".to_owned());
@@ -119,10 +149,16 @@ pub fn matrix(
     field: &str,
     file: &str,
     factor: f64,
-    expected: Option<(usize, &str)>,
+    expected: Option<Expected<'_>>,
 ) -> Result<SparseMatrix, RigError> {
     let toml = files.toml.clone();
     files.read(field, file, |input| {
+        if !is_matrix_market(input)
+            && let Some(expected) = expected
+        {
+            let (entries, mirrored) = coordinates::read(file, input, expected.rows, expected.row_of)?;
+            return Ok(entries.compress(expected.rows, mirrored, factor));
+        }
         let mut entries = Entries::default();
         let size = matrix_market::read_entries(file, input, |row, column, value| {
             if row.max(column) < MOST_ROWS {
@@ -132,7 +168,7 @@ pub fn matrix(
         let n = size.rows;
         let limit = match expected {
             _ if size.columns != n || n == 0 || n >= MOST_ROWS => format!("a square matrix of 1 to {MOST_ROWS} rows"),
-            Some((rows, told)) if rows != n => format!("{rows}x{rows}, as {told}"),
+            Some(Expected { rows, told, .. }) if rows != n => format!("{rows}x{rows}, as {told}"),
             // Only now is memory for n columns asked for.
             None if entries.len() < n => "an entry on every place of the diagonal".to_owned(),
             _ => return Ok(entries.compress(n, size.mirrored, factor)),
@@ -142,12 +178,23 @@ pub fn matrix(
     })
 }
 
+/// Whether what is left to read begins with the banner of a Matrix Market file, or with nothing at all.
+fn is_matrix_market(input: &mut dyn BufRead) -> bool {
+    input.fill_buf().is_ok_and(|start| start.is_empty() || start.starts_with(b"%"))
+}
+
+/// A file name's extension in small letters.
+fn extension(name: &str) -> String {
+    Path::new(name).extension().map(|extension| extension.to_string_lossy().to_lowercase()).unwrap_or_default()
+}
+
 /// A symmetric matrix on its own, checked.
 ///
 /// # Errors
 /// [`RigError`].
 pub fn symmetric(files: &mut Files, field: &str, file: &str, mass: bool) -> Result<SparseMatrix, RigError> {
-    let read = Read { field: field.to_owned(), file, matrix: matrix(files, field, file, 1.0, None)? };
+    let matrix = matrix(files, field, file, 1.0, None)?;
+    let read = Read { field: field.to_owned(), file, matrix, row_of: &HashMap::new() };
     read.check(files, mass)?;
     Ok(read.matrix)
 }
@@ -187,7 +234,13 @@ impl Read<'_> {
 
     /// An error about an entry, with the line it stands in.
     fn at_line(&self, files: &mut Files, place: (usize, usize), value: String, limit: &str) -> RigError {
-        let found = files.read(&self.field, self.file, |input| line_of(self.file, input, place));
+        let found = files.read(&self.field, self.file, |input| {
+            if is_matrix_market(input) {
+                line_of(self.file, input, place)
+            } else {
+                coordinates::line_of(self.file, input, self.row_of, place)
+            }
+        });
         match found {
             Ok(line) => lines::refuse(self.file, line, "entry", value, limit),
             Err(error) => error,

@@ -51,7 +51,6 @@ const MAX_PUBLISHERS: usize = 8;
 const MAX_SUBSCRIBERS: usize = 32;
 const MAX_NODES: usize = 64;
 const HISTORY_SAMPLES: usize = 16;
-const BUFFER_SAMPLES: usize = 64;
 
 /// A reader looks for samples, and whether it should stop, at least this often; with events it wakes at once.
 const TICK: Duration = Duration::from_millis(50);
@@ -182,7 +181,22 @@ impl<F: Form> ShmReader<F> {
     ///
     /// # Errors
     /// Whatever iceoryx2 refuses.
-    pub fn spawn(options: &ShmOptions, sink: impl FnMut(Heard<F::Message>) + Send + 'static) -> Result<Self, ShmError> {
+    pub fn spawn(
+        options: &ShmOptions,
+        mut sink: impl FnMut(Heard<F::Message>) + Send + 'static,
+    ) -> Result<Self, ShmError> {
+        Self::spawn_with_backlog(options, move |heard, _| sink(heard))
+    }
+
+    /// As [`ShmReader::spawn`]; `sink` is also told whether more is waiting to be read: one that takes its time with the last
+    /// message should not with those before it, or the oldest of them are lost.
+    ///
+    /// # Errors
+    /// Whatever iceoryx2 refuses.
+    pub fn spawn_with_backlog(
+        options: &ShmOptions,
+        sink: impl FnMut(Heard<F::Message>, bool) + Send + 'static,
+    ) -> Result<Self, ShmError> {
         let node = new_node(options)?;
         let Services { service, topic, event } = Services::<F>::open(&node, options)?;
         // The listener first: nothing can then come between that wakes nobody.
@@ -242,7 +256,7 @@ struct Reading<F: Form, S> {
     node: Node<Ipc>,
 }
 
-impl<F: Form, S: FnMut(Heard<F::Message>)> Reading<F, S> {
+impl<F: Form, S: FnMut(Heard<F::Message>, bool)> Reading<F, S> {
     fn run(mut self, listener: &Listener<Ipc>, ready: &crossbeam_channel::Sender<Result<(), ShmError>>) {
         let wait_set = match WaitSetBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled).create::<Ipc>() {
             Ok(wait_set) => wait_set,
@@ -300,7 +314,8 @@ impl<F: Form, S: FnMut(Heard<F::Message>)> Reading<F, S> {
             match form.to_message() {
                 Ok(message) => {
                     self.counters.heard(missed);
-                    (self.sink)(Heard::now(Bus::Shm, message));
+                    let more_waits = self.subscriber.has_samples().unwrap_or(true);
+                    (self.sink)(Heard::now(Bus::Shm, message), more_waits);
                 }
                 Err(_) => self.counters.malformed(),
             }
@@ -360,7 +375,7 @@ fn open_topic<F: Form>(
             .max_subscribers(MAX_SUBSCRIBERS)
             .max_nodes(MAX_NODES)
             .history_size(HISTORY_SAMPLES)
-            .subscriber_max_buffer_size(BUFFER_SAMPLES)
+            .subscriber_max_buffer_size(F::WAITING_SAMPLES)
             .create()
             .map_err(Error::PublishSubscribeCreateError),
         Err(other) => Err(Error::PublishSubscribeOpenError(other)),

@@ -99,12 +99,16 @@ fn hash(words: impl Iterator<Item = u64>) -> String {
     hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
+/// Gives the calling thread the lowest priority. Where the system does not allow it, it competes like any thread.
+pub fn yield_to_predictions() {
+    let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
+}
+
 /// Builds the chart on a thread of its own, of the lowest priority: predictions come first. It ends early when nobody
 /// listens any more; with `kept` it is built only once.
 pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming>, stopped: Arc<AtomicBool>) {
     std::thread::spawn(move || {
-        // Where the system does not allow it, the chart competes like any thread.
-        let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
+        yield_to_predictions();
         let go_on = || !stopped.load(Ordering::Relaxed);
         let built = catch_unwind(AssertUnwindSafe(|| match &kept {
             Some(kept) => kept_chart(&rig, kept, &go_on),

@@ -1,11 +1,13 @@
 //! The node: hands what it hears to the session and carries out what the session wants.
 //!
-//! One thread owns the session and publishes. Everything that shapes a prediction comes through one bounded channel
-//! and is recorded in the order in which the session gets it, so that a replay can feed it the same.
+//! One thread at a time has the session and publishes: the node's own, which takes what waits in one bounded channel, or the
+//! one that heard an input which can be answered at once ([`Shortcut`]). Everything that shapes a prediction is recorded in the
+//! order in which the session gets it, so that a replay can feed it the same.
 
 mod mapper;
 mod outputs;
 mod sensitivity;
+mod shortcut;
 mod statistics;
 mod watch;
 
@@ -14,11 +16,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, bounded};
+use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
 
-pub use mapper::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map};
+pub use mapper::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map, yield_to_predictions};
 pub use outputs::Outputs;
 pub use sensitivity::end_derivatives;
+pub use shortcut::Shortcut;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
 use crate::io::chart_file::ChartFile;
@@ -32,12 +35,17 @@ use crate::settings::Settings;
 use crate::wire::{self, Header, RigInfo, SessionEvent, Time, event_kind};
 use mapper::Mapper;
 use sensitivity::Question;
+use shortcut::Place;
 use statistics::Statistics;
 
 /// What may wait for the node; more inputs than this are lost before they are recorded, and counted.
 const QUEUE: usize = 16_384;
 /// A backlog that can be worked off in this time is; of a longer one only the newest input is predicted.
 const CATCH_UP: Duration = Duration::from_millis(100);
+/// No prediction begins later than this after its input was heard, unless it is the newest.
+const LATEST: Duration = Duration::from_millis(500);
+/// The fastest of so many predictions tells what one takes: on a busy machine any of them may have been interrupted.
+const TIMED: usize = 16;
 /// Inputs whose stamp and sequence number are remembered, to answer what comes over both buses once.
 const REMEMBERED: usize = 8192;
 /// Time between diagnostics.
@@ -84,10 +92,16 @@ pub struct Node {
     vibration_heard_before: Remembered,
     last_heard: Instant,
     silent: bool,
-    /// What a prediction takes, solved or read off the chart, smoothed.
-    prediction_time: Duration,
+    /// What was taken out of the channel and is to be done.
+    backlog: VecDeque<Incoming>,
+    /// How many of these are inputs.
+    inputs_waiting: usize,
+    prediction_times: Times,
     /// The backlog was too long: until it is gone only the newest input is predicted.
     passing_over: bool,
+    next_diagnostics: Instant,
+    /// Where this is while it runs.
+    place: Place,
     /// Tells the thread that charts the rig that nobody waits for it any more.
     stopped: Arc<AtomicBool>,
     next_sensitivity: Instant,
@@ -108,8 +122,12 @@ impl Node {
             vibration_heard_before: Remembered::default(),
             last_heard: Instant::now(),
             silent: false,
-            prediction_time: Duration::ZERO,
+            backlog: VecDeque::new(),
+            inputs_waiting: 0,
+            prediction_times: Times::default(),
             passing_over: false,
+            next_diagnostics: Instant::now() + DIAGNOSTICS_EVERY,
+            place: Place::default(),
             next_sensitivity: Instant::now(),
         }
     }
@@ -121,54 +139,94 @@ impl Node {
         self
     }
 
+    /// Lets whoever holds `shortcut` have inputs answered past the queue while this runs.
+    pub fn with_shortcut(mut self, shortcut: &Shortcut) -> Self {
+        self.place = shortcut.place.clone();
+        self
+    }
+
     /// Runs until [`Incoming::Stop`] or until nobody can send any more, then gives back what it published to.
     pub fn run(mut self, incoming: &Receiver<Incoming>) -> Outputs {
         self.begin();
-        let mut backlog: VecDeque<Incoming> = VecDeque::new();
-        let mut next_diagnostics = Instant::now() + DIAGNOSTICS_EVERY;
-        'run: loop {
-            // Nothing is waited for while something is left to do: diagnostics interrupt a backlog.
-            if backlog.is_empty() {
-                let deadline =
-                    self.silence_deadline().map_or(next_diagnostics, |silence| silence.min(next_diagnostics));
-                match incoming.recv_deadline(deadline) {
-                    Ok(first) => self.admit(first, &mut backlog),
-                    Err(RecvTimeoutError::Timeout) => {}
-                    Err(RecvTimeoutError::Disconnected) => break,
-                }
+        let place = std::mem::take(&mut self.place);
+        let mut next = Next::Wait(self.deadline());
+        *place.lock() = Some(self);
+        loop {
+            // Not taken out of the channel here: see `Shortcut::input`.
+            if let Next::Wait(deadline) = next {
+                let mut ready = Select::new();
+                ready.recv(incoming);
+                let _ = ready.ready_deadline(deadline);
             }
-            while let Some(next) = backlog.pop_front() {
-                while backlog.len() < QUEUE
-                    && let Ok(later) = incoming.try_recv()
-                {
-                    self.admit(later, &mut backlog);
-                }
-                match next {
-                    Incoming::Stop => break 'run,
-                    Incoming::Input(heard) => self.input(heard, &backlog),
-                    Incoming::Vibration(heard) => self.vibration(heard),
-                    Incoming::Parameter { name, value } => self.parameter(name, value),
-                    Incoming::Map { point, map } => self.map(point, map),
-                    Incoming::Ends { map, ends } => self.ends(&map, ends),
-                    Incoming::Sensitivity(found) => self.sensitivity(*found),
-                    Incoming::Chart(chart) => self.chart(chart),
-                }
-                if Instant::now() >= next_diagnostics {
-                    break;
-                }
-            }
-            let nothing_waits = backlog.is_empty() && incoming.is_empty();
-            if nothing_waits && self.silence_deadline().is_some_and(|deadline| Instant::now() >= deadline) {
-                self.silence();
-            }
-            if Instant::now() >= next_diagnostics {
-                next_diagnostics = Instant::now() + DIAGNOSTICS_EVERY;
-                self.diagnose(backlog.len() + incoming.len());
+            let mut place = place.lock();
+            next = place.as_mut().map_or(Next::Stop, |node| node.work_off(incoming));
+            if matches!(next, Next::Stop)
+                && let Some(mut node) = place.take()
+            {
+                drop(place);
+                node.stopped.store(true, Ordering::Relaxed);
+                node.diagnose(0);
+                return node.outputs;
             }
         }
-        self.stopped.store(true, Ordering::Relaxed);
-        self.diagnose(0);
-        self.outputs
+    }
+
+    /// Deals with what waits, until nothing does or diagnostics are due; then with what time brings.
+    fn work_off(&mut self, incoming: &Receiver<Incoming>) -> Next {
+        loop {
+            while self.backlog.len() < QUEUE {
+                match incoming.try_recv() {
+                    Ok(later) => self.admit(later),
+                    Err(TryRecvError::Disconnected) if self.backlog.is_empty() => return Next::Stop,
+                    Err(_) => break,
+                }
+            }
+            match self.backlog.pop_front() {
+                None => break,
+                Some(Incoming::Stop) => return Next::Stop,
+                Some(Incoming::Input(heard)) => {
+                    self.inputs_waiting -= 1;
+                    self.input(heard);
+                }
+                Some(Incoming::Vibration(heard)) => self.vibration(heard),
+                Some(Incoming::Parameter { name, value }) => self.parameter(name, value),
+                Some(Incoming::Map { point, map }) => self.map(point, map),
+                Some(Incoming::Ends { map, ends }) => self.ends(&map, ends),
+                Some(Incoming::Sensitivity(found)) => self.sensitivity(*found),
+                Some(Incoming::Chart(chart)) => self.chart(chart),
+            }
+            if Instant::now() >= self.next_diagnostics {
+                break;
+            }
+        }
+        let nothing_waits = self.backlog.is_empty() && incoming.is_empty();
+        if nothing_waits && self.silence_deadline().is_some_and(|deadline| Instant::now() >= deadline) {
+            self.silence();
+        }
+        if Instant::now() >= self.next_diagnostics {
+            self.next_diagnostics = Instant::now() + DIAGNOSTICS_EVERY;
+            self.diagnose(self.backlog.len() + incoming.len());
+        }
+        // Nothing is waited for while something is left to do: diagnostics interrupt a backlog.
+        if self.backlog.is_empty() { Next::Wait(self.deadline()) } else { Next::GoOn }
+    }
+
+    /// When there is something to do even if nothing comes.
+    fn deadline(&self) -> Instant {
+        self.silence_deadline().map_or(self.next_diagnostics, |silence| silence.min(self.next_diagnostics))
+    }
+
+    /// Whether an input can be predicted as fast as another thread is woken, with nothing before it. The first after a silence
+    /// wakes the thread that will notice the next.
+    fn answers_at_once(&self, input: &wire::OperatingPoint) -> bool {
+        self.backlog.is_empty() && !self.silent && self.session.answers_at_once(&input.point())
+    }
+
+    /// Predicts for an input that never waited.
+    fn answer(&mut self, heard: Heard<wire::OperatingPoint>) {
+        if self.is_new(&heard) {
+            self.input(heard);
+        }
     }
 
     /// Says what the session starts from, and asks for the map of the reference conditions.
@@ -183,42 +241,46 @@ impl Node {
 
     /// Queues what has come. What came over the other bus already is dropped here: were it queued, the input it
     /// repeats would be passed over for it.
-    fn admit(&mut self, next: Incoming, backlog: &mut VecDeque<Incoming>) {
-        if let Incoming::Input(Heard { bus, message, .. }) = &next
-            && !self.heard_before.is_new(*bus, message.header.stamp, message.seq)
-        {
-            self.statistics.duplicates += 1;
-            return;
+    fn admit(&mut self, next: Incoming) {
+        if let Incoming::Input(heard) = &next {
+            if !self.is_new(heard) {
+                return;
+            }
+            self.inputs_waiting += 1;
         }
-        backlog.push_back(next);
+        self.backlog.push_back(next);
+    }
+
+    /// Whether an input did not come over the other bus already.
+    fn is_new(&mut self, heard: &Heard<wire::OperatingPoint>) -> bool {
+        let is_new = self.heard_before.is_new(heard.bus, heard.message.header.stamp, heard.message.seq);
+        self.statistics.duplicates += u64::from(!is_new);
+        is_new
     }
 
     /// Predicts for an input; or, once the inputs behind it were more than can be worked off, passes all but the
     /// newest over.
-    fn input(&mut self, heard: Heard<wire::OperatingPoint>, behind: &VecDeque<Incoming>) {
-        let input = heard.message;
+    fn input(&mut self, heard: Heard<wire::OperatingPoint>) {
         self.last_heard = Instant::now();
         self.silent = false;
         self.statistics.heard(heard.bus);
-        self.outputs.record(heard.at.wall_ns, Payload::OperatingPoint(input.clone()));
-        let inputs_behind = behind.iter().filter(|next| matches!(next, Incoming::Input(_)));
-        let waiting = inputs_behind.take(if self.passing_over { 1 } else { usize::MAX }).count();
-        self.passing_over = waiting > 0 && (self.passing_over || self.prediction_time * waiting as u32 > CATCH_UP);
+        let started = clock::monotonic_ns();
+        let age = Duration::from_nanos(started.saturating_sub(heard.at.monotonic_ns));
+        let too_many = self.prediction_times.least() * self.inputs_waiting as u32 > CATCH_UP;
+        self.passing_over = self.inputs_waiting > 0 && (self.passing_over || too_many || age > LATEST);
         if self.passing_over {
             self.statistics.passed_over += 1;
+            self.outputs.record(heard.at.wall_ns, Payload::OperatingPoint(heard.message));
             return;
         }
-        self.watch.input(&input);
-        let point = input.point();
+        let point = heard.message.point();
         let worked_before = self.session.counters().worked();
-        let started = clock::monotonic_ns();
-        self.step(Event::Input(input));
+        self.step(Event::Input(heard.message.clone()), Some(heard));
         let took = Duration::from_nanos(clock::monotonic_ns().saturating_sub(started));
         self.statistics.predicted(took);
         self.sensitivity_due(point);
         if self.session.counters().worked() > worked_before {
-            let known = if self.prediction_time.is_zero() { took } else { self.prediction_time };
-            self.prediction_time = (known * 7 + took) / 8;
+            self.prediction_times.note(took);
         }
     }
 
@@ -234,7 +296,7 @@ impl Node {
 
     fn parameter(&mut self, name: String, value: f64) {
         self.note(parameter_event(now_header(), &name, value));
-        self.step(Event::Parameter { name, value });
+        self.step(Event::Parameter { name, value }, None);
     }
 
     fn map(&mut self, point: OperatingPoint, map: Result<Arc<StabilityMap>, String>) {
@@ -246,7 +308,7 @@ impl Node {
                 let tolerance = self.session.settings().map_tolerance;
                 self.mapper.done(|wish| map_serves(&self.rig.model, &map, wish, tolerance));
                 self.watch.map(&map);
-                self.step(Event::MapReady(map));
+                self.step(Event::MapReady(map), None);
             }
             Err(reason) => {
                 self.mapper.give_up_on(point);
@@ -264,7 +326,7 @@ impl Node {
             Ok(Ok(ends)) if in_force => {
                 self.statistics.ends += 1;
                 self.note(at_load_and_speed(event_kind::WINDOW_ENDS, &ends.point, ends_hash(&ends)));
-                self.step(Event::EndsReady(ends));
+                self.step(Event::EndsReady(ends), None);
             }
             Ok(Err(point)) if in_force => self.mapper.want(point),
             Ok(_) => {}
@@ -308,7 +370,7 @@ impl Node {
                 self.statistics.charted(&chart);
                 let hash = chart_hash(&chart);
                 self.note(SessionEvent { header: now_header(), kind: event_kind::CHART, hash, ..Default::default() });
-                self.step(Event::ChartReady(chart));
+                self.step(Event::ChartReady(chart), None);
             }
             Err(reason) => self.statistics.chart_failure = Some(reason),
         }
@@ -324,7 +386,7 @@ impl Node {
         let header = now_header();
         let stamp = header.stamp;
         self.note(SessionEvent { header, kind: event_kind::SILENCE, ..Default::default() });
-        self.step(Event::Silence { stamp });
+        self.step(Event::Silence { stamp }, None);
     }
 
     /// Records and publishes an event of the session, before the session gets it.
@@ -332,11 +394,18 @@ impl Node {
         self.outputs.session_event(event);
     }
 
-    fn step(&mut self, event: Event) {
+    /// One step of the session, of `input` if it is one. Whoever waits for the prediction over shared memory gets it before
+    /// anything else is done with it; input and prediction are recorded in this order.
+    fn step(&mut self, event: Event, input: Option<Heard<wire::OperatingPoint>>) {
         match self.session.step(event) {
             Ok(effects) => {
                 if let Some(prediction) = effects.publish {
                     self.statistics.level = prediction.level;
+                    self.outputs.prediction_to_shm(prediction);
+                    if let Some(heard) = input {
+                        self.watch.input(&heard.message);
+                        self.outputs.record(heard.at.wall_ns, Payload::OperatingPoint(heard.message));
+                    }
                     self.outputs.prediction(prediction);
                     self.watch.prediction(prediction);
                 }
@@ -360,6 +429,32 @@ impl Node {
             self.statistics.report(now_header(), &self.rig, counters, queued, self.mapper.pending(), &self.outputs);
         self.watch.counters(counters, self.statistics.passed_over);
         self.outputs.diagnostics(array);
+    }
+}
+
+/// What the thread of a node does next.
+enum Next {
+    Wait(Instant),
+    GoOn,
+    Stop,
+}
+
+/// What the latest predictions took.
+#[derive(Default)]
+struct Times {
+    latest: [Duration; TIMED],
+    count: usize,
+}
+
+impl Times {
+    fn note(&mut self, took: Duration) {
+        self.latest[self.count % TIMED] = took;
+        self.count += 1;
+    }
+
+    /// The least of them; zero without any.
+    fn least(&self) -> Duration {
+        self.latest[..self.count.min(TIMED)].iter().min().copied().unwrap_or_default()
     }
 }
 
@@ -451,10 +546,56 @@ mod tests {
         let watch = Watch::default();
         let mut node = Node::new(rig, settings, Outputs::default(), sender, watch.clone());
         // Of a rig that takes as long, not more than ten may wait.
-        node.prediction_time = Duration::from_millis(10);
+        node.prediction_times.note(Duration::from_millis(10));
         node.run(&receiver);
         let seen = watch.snapshot();
         assert_eq!(seen.prediction.expect("one").input_seq, COUNT - 1);
         assert_eq!((seen.counters.solved, seen.passed_over), (1, COUNT - 1));
+    }
+
+    /// With a chart, inputs are answered on the thread that heard them; what has to be solved is queued, and nothing that comes
+    /// later overtakes it.
+    #[test]
+    fn an_input_is_answered_past_the_queue_but_overtakes_none() {
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let (sender, receiver) = channel();
+        let shortcut = Shortcut::new(sender.clone());
+        let watch = Watch::default();
+        let node = Node::new(rig.clone(), Settings::for_rig(&rig), Outputs::default(), sender.clone(), watch.clone());
+        let node = node.with_shortcut(&shortcut);
+        let chart = Arc::new(session_chart(&rig, 1, &|| true).expect("charted"));
+        sender.send(Incoming::Chart(Ok(chart))).expect("room");
+        let mut samples = vec![];
+        watch.take_samples(&mut samples);
+        let thread = std::thread::spawn(move || node.run(&receiver));
+        let (mut seq, mut at_once, mut all) = (0, 0, vec![]);
+        let mut ask = |disc_speed_rad_s: f64| {
+            let message = wire::OperatingPoint {
+                header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
+                seq,
+                normal_load_n: 500.0,
+                disc_speed_rad_s,
+                friction_coefficient: 0.3 + 1e-6 * seq as f64,
+            };
+            assert!(shortcut.input(Heard::now(Bus::Shm, message), seq % 7 == 0));
+            seq += 1;
+            at_once += u32::from(watch.snapshot().prediction.is_some_and(|answer| answer.input_seq == seq - 1));
+            // No more than a few wait, so that none is passed over.
+            while all.len() + 20 < seq as usize {
+                assert_eq!(watch.take_samples(&mut samples), 0);
+                all.append(&mut samples);
+                std::thread::yield_now();
+            }
+        };
+        for k in 0..5000 {
+            // Every tenth turns the other way: off the chart.
+            ask(if k % 10 == 9 { -13.0 } else { 13.0 });
+        }
+        sender.send(Incoming::Stop).expect("it runs");
+        thread.join().expect("it ended");
+        watch.take_samples(&mut samples);
+        all.append(&mut samples);
+        assert!(all.iter().map(|sample| sample.input_seq).eq(0..seq), "{} of {seq} answered in order", all.len());
+        assert!(at_once > 100, "{at_once} of {seq} were answered before anything else was done");
     }
 }

@@ -61,10 +61,15 @@ impl Outputs {
         }
     }
 
-    pub fn prediction(&mut self, prediction: &Prediction) {
+    /// Publishes a prediction over shared memory, where it is waited for.
+    pub fn prediction_to_shm(&mut self, prediction: &Prediction) {
         if let Some(Err(error)) = self.shm.as_ref().map(|shm| shm.publish(prediction)) {
             self.failed(&error);
         }
+    }
+
+    /// Publishes a prediction over ROS 2 and records it.
+    pub fn prediction(&mut self, prediction: &Prediction) {
         if let Some(ros2) = &self.ros2 {
             if !self.ros2_readers.any(|| ros2.prediction_readers()) {
                 self.encodings_skipped += 1;

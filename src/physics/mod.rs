@@ -4,8 +4,10 @@
 
 pub mod chart;
 pub mod critical;
+mod dense_eigen;
 pub mod ends;
 mod flexible_contact;
+pub mod identification;
 pub mod model;
 pub mod operating_point;
 pub mod reference;

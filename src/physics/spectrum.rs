@@ -8,14 +8,10 @@
 //!
 //! The scaling by `S` is not optional: without it the state-space roots lose half their digits.
 
-use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
-use faer::linalg::evd::{
-    ComputeEigenvectors, EvdParams, SelfAdjointEvdParams, evd_real, evd_scratch, self_adjoint_evd,
-    self_adjoint_evd_scratch,
-};
 use faer::linalg::matmul::matmul;
-use faer::{Accum, Auto, Col, Mat, MatRef, Par, Spec, c64};
+use faer::{Accum, Mat, MatRef, Par, c64};
 
+use super::dense_eigen::{Dense, Packed, Packing, packing};
 use super::model::{Model, ModelError, Parameter};
 use super::operating_point::OperatingPoint;
 
@@ -59,7 +55,7 @@ impl RootError {
     /// From a bound `δ` of the error of `λ²`: `|δλ| ≤ δ / (|λ| + √(|λ|² - δ))`, near the origin `|λ| + √δ`. A root whose
     /// square is known to be `real` and negative has no growth rate, exactly.
     pub fn from_square(lambda: c64, square: f64, real: bool) -> Self {
-        let size = lambda.norm();
+        let size = magnitude(lambda);
         let rest = size * size - square;
         let error = if rest > 0.0 { square / (size + rest.sqrt()) } else { size + square.max(0.0).sqrt() };
         let sigma = if real && lambda.re == 0.0 && rest > 0.0 { 0.0 } else { error };
@@ -68,7 +64,7 @@ impl RootError {
 
     /// From a bound of the error of `λ`.
     pub fn from_lambda(lambda: c64, error: f64) -> Self {
-        Self { square: error * (2.0 * lambda.norm() + error), omega: error, sigma: error }
+        Self { square: error * (2.0 * magnitude(lambda) + error), omega: error, sigma: error }
     }
 }
 
@@ -91,13 +87,13 @@ impl Root {
     /// `ζ = -σ/|λ|`; 0 for a root at the origin.
     pub fn damping_ratio(&self) -> f64 {
         // Adding zero turns the -0 of an undamped mode into 0.
-        let magnitude = self.lambda.norm();
-        if magnitude > 0.0 { -self.lambda.re / magnitude + 0.0 } else { 0.0 }
+        let size = magnitude(self.lambda);
+        if size > 0.0 { -self.lambda.re / size + 0.0 } else { 0.0 }
     }
 
     /// Whether it grows: `σ > threshold · |λ|`. At the origin, within rounding, nothing grows.
     pub fn is_unstable(&self, threshold: f64) -> bool {
-        self.lambda.re > threshold * self.lambda.norm()
+        self.lambda.re > threshold * magnitude(self.lambda)
     }
 }
 
@@ -185,15 +181,6 @@ pub struct Solver {
     products: [Mat<f64>; 4],
 }
 
-/// Workspace of the dense eigenvalue problem, and its answer: values, and vectors in LAPACK's packing, a complex pair in two
-/// columns, real and imaginary part.
-struct Dense {
-    values: Vec<c64>,
-    left: Mat<f64>,
-    right: Mat<f64>,
-    memory: MemBuffer,
-}
-
 /// Which problem gives the roots.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Problem {
@@ -232,12 +219,7 @@ impl Solver {
             stiffness_slope: square(),
             damping_slope: square(),
             state: Mat::new(),
-            dense: Dense {
-                values: vec![],
-                left: Mat::new(),
-                right: Mat::new(),
-                memory: MemBuffer::new(StackReq::EMPTY),
-            },
+            dense: Dense::new(),
             shapes: Mat::new(),
             products: [const { Mat::new() }; 4],
         }
@@ -294,6 +276,11 @@ impl Solver {
     /// scaled state matrix.
     pub fn matrix(&self, spectrum: &Spectrum) -> MatRef<'_, f64> {
         if spectrum.undamped { self.stiffness.as_ref() } else { self.state.as_ref() }
+    }
+
+    /// Left vectors of the problem that was solved, packed: those of a symmetric one are its right ones.
+    fn left_vectors(&self, problem: Problem) -> &Mat<f64> {
+        if problem == Problem::Symmetric { &self.dense.right } else { &self.dense.left }
     }
 
     /// Writes `[0 S; -K S⁻¹ -C]`.
@@ -438,7 +425,7 @@ impl Solver {
         let n = self.stiffness.nrows();
         for entry in raw {
             let packed = |m| Packed::new(m, entry.packing);
-            let (state, whole) = (packed(&self.dense.right), packed(self.dense.left(problem)));
+            let (state, whole) = (packed(&self.dense.right), packed(self.left_vectors(problem)));
             let [cx, slope_kx, slope_cx] = [1, 2, 3].map(|k| packed(&self.products[k]));
             let product = whole.dot(state);
             let condition =
@@ -465,178 +452,13 @@ impl Solver {
             let share = entry.length.recip();
             shapes.col_as_slice_mut(j).iter_mut().enumerate().for_each(|(i, out)| *out = share * x.at(i));
             let Some(Left { weight, .. }) = entry.left else { continue };
-            let whole = Packed::new(self.dense.left(problem), entry.packing);
+            let whole = Packed::new(self.left_vectors(problem), entry.packing);
             let y = if problem == Problem::Damped { whole.rows(n..) } else { whole };
             let share = entry.length / weight.conj();
             left.col_as_slice_mut(j).iter_mut().enumerate().for_each(|(i, out)| *out = share * y.at(i));
         }
         (shapes, left)
     }
-}
-
-impl Dense {
-    fn fit(&mut self, dimension: usize) {
-        if self.right.nrows() != dimension {
-            use ComputeEigenvectors::Yes;
-            let unsymmetric = evd_scratch::<f64>(dimension, Yes, Yes, Par::Seq, unsymmetric_params());
-            let symmetric = self_adjoint_evd_scratch::<f64>(dimension, Yes, Par::Seq, symmetric_params());
-            self.memory = MemBuffer::new(unsymmetric.or(symmetric));
-            self.right = Mat::zeros(dimension, dimension);
-            self.left = Mat::zeros(dimension, dimension);
-        }
-        self.values.clear();
-    }
-
-    /// Eigenvalues of a symmetric `matrix`, and its vectors if asked for.
-    fn symmetric_eigen(&mut self, matrix: MatRef<'_, f64>, vectors: Vectors) -> Result<(), SolveError> {
-        let dimension = matrix.nrows();
-        self.fit(dimension);
-        let mut kappa = Col::<f64>::zeros(dimension);
-        // faer stops at an absolute tolerance near 1e-16: entries are brought near 1, by a power of two so that no
-        // digit changes.
-        let exponent = matrix.norm_max().log2().ceil();
-        let unit = if exponent.is_finite() { exponent.exp2() } else { 1.0 };
-        self_adjoint_evd(
-            (matrix * faer::Scale(unit.recip())).as_ref(),
-            kappa.as_mut().as_diagonal_mut(),
-            (vectors != Vectors::None).then(|| self.right.as_mut()),
-            Par::Seq,
-            MemStack::new(&mut self.memory),
-            symmetric_params(),
-        )
-        .map_err(|_| SolveError::NoConvergence { dimension })?;
-        self.values.extend(kappa.iter().map(|kappa| c64::new(kappa * unit, 0.0)));
-        Ok(())
-    }
-
-    /// Eigenvalues of `matrix`, whose Frobenius norm is `norm`, and the vectors that are asked for.
-    fn eigen(&mut self, matrix: MatRef<'_, f64>, norm: f64, vectors: Vectors) -> Result<(), SolveError> {
-        let dimension = matrix.nrows();
-        self.fit(dimension);
-        let mut re = Col::<f64>::zeros(dimension);
-        let mut im = Col::<f64>::zeros(dimension);
-        evd_real(
-            matrix,
-            re.as_mut().as_diagonal_mut(),
-            im.as_mut().as_diagonal_mut(),
-            (vectors == Vectors::Both).then(|| self.left.as_mut()),
-            (vectors != Vectors::None).then(|| self.right.as_mut()),
-            Par::Seq,
-            MemStack::new(&mut self.memory),
-            unsymmetric_params(),
-        )
-        .map_err(|_| SolveError::NoConvergence { dimension })?;
-        self.values.extend(re.iter().zip(im.iter()).map(|(&re, &im)| c64::new(re, im)));
-        // faer does not report whether the iteration converged; the traces of what it left tell.
-        let rounding = 64.0 * dimension as f64 * f64::EPSILON;
-        let mut trace_of_square = 0.0;
-        for j in 0..dimension {
-            trace_of_square += matrix[(j, j)] * matrix[(j, j)];
-            trace_of_square += 2.0 * (0..j).map(|i| matrix[(i, j)] * matrix[(j, i)]).sum::<f64>();
-        }
-        let traces = [
-            (1, (0..dimension).map(|i| matrix[(i, i)]).sum(), re.iter().sum::<f64>(), rounding * norm),
-            (2, trace_of_square, self.values.iter().map(|z| (z * z).re).sum(), rounding * norm * norm),
-        ];
-        for (power, expected, found, limit) in traces {
-            if (found - expected).abs() > limit || !found.is_finite() {
-                return Err(SolveError::Trace { power, found, expected, limit });
-            }
-        }
-        Ok(())
-    }
-
-    /// Left vectors, packed.
-    fn left(&self, problem: Problem) -> &Mat<f64> {
-        if problem == Problem::Symmetric { &self.right } else { &self.left }
-    }
-}
-
-fn unsymmetric_params() -> Spec<EvdParams, f64> {
-    <EvdParams as Auto<f64>>::auto().into()
-}
-
-fn symmetric_params() -> Spec<SelfAdjointEvdParams, f64> {
-    <SelfAdjointEvdParams as Auto<f64>>::auto().into()
-}
-
-/// Where LAPACK's packing keeps a vector: `re + i sign im`, real without `im`.
-#[derive(Clone, Copy)]
-struct Packing {
-    re: usize,
-    im: Option<usize>,
-    sign: f64,
-}
-
-/// Where the vector of each of `values` is: the first of a complex pair holds real and imaginary part of its own vector
-/// in its two columns; the second is its conjugate.
-fn packing(values: &[c64]) -> impl Iterator<Item = Packing> {
-    let mut second = false;
-    values.iter().enumerate().map(move |(k, value)| {
-        if value.im == 0.0 {
-            return Packing { re: k, im: None, sign: 0.0 };
-        }
-        second = !second;
-        if second {
-            Packing { re: k, im: Some(k + 1), sign: 1.0 }
-        } else {
-            Packing { re: k - 1, im: Some(k), sign: -1.0 }
-        }
-    })
-}
-
-/// A complex vector in LAPACK's packing.
-#[derive(Clone, Copy)]
-struct Packed<'a> {
-    re: &'a [f64],
-    /// Empty for a real vector.
-    im: &'a [f64],
-    sign: f64,
-}
-
-impl<'a> Packed<'a> {
-    fn new(matrix: &'a Mat<f64>, packing: Packing) -> Self {
-        let im = packing.im.map_or(&[][..], |k| matrix.col_as_slice(k));
-        Self { re: matrix.col_as_slice(packing.re), im, sign: packing.sign }
-    }
-
-    fn rows(self, rows: impl std::slice::SliceIndex<[f64], Output = [f64]> + Clone) -> Self {
-        let im = if self.im.is_empty() { self.im } else { &self.im[rows.clone()] };
-        Self { re: &self.re[rows], im, sign: self.sign }
-    }
-
-    fn at(self, i: usize) -> c64 {
-        c64::new(self.re[i], if self.im.is_empty() { 0.0 } else { self.sign * self.im[i] })
-    }
-
-    /// `selfᴴ other`.
-    fn dot(self, other: Self) -> c64 {
-        if self.im.is_empty() {
-            return c64::new(dot(self.re, other.re), 0.0);
-        }
-        let re = dot(self.re, other.re) + dot(self.im, other.im);
-        c64::new(re, self.sign * (dot(self.re, other.im) - dot(self.im, other.re)))
-    }
-
-    fn norm_sqr(self) -> f64 {
-        dot(self.re, self.re) + dot(self.im, self.im)
-    }
-
-    fn norm(self) -> f64 {
-        self.norm_sqr().sqrt()
-    }
-}
-
-/// `Σ aᵢ bᵢ`, in eight sums side by side.
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut sums = [0.0; 8];
-    let (mut a, mut b) = (a.chunks_exact(8), b.chunks_exact(8));
-    for (a, b) in (&mut a).zip(&mut b) {
-        for ((sum, a), b) in sums.iter_mut().zip(a).zip(b) {
-            *sum += a * b;
-        }
-    }
-    sums.iter().sum::<f64>() + a.remainder().iter().zip(b.remainder()).map(|(a, b)| a * b).sum::<f64>()
 }
 
 /// `S`: what each displacement is multiplied by, so that it weighs as much as its velocity, rad/s.
@@ -704,6 +526,17 @@ pub(super) fn square_root(square: c64) -> c64 {
     } else {
         let root = square.sqrt();
         if root.im < 0.0 { -root } else { root }
+    }
+}
+
+/// `|z|`: for real and imaginary numbers without a square root.
+pub(super) fn magnitude(z: c64) -> f64 {
+    if z.re == 0.0 {
+        z.im.abs()
+    } else if z.im == 0.0 {
+        z.re.abs()
+    } else {
+        z.norm()
     }
 }
 

@@ -59,7 +59,7 @@ impl Summary {
     pub fn take_chart(&mut self, charted: &[Mode], band_max_hz: Option<f64>, threshold: f64) {
         self.modes.clear();
         self.modes.extend(charted.iter().filter(|mode| mode.root.oscillates()).copied());
-        self.modes.sort_unstable_by(|a, b| super::spectrum::order(&a.root, &b.root).then(a.id.cmp(&b.id)));
+        sort_almost_sorted(&mut self.modes);
         let statics = charted.iter().map(|mode| mode.root).filter(|root| !root.oscillates());
         // Only those of undamped models are charted, each for both signs.
         self.nonoscillatory_growth_per_s.clear();
@@ -82,5 +82,24 @@ impl Summary {
     /// The fastest growing static root, if it grows.
     pub fn diverges(&self) -> bool {
         self.nonoscillatory_growth_per_s.first().is_some_and(|&growth| growth > 0.0)
+    }
+}
+
+/// Sorts modes by insertion, which for those of a chart, almost sorted as they come, takes a step or two each; where it takes
+/// more, they are sorted anew.
+fn sort_almost_sorted(modes: &mut [Mode]) {
+    let order = |a: &Mode, b: &Mode| super::spectrum::order(&a.root, &b.root).then(a.id.cmp(&b.id));
+    let mut steps = 8 * modes.len();
+    for k in 1..modes.len() {
+        let mut at = k;
+        while at > 0 && order(&modes[at - 1], &modes[at]).is_gt() {
+            modes.swap(at - 1, at);
+            at -= 1;
+            if steps == 0 {
+                modes.sort_unstable_by(order);
+                return;
+            }
+            steps -= 1;
+        }
     }
 }

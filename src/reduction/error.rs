@@ -34,10 +34,15 @@ pub enum ReductionError {
     MissedModes { what: String, found: usize, counted: usize, below: f64 },
     #[error("{what}: mode {mode} has |K phi - omega^2 M phi| = {value:.3e} of its parts, limit {limit:.1e}")]
     Residual { what: String, mode: usize, value: f64, limit: f64 },
+    #[error(
+        "{what}: the root {growth_per_s:e} + {omega_rad_s:e}i found around {found:e} rad/s was not found around \
+         {missed:e} rad/s"
+    )]
+    MissedRoot { what: String, growth_per_s: f64, omega_rad_s: f64, found: f64, missed: f64 },
     #[error("{what}: shifts covered the band up to {covered:.6e} rad/s only, expected {band:.6e} rad/s")]
     NotCovered { what: String, covered: f64, band: f64 },
     #[error(
-        "{what}: its modes need {:.2} GiB of memory, more than the {:.2} GiB allowed",
+        "{what}: it needs {:.2} GiB of memory, more than the {:.2} GiB allowed",
         *bytes as f64 / GIB, *limit as f64 / GIB
     )]
     Memory { what: String, bytes: usize, limit: usize },

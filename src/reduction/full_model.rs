@@ -82,6 +82,15 @@ struct ContactTerm<'a> {
     right: &'a [SparseRow],
 }
 
+/// A sum of products of rows: `Σ leftᵀ (stiffness + λ damping) right`.
+#[derive(Clone, Debug, Default)]
+pub(super) struct LowRank {
+    pub left: Vec<SparseRow>,
+    pub right: Vec<SparseRow>,
+    pub stiffness: Vec<f64>,
+    pub damping: Vec<f64>,
+}
+
 impl FullModel {
     /// Number of degrees of freedom, `n`.
     pub fn dimension(&self) -> usize {
@@ -181,6 +190,42 @@ impl FullModel {
             ContactTerm { left: contact.lateral.clone(), weights: across, right: &contact.lateral },
         ];
         [stiffness, damping].map(|terms| terms.into_iter().filter(some).collect())
+    }
+
+    /// What the contact adds at `p`, pair by pair: `Σ leftᵀ (k + λ c) right`.
+    pub(super) fn low_rank(&self, p: &OperatingPoint) -> LowRank {
+        let [stiffness, damping] = self.contact_terms(p);
+        let mut sum = LowRank::default();
+        for term in &stiffness {
+            sum.left.extend(term.left.iter().cloned());
+            sum.right.extend(term.right.iter().cloned());
+            sum.stiffness.extend(&term.weights);
+            sum.damping.resize(sum.stiffness.len(), 0.0);
+        }
+        for term in &damping {
+            // Springs and dampers of a pair act along the same rows.
+            if sum.left == term.left && sum.right == term.right && sum.damping.iter().all(|value| *value == 0.0) {
+                sum.damping.clone_from(&term.weights);
+                continue;
+            }
+            sum.left.extend(term.left.iter().cloned());
+            sum.right.extend(term.right.iter().cloned());
+            sum.damping.extend(&term.weights);
+            sum.stiffness.resize(sum.damping.len(), 0.0);
+        }
+        sum
+    }
+
+    /// The rows of all parts that the contact touches, ascending.
+    pub(super) fn contact_rows(&self) -> Vec<usize> {
+        let contact = self.contact.iter();
+        let mut rows: Vec<usize> = contact
+            .flat_map(|contact| contact.normal.iter().chain(&contact.sliding).chain(&contact.lateral))
+            .flat_map(|row| row.iter().map(|(index, _)| *index))
+            .collect();
+        rows.sort_unstable();
+        rows.dedup();
+        rows
     }
 
     /// The model on the span of `basis`, `n×k`, whose columns need only be independent.

@@ -11,27 +11,36 @@
 //! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
 //! to the basis; [`residual()`] finds what the modes left out still do at the contact; [`keep_modes`] does both for
 //! all parts of a model.
-//! A [`FullModel`] is what all of it starts from; [`full_order_roots`] solves the full system itself, to compare with.
+//! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare with.
+//!
+//! [`compare_roots`] and [`full_windows`] say how far a reduced model is from it.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
+mod compare;
+mod contact_solver;
 mod dense;
 mod error;
 mod full_model;
 mod full_order;
+mod krylov_schur;
 mod lanczos;
 mod normal_modes;
 mod ordering;
 mod pencil;
 mod project;
 mod residual;
+mod schur;
 mod sparse;
 mod substructures;
 
+pub use compare::{
+    CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
+};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
-pub use full_order::{CoveredDisc, FullRoot, FullSpectrum, full_order_roots};
+pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use project::{project_dense, project_sparse};
 pub use residual::{InertiaBy, Residual, residual};

@@ -128,12 +128,15 @@ struct Plan {
     inertia_by: InertiaBy,
 }
 
+/// What is done with an item, and who hears of it.
+type Work<'a, T, R> = dyn Fn(&T, &mut dyn FnMut(Progress)) -> Result<R, ReductionError> + Sync + 'a;
+
 /// `work` on every item, on threads of their own if `at_once`; what they report is heard here, on one thread.
 fn side_by_side<T: Sync, R: Send>(
     items: &[T],
     at_once: bool,
     progress: &mut dyn FnMut(usize, Progress),
-    work: &(dyn Fn(&T, &mut dyn FnMut(Progress)) -> Result<R, ReductionError> + Sync),
+    work: &Work<'_, T, R>,
 ) -> Result<Vec<R>, ReductionError> {
     if !at_once {
         return items.iter().enumerate().map(|(index, item)| work(item, &mut |p| progress(index, p))).collect();
@@ -181,16 +184,18 @@ mod tests {
     fn side_by_side_or_one_after_the_other_is_the_same() {
         let [pad, disc] = [chain(500, 100.0), chain(700, 300.0)];
         let rows = [Some(0), None, Some(499)];
-        let part =
-            |name, [mass, stiffness]: &'_ [SparseMatrix; 2], wanted| -> (&str, SparseMatrix, SparseMatrix, Wanted) {
-                (name, mass.clone(), stiffness.clone(), wanted)
-            };
         // ω = 2 sqrt(k/m) sin(p π / 2n), p from 0: 12 of the disc below the middle of p = 11 and 12.
         let below = 2.0 * 150.0_f64.sqrt() * (11.5 * std::f64::consts::PI / 1400.0).sin();
-        let owned = [part("pad", &pad, Wanted::Lowest(9)), part("disc", &disc, Wanted::Below(below))];
+        let owned = [("pad", pad, Wanted::Lowest(9)), ("disc", disc, Wanted::Below(below))];
         let parts: Vec<Substructure<'_>> = owned
             .iter()
-            .map(|(name, mass, stiffness, wanted)| Substructure { name, mass, stiffness, rows: &rows, wanted: *wanted })
+            .map(|(name, [mass, stiffness], wanted)| Substructure {
+                name,
+                mass,
+                stiffness,
+                rows: &rows,
+                wanted: *wanted,
+            })
             .collect();
         let mut needs = vec![];
         let together = keep_modes(&parts, true, None, &mut |_, p| {

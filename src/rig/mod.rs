@@ -25,6 +25,7 @@ pub mod uff;
 
 use faer::Mat;
 
+use crate::certificate::Certificate;
 use crate::physics::{Model, OperatingPoint};
 
 pub use embedded::EMBEDDED;
@@ -64,6 +65,8 @@ pub struct Rig {
     pub files: Vec<RigFile>,
     /// What the rig is made of, a line each, for [`Rig::describe`].
     pub contents: Vec<String>,
+    /// `[reduction]`: how far it is from the full model it was reduced from.
+    pub reduction: Option<Certificate>,
     /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
     pub shapes: Vec<SideShapes>,
 }
@@ -188,9 +191,45 @@ impl Rig {
             path: None,
             content_hash: source.content_hash(),
             files: source.into_files(),
-            contents: built.contents,
+            contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::told)).collect(),
+            reduction: raw.reduction,
             shapes: built.shapes,
         })
+    }
+
+    /// The stiffness of the rig's contact pairs as its file lists it, N/m: one value, or one for each pair of a patch.
+    pub fn contact_stiffness_n_per_m(&self) -> Vec<f64> {
+        let mut listed = vec![];
+        self.visit_contact_stiffness(&mut |value| {
+            listed.push(value);
+            value
+        });
+        listed
+    }
+
+    /// The same rig with the stiffness of every contact pair multiplied by `factor`.
+    ///
+    /// # Errors
+    /// [`RigError`]: the rig's own files are at fault, or `factor` takes the stiffness out of range.
+    pub fn with_contact_stiffness_times(&self, factor: f64) -> Result<Self, RigError> {
+        let Some(text) = self.visit_contact_stiffness(&mut |value| factor * value) else { return Ok(self.clone()) };
+        let mut files = self.files.clone();
+        files[0].bytes = text.into_bytes();
+        Self::from_files(&files)
+    }
+
+    /// The text of the rig file with every contact stiffness replaced by what `change` makes of it.
+    fn visit_contact_stiffness(&self, change: &mut dyn FnMut(f64) -> f64) -> Option<String> {
+        let text = std::str::from_utf8(&self.files.first()?.bytes).ok()?;
+        let mut table: toml::Table = text.parse().ok()?;
+        for key in ["contact", "contact_patch"] {
+            for contact in table.get_mut(key).and_then(toml::Value::as_array_mut).into_iter().flatten() {
+                if let Some(stiffness) = contact.get_mut("stiffness_n_per_m") {
+                    change_numbers(stiffness, change);
+                }
+            }
+        }
+        Some(table.to_string())
     }
 
     /// What the rig is and holds, a few lines for people.
@@ -210,6 +249,15 @@ impl Rig {
         lines.push(format!("files      {}", names.join(", ")));
         lines.push(format!("hash       {}", self.content_hash));
         lines.join("\n")
+    }
+}
+
+/// Replaces a number, or every number of a list.
+fn change_numbers(value: &mut toml::Value, change: &mut dyn FnMut(f64) -> f64) {
+    if let toml::Value::Array(values) = value {
+        values.iter_mut().for_each(|value| change_numbers(value, change));
+    } else if let Some(number) = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64)) {
+        *value = toml::Value::Float(change(number));
     }
 }
 

@@ -3,6 +3,7 @@
 use serde::Deserialize;
 
 use super::RigError;
+use crate::certificate::Certificate;
 
 /// A whole rig file.
 #[derive(Debug, Deserialize)]
@@ -30,6 +31,7 @@ pub struct RawRig {
     pub contact: Option<Vec<RawContact>>,
     pub contact_patch: Option<Vec<RawPatch>>,
     pub system: Option<RawSystem>,
+    pub reduction: Option<Certificate>,
 }
 
 /// Declares a table whose keys all have defaults.

@@ -131,6 +131,9 @@ pub trait Form: ZeroCopySend + Copy + std::fmt::Debug + Send + 'static {
     type Message: Clone + Send + 'static;
     /// The service that carries it; its event service has the same name.
     const SERVICE: &'static str;
+    /// Samples that may wait for a reader before the oldest are lost to it: at least a tenth of a second of the
+    /// highest rate.
+    const WAITING_SAMPLES: usize;
 
     /// The form of a message.
     ///
@@ -211,6 +214,8 @@ pub struct PredictionForm {
 impl Form for OperatingPointForm {
     type Message = OperatingPoint;
     const SERVICE: &'static str = "rig/operating_point";
+    // A rig that was held up sends what it measured meanwhile all at once.
+    const WAITING_SAMPLES: usize = 4096;
 
     fn from_message(message: &OperatingPoint) -> Result<Self, FormError> {
         Ok(Self {
@@ -240,6 +245,7 @@ impl Form for OperatingPointForm {
 impl Form for VibrationForm {
     type Message = Vibration;
     const SERVICE: &'static str = "rig/vibration";
+    const WAITING_SAMPLES: usize = 1024;
 
     fn from_message(message: &Vibration) -> Result<Self, FormError> {
         let Vibration { header, frequency_hz, level_db } = message;
@@ -259,6 +265,7 @@ impl Form for VibrationForm {
 impl Form for PredictionForm {
     type Message = Prediction;
     const SERVICE: &'static str = "squealcast/prediction";
+    const WAITING_SAMPLES: usize = 1024;
 
     fn from_message(message: &Prediction) -> Result<Self, FormError> {
         if message.modes.len() > MAX_MODES {
@@ -405,6 +412,7 @@ pub struct SensitivityForm {
 impl Form for SensitivityForm {
     type Message = Sensitivity;
     const SERVICE: &'static str = "squealcast/sensitivity";
+    const WAITING_SAMPLES: usize = 64;
 
     fn from_message(message: &Sensitivity) -> Result<Self, FormError> {
         let (mode_count, pair_count) = (message.modes.len(), message.pairs.len());

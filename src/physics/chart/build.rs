@@ -6,13 +6,11 @@
 //! next. So most conditions are charted early and the hard corners last, and a build that was interrupted goes on from
 //! its last such unit of work to the same chart.
 
-use faer::{Mat, c64};
-
-use super::chebyshev::{Basis, Fit, Fitted};
-use super::cluster::{MAX_SIZE, symmetric_functions, symmetric_slopes};
+use super::chebyshev::{Basis, Fit};
 use super::hold_out::within_bounds;
+use super::leaf::Branches;
 use super::samples::{Sample, Sampler, follow, spread};
-use super::{Axis, Branch, Chart, Cluster, Leaf, MAX_AXES, Scratch};
+use super::{Axis, Branch, Chart, Leaf, MAX_AXES, Scratch};
 use crate::physics::model::{Model, Traces};
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::spectrum::{SolveError, Solver, Spectrum};
@@ -49,12 +47,6 @@ pub enum ChartError {
     Stopped,
 }
 
-/// Bounds are this many times what was estimated or seen.
-const SAFETY: f64 = 4.0;
-/// Error of a charted share of the pad; where it is not reached the share is NaN.
-pub const SHARE_TOLERANCE: f64 = 1e-4;
-/// Distance of two roots, relative to their size, below which they count as merging.
-pub const MERGING: f64 = 1e-4;
 /// Points besides those of the fit at which a leaf is checked.
 const HELD_OUT: usize = 3;
 /// Boxes split off a unit of work that are smaller than it by this factor wait.
@@ -166,44 +158,11 @@ enum Outcome {
     Split(usize),
 }
 
-struct Builder<'a> {
-    options: &'a ChartOptions,
-    sampler: Sampler<'a>,
+pub(super) struct Builder<'a> {
+    pub options: &'a ChartOptions,
+    pub sampler: Sampler<'a>,
     solvers: Vec<Solver>,
-    chart: Chart,
-}
-
-/// The samples of a box, and which of their roots are one.
-struct Branches<'a> {
-    samples: Vec<&'a Sample>,
-    units: Vec<[f64; MAX_AXES]>,
-    /// Half the widths of the box.
-    half: [f64; MAX_AXES],
-    /// `[sample][branch]`.
-    roots: Vec<Vec<usize>>,
-    ids: Vec<u32>,
-    /// Rounding error of a well-conditioned root.
-    rounding: f64,
-    undamped: bool,
-}
-
-impl Branches<'_> {
-    fn count(&self) -> usize {
-        self.ids.len()
-    }
-
-    fn z(&self, sample: usize, branch: usize) -> c64 {
-        self.samples[sample].z[self.roots[sample][branch]]
-    }
-
-    /// Slopes along the unit coordinates.
-    fn slope(&self, sample: usize, branch: usize, axis: usize) -> c64 {
-        self.samples[sample].slopes[self.roots[sample][branch]][axis] * self.half[axis]
-    }
-
-    fn condition(&self, sample: usize, branch: usize) -> f64 {
-        self.samples[sample].conditions[self.roots[sample][branch]]
-    }
+    pub chart: Chart,
 }
 
 impl Builder<'_> {
@@ -327,235 +286,6 @@ impl Builder<'_> {
         map.identify(spectrum).into_iter().take(tracked(spectrum)).collect()
     }
 
-    /// Clusters the branches of the band until every symmetric function converges; else the axis to split along.
-    fn cluster(&self, branches: &Branches<'_>, fit: &Fit) -> Result<Vec<(Vec<usize>, Expansion)>, usize> {
-        let omega = |z: c64| if branches.undamped { (-z.re).max(0.0).sqrt() } else { z.im };
-        let limit = self.options.band_max_hz.map_or(f64::INFINITY, |hz| hz * std::f64::consts::TAU);
-        let in_band = |branch: usize| (0..branches.samples.len()).any(|k| omega(branches.z(k, branch)) <= limit);
-        let mut settled: Vec<(Vec<usize>, Expansion)> = vec![];
-        let mut open: Vec<Vec<usize>> = (0..branches.count()).filter(|&k| in_band(k)).map(|k| vec![k]).collect();
-        while let Some(members) = open.pop() {
-            let expansion = self.expand(branches, fit, &members);
-            let Some(axis) = expansion.failing else {
-                settled.push((members, expansion));
-                continue;
-            };
-            if members.len() >= MAX_SIZE {
-                return Err(axis);
-            }
-            // Whatever comes closest to a member joins, with all it was already clustered with.
-            let nearest = (0..branches.count())
-                .filter(|k| !members.contains(k))
-                .map(|k| (closeness(branches, &members, k), k))
-                .min_by(|a, b| a.0.total_cmp(&b.0));
-            let Some((_, nearest)) = nearest else { return Err(axis) };
-            let mut joined = members;
-            let taken = |cluster: &Vec<usize>| cluster.contains(&nearest);
-            if let Some(at) = settled.iter().position(|(cluster, _)| taken(cluster)) {
-                joined.extend(settled.swap_remove(at).0);
-            } else if let Some(at) = open.iter().position(taken) {
-                joined.extend(open.swap_remove(at));
-            } else {
-                joined.push(nearest);
-            }
-            if joined.len() > MAX_SIZE {
-                return Err(axis);
-            }
-            open.push(joined);
-        }
-        Ok(settled)
-    }
-
-    /// The expansions of the symmetric functions of some branches.
-    fn expand(&self, branches: &Branches<'_>, fit: &Fit, members: &[usize]) -> Expansion {
-        let (axes, size, count) = (self.chart.axes.len(), members.len(), branches.samples.len());
-        let parts = if branches.undamped { 1 } else { 2 };
-        // An error of λ counts twice in λ².
-        let tolerance = self.options.tolerance / parts as f64;
-        let mut data = Mat::zeros(count * (1 + axes), size * parts);
-        let (mut radius, mut scale, mut stray) = (0.0f64, f64::INFINITY, 0.0f64);
-        let mut sound = vec![true; count];
-        let mut allowed = vec![f64::INFINITY; size];
-        let mut condition = 1.0f64;
-        for node in 0..count {
-            let z: Vec<c64> = members.iter().map(|&k| branches.z(node, k)).collect();
-            let functions = symmetric_functions(&z);
-            sound[node] = members.iter().all(|&k| branches.samples[node].is_sound(branches.roots[node][k]));
-            scale = scale.min(functions[0].norm());
-            radius = z.iter().map(|z| (z - functions[0]).norm()).fold(radius, f64::max);
-            if size == 1 {
-                condition = condition.max(branches.condition(node, members[0]));
-            }
-            allow(&z, functions[0], tolerance, &mut allowed);
-            for (k, function) in functions.iter().enumerate() {
-                data[(node * (1 + axes), k * parts)] = function.re;
-                if parts == 2 {
-                    data[(node * (1 + axes), k * parts + 1)] = function.im;
-                } else {
-                    stray = stray.max(function.im.abs() / function.norm().max(f64::MIN_POSITIVE));
-                }
-            }
-            for axis in 0..axes {
-                let dz: Vec<c64> = members.iter().map(|&k| branches.slope(node, k, axis)).collect();
-                for (k, slope) in symmetric_slopes(&z, &dz).into_iter().enumerate() {
-                    data[(node * (1 + axes) + 1 + axis, k * parts)] = slope.re;
-                    if parts == 2 {
-                        data[(node * (1 + axes) + 1 + axis, k * parts + 1)] = slope.im;
-                    }
-                }
-            }
-        }
-        let mut expansion = Expansion { channels: vec![], errors: vec![0.0; size], degree: 0, failing: Some(0) };
-        // A cluster that is not closed under conjugation lacks its mirror image.
-        if stray > 1e-6 {
-            return expansion;
-        }
-        let fitted = if sound.iter().all(|&sound| sound) {
-            fit.expand(data)
-        } else {
-            match Fit::new(&self.chart.basis, &branches.units, &sound) {
-                Some(fit) => fit.expand(data),
-                None => return expansion,
-            }
-        };
-        let mut failing: Option<(f64, usize)> = None;
-        for k in 0..size {
-            let floor = branches.rounding * size as f64 * condition * radius.max(branches.rounding).powi(k as i32);
-            for fitted in &fitted[k * parts..(k + 1) * parts] {
-                let missing = SAFETY * fitted.missing;
-                expansion.errors[k] += missing + floor;
-                let excess = missing / (allowed[k] / parts as f64 + 8.0 * floor);
-                if excess.is_nan() || excess > 1.0 && failing.is_none_or(|(worst, _)| excess > worst) {
-                    failing = Some((excess, fitted.worst_axis));
-                }
-            }
-        }
-        expansion.channels = fitted.into_iter().map(|fitted| fitted.coefficients).collect();
-        // What is not needed is cut off, for all functions of the cluster alike.
-        let basis = &self.chart.basis;
-        let beyond = |column: usize, degree: usize| basis.beyond(&expansion.channels[column], degree);
-        let enough =
-            |degree: &usize| (0..size * parts).all(|column| beyond(column, *degree) <= 0.1 * allowed[column / parts]);
-        let degree = (0..basis.degree()).find(enough).unwrap_or(basis.degree());
-        for column in 0..size * parts {
-            expansion.errors[column / parts] += basis.beyond(&expansion.channels[column], degree);
-        }
-        expansion.degree = degree;
-        expansion.failing = failing.map(|(_, axis)| axis);
-        expansion
-    }
-
-    /// Lays the coefficients out and adds what the charted roots leave of the traces.
-    fn assemble(
-        &self,
-        branches: &Branches<'_>,
-        settled: Vec<(Vec<usize>, Expansion)>,
-        low: &[f64; MAX_AXES],
-        high: &[f64; MAX_AXES],
-    ) -> Result<Leaf, usize> {
-        let axes = self.chart.axes.len();
-        let weight = if branches.undamped { 1.0 } else { 2.0 };
-        let mut rest = Mat::zeros(branches.samples.len() * (1 + axes), 2);
-        let mut largest = [0.0f64; 2];
-        for (node, sample) in branches.samples.iter().enumerate() {
-            let row = node * (1 + axes);
-            for k in 0..2 {
-                largest[k] = largest[k].max(sample.totals[k].abs());
-                rest[(row, k)] = sample.totals[k];
-                for axis in 0..axes {
-                    rest[(row + 1 + axis, k)] = sample.total_slopes[axis][k] * branches.half[axis];
-                }
-            }
-            for &branch in settled.iter().flat_map(|(members, _)| members) {
-                let z = branches.z(node, branch);
-                rest[(row, 0)] -= weight * z.re;
-                rest[(row, 1)] -= weight * (z * z).re;
-                for axis in 0..axes {
-                    let slope = branches.slope(node, branch, axis);
-                    rest[(row + 1 + axis, 0)] -= weight * slope.re;
-                    rest[(row + 1 + axis, 1)] -= weight * 2.0 * (z * slope).re;
-                }
-            }
-        }
-        let sound: Vec<bool> = (0..branches.samples.len())
-            .map(|node| {
-                let members = || settled.iter().flat_map(|(members, _)| members);
-                members().all(|&k| branches.condition(node, k) < 1e5)
-            })
-            .collect();
-        let Some(fit) = Fit::new(&self.chart.basis, &branches.units, &sound) else { return Err(0) };
-        let mut remainders = vec![];
-        let mut remainder_errors = [0.0; 2];
-        for (k, fitted) in fit.expand(rest).into_iter().enumerate() {
-            let floor = 64.0 * f64::EPSILON * largest[k] * self.sampler.model.dimension() as f64;
-            remainder_errors[k] = SAFETY * fitted.missing + floor;
-            if remainder_errors[k] > 1e-6 * largest[k] + 2.0 * floor {
-                return Err(fitted.worst_axis);
-            }
-            remainders.push(fitted.coefficients);
-        }
-        let shares = self.shares(branches, &settled);
-        let mut blocks = vec![(self.chart.basis.degree(), Part::Remainders, remainders)];
-        let mut clusters = vec![];
-        for ((members, expansion), share) in settled.into_iter().zip(shares) {
-            let mut ids: Vec<u32> = members.iter().map(|&k| branches.ids[k]).collect();
-            ids.sort_unstable();
-            let ascending = is_ascending(branches, &members);
-            let Expansion { channels, errors, degree, .. } = expansion;
-            blocks.push((degree, Part::Cluster(clusters.len()), channels));
-            blocks.extend(share.map(|(degree, channel)| (degree, Part::Share(clusters.len()), vec![channel])));
-            clusters.push(Cluster { ids, channel: 0, errors, share: None, ascending });
-        }
-        // Channels of high degree first: those that take part in a degree stand together.
-        blocks.sort_by_key(|(degree, ..)| std::cmp::Reverse(*degree));
-        let (mut remainder, mut columns, mut widths) =
-            (0, Vec::<Vec<f64>>::new(), vec![0; self.chart.basis.degree() + 1]);
-        for (degree, part, channels) in blocks {
-            match part {
-                Part::Remainders => remainder = columns.len(),
-                Part::Cluster(k) => clusters[k].channel = columns.len(),
-                Part::Share(k) => clusters[k].share = Some(columns.len()),
-            }
-            columns.extend(channels);
-            widths[..=degree].iter_mut().for_each(|width| *width = columns.len());
-        }
-        let mut coefficients = vec![];
-        for (degree, &width) in widths.iter().enumerate() {
-            let rows = self.chart.basis.of_degree(degree);
-            for row in rows {
-                coefficients.extend(columns[..width].iter().map(|column: &Vec<f64>| column[row]));
-            }
-        }
-        Ok(Leaf { low: *low, high: *high, clusters, widths, remainder, coefficients, remainder_errors })
-    }
-
-    /// Coefficients of the pad's share of every root that is alone, where they converge. Slopes of shares are not known: the
-    /// fit is of as low a degree as the points allow.
-    fn shares(&self, branches: &Branches<'_>, settled: &[(Vec<usize>, Expansion)]) -> Vec<Option<(usize, Vec<f64>)>> {
-        let axes = self.chart.axes.len();
-        let points = branches.units.len();
-        let degree = (0..=self.chart.basis.degree())
-            .take_while(|&degree| 4 * Basis::new(axes, degree).len() <= 3 * points)
-            .last()
-            .unwrap_or(0);
-        let basis = Basis::new(axes, degree);
-        let alone: Vec<usize> =
-            settled.iter().map(|(members, _)| if members.len() == 1 { members[0] } else { usize::MAX }).collect();
-        let Some(fit) = Fit::new(&basis, &branches.units, &vec![false; points]) else {
-            return vec![None; settled.len()];
-        };
-        let share = |node: usize, branch: usize| match alone[branch] {
-            usize::MAX => f64::NAN,
-            branch => branches.samples[node].spectrum.roots[branches.roots[node][branch]].pad_participation,
-        };
-        let data = Mat::from_fn(points * (1 + axes), settled.len(), |row, k| {
-            if row % (1 + axes) == 0 { share(row / (1 + axes), k) } else { 0.0 }
-        });
-        // NaN is no share.
-        let converged = |fitted: &Fitted| SAFETY * fitted.missing <= SHARE_TOLERANCE;
-        fit.expand(data).into_iter().map(|f| converged(&f).then_some((degree, f.coefficients))).collect()
-    }
-
     /// Compares a leaf with dense solves that took no part in its fit; errors seen above a bound refuse it.
     fn check(&self, leaf: &Leaf, held_out: &[Sample]) -> bool {
         let alone = self.chart.with_only(leaf);
@@ -573,40 +303,6 @@ fn points_wanted(basis: &Basis, axes: usize) -> usize {
     (3 * basis.len()).div_ceil(2 * (1 + axes))
 }
 
-/// Lowers `allowed` to the error of each symmetric function of the roots `z` that leaves each of them the asked tolerance; the
-/// nearest other root counts as no closer than [`MERGING`].
-fn allow(z: &[c64], mean: c64, tolerance: f64, allowed: &mut [f64]) {
-    let size = mean.norm();
-    allowed[0] = allowed[0].min(if z.len() == 1 { 0.8 } else { 0.4 } * tolerance * size);
-    for (i, &root) in z.iter().enumerate() {
-        let mut gaps: Vec<f64> = (0..z.len()).filter(|&j| j != i).map(|j| (z[j] - root).norm()).collect();
-        gaps.sort_by(f64::total_cmp);
-        let near = MERGING * size;
-        let product: f64 =
-            gaps.iter().enumerate().map(|(rank, &gap)| if rank == 0 { near } else { gap.max(near) }).product();
-        let reach = (root - mean).norm().max(near);
-        for (m, allowed) in allowed.iter_mut().enumerate().skip(1) {
-            let weight = reach.powi((z.len() - 1 - m) as i32) * (2 * z.len() * (z.len() - 1)) as f64;
-            *allowed = allowed.min(tolerance * size * product / weight);
-        }
-    }
-}
-
-/// Of a pair: whether the lower identity has the lower frequency where it is apart.
-fn is_ascending(branches: &Branches<'_>, members: &[usize]) -> bool {
-    let [a, b] = *members else { return true };
-    let (lower, upper) = if branches.ids[a] < branches.ids[b] { (a, b) } else { (b, a) };
-    let order = |node: usize| {
-        let (lower, upper) = (branches.z(node, lower), branches.z(node, upper));
-        match (branches.undamped, lower.im == 0.0) {
-            (true, true) => (lower.re - upper.re).signum(),
-            (true, false) => 0.0,
-            (false, _) => (upper.im - lower.im).signum(),
-        }
-    };
-    (0..branches.samples.len()).map(order).sum::<f64>() >= 0.0
-}
-
 /// Whether a static root of a damped model, which is not charted, grows at one of the nodes or may grow between them:
 /// comes closer to zero than it moves over the box.
 fn may_diverge<'a>(spectra: impl Iterator<Item = &'a Spectrum>) -> bool {
@@ -617,35 +313,6 @@ fn may_diverge<'a>(spectra: impl Iterator<Item = &'a Spectrum>) -> bool {
     }
     // A free root stays at zero, exactly.
     high > 0.0 || (high > f64::NEG_INFINITY && high != low && high + (high - low) > 0.0)
-}
-
-/// How close branch `k` comes to any of `members` or to its mirror image, relative to its size.
-fn closeness(branches: &Branches<'_>, members: &[usize], k: usize) -> f64 {
-    let gap = |node: usize| {
-        let z = branches.z(node, k);
-        let member = |&j: &usize| {
-            let other = branches.z(node, j);
-            (other - z).norm().min((other.conj() - z).norm())
-        };
-        members.iter().map(member).fold(f64::INFINITY, f64::min) / z.norm()
-    };
-    (0..branches.samples.len()).map(gap).fold(f64::INFINITY, f64::min)
-}
-
-/// What a block of channels is for.
-enum Part {
-    Remainders,
-    Cluster(usize),
-    Share(usize),
-}
-
-struct Expansion {
-    channels: Vec<Vec<f64>>,
-    errors: Vec<f64>,
-    /// Total degree beyond which coefficients are not needed.
-    degree: usize,
-    /// The axis along which it does not converge.
-    failing: Option<usize>,
 }
 
 #[cfg(test)]

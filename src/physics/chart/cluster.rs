@@ -5,6 +5,8 @@
 
 use faer::c64;
 
+use crate::physics::spectrum::{magnitude, square_root};
+
 /// The most roots of a cluster.
 pub const MAX_SIZE: usize = 4;
 
@@ -54,10 +56,14 @@ pub fn symmetric_slopes(z: &[c64], dz: &[c64]) -> Vec<c64> {
 pub fn roots(functions: &[c64], errors: &[f64], out: &mut [(c64, f64); MAX_SIZE]) {
     let k = functions.len();
     let mean = functions[0];
+    if k == 1 {
+        out[0] = (mean, errors[0]);
+        return;
+    }
     let w = offsets(functions);
     for i in 0..k {
         let (mut rho, mut slope) = (0.0, c64::new(1.0, 0.0));
-        let size = w[i].norm();
+        let size = magnitude(w[i]);
         for (m, error) in errors.iter().enumerate().skip(1) {
             rho += error * size.powi((k - 1 - m) as i32);
         }
@@ -66,8 +72,8 @@ pub fn roots(functions: &[c64], errors: &[f64], out: &mut [(c64, f64); MAX_SIZE]
                 slope *= w[i] - other;
             }
         }
-        let far = k as f64 * rho / slope.norm();
-        let near = rho.powf(1.0 / k as f64);
+        let far = k as f64 * rho / magnitude(slope);
+        let near = if k == 2 { rho.sqrt() } else { rho.powf(1.0 / k as f64) };
         let spread = if rho == 0.0 { 0.0 } else { far.min(near) };
         out[i] = (mean + w[i], errors[0] + spread);
     }
@@ -79,7 +85,7 @@ pub fn offsets(functions: &[c64]) -> [c64; MAX_SIZE] {
     match functions.len() {
         0 | 1 => {}
         2 => {
-            let half = (-functions[1]).sqrt();
+            let half = square_root(-functions[1]);
             (w[0], w[1]) = (half, -half);
         }
         k => simultaneous(&functions[1..], &mut w[..k]),

@@ -2,7 +2,8 @@
 
 use faer::c64;
 
-use super::build::{ChartOptions, MERGING};
+use super::build::ChartOptions;
+use super::leaf::MERGING;
 use super::{Chart, NotCharted, Scratch};
 use crate::physics::model::{Model, Traces};
 use crate::physics::operating_point::OperatingPoint;

@@ -7,17 +7,20 @@
 //! taken twice shows.
 
 pub mod build;
+mod channels;
 pub(super) mod chebyshev;
 mod cluster;
 pub mod hold_out;
+mod leaf;
 mod samples;
 mod words;
 
 use faer::c64;
 
 use super::operating_point::OperatingPoint;
-use super::spectrum::{Root, RootError};
+use super::spectrum::{Root, RootError, magnitude, square_root};
 use super::summary::Mode;
+use channels::Channels;
 use chebyshev::Basis;
 use cluster::MAX_SIZE;
 
@@ -102,11 +105,11 @@ enum Branch {
 struct Cluster {
     /// Identities, ascending.
     ids: Vec<u32>,
-    /// Where its channels begin.
+    /// Where its channels begin among the functions.
     channel: usize,
     /// Bound of the error of each symmetric function.
     errors: Vec<f64>,
-    /// Where the pad's share of a root that is alone is expanded, to [`build::SHARE_TOLERANCE`].
+    /// Where, beside the functions, the pad's share of a root that is alone is expanded, to [`leaf::SHARE_TOLERANCE`].
     share: Option<usize>,
     /// Of a pair that is apart: whether the lower identity has the lower frequency.
     ascending: bool,
@@ -118,15 +121,17 @@ struct Leaf {
     low: [f64; MAX_AXES],
     high: [f64; MAX_AXES],
     clusters: Vec<Cluster>,
-    /// How many channels have coefficients of each total degree: those of high degree come first.
-    widths: Vec<usize>,
-    /// Where the two channels begin that hold what the charted roots leave of the traces.
-    remainder: usize,
-    /// Degree by degree, polynomial by polynomial, channel fastest.
-    coefficients: Vec<f64>,
+    /// The symmetric functions of the clusters.
+    functions: Channels,
+    /// What else a prediction needs: what the charted roots leave of the traces, in the first two channels, and shares of the
+    /// pad.
+    beside: Channels,
     /// Error bounds of the two remainders.
     remainder_errors: [f64; 2],
 }
+
+/// The channels of [`Leaf::beside`] that hold what the charted roots leave of the traces.
+const REMAINDERS: usize = 2;
 
 /// The roots of a model over a box of conditions.
 #[derive(Clone, Debug)]
@@ -147,7 +152,8 @@ pub struct Chart {
 #[derive(Clone, Debug, Default)]
 pub struct Scratch {
     basis: Vec<f64>,
-    channels: Vec<f64>,
+    functions: Vec<f64>,
+    beside: Vec<f64>,
 }
 
 impl Chart {
@@ -163,7 +169,8 @@ impl Chart {
 
     /// Bytes it holds.
     pub fn size_bytes(&self) -> usize {
-        self.leaves.iter().map(|leaf| 8 * leaf.coefficients.len()).sum()
+        let numbers = |leaf: &Leaf| leaf.functions.coefficients.len() + leaf.beside.coefficients.len();
+        self.leaves.iter().map(|leaf| 8 * numbers(leaf)).sum()
     }
 
     /// Share of the conditions, evenly spread over friction coefficient, load and speed, that have no leaf.
@@ -230,7 +237,8 @@ impl Chart {
         out: &mut Vec<Mode>,
     ) -> Result<(), NotCharted> {
         let leaf = self.expand(p, scratch)?;
-        let values = &scratch.channels;
+        leaf.beside.evaluate(&self.basis, &scratch.basis, &mut scratch.beside);
+        let (values, beside) = (&scratch.functions, &scratch.beside);
         let before = out.len();
         let mut found = [0.0; 2];
         let mut limit = [0.0; 2];
@@ -240,20 +248,20 @@ impl Chart {
             let functions = self.functions(cluster, values);
             cluster::roots(&functions[..size], &cluster.errors, &mut roots);
             self.sort_pair(cluster, &mut roots);
-            let gap = if size == 2 { (roots[0].0 - roots[1].0).norm() } else { f64::INFINITY };
+            let gap = if size == 2 { magnitude(roots[0].0 - roots[1].0) } else { f64::INFINITY };
             for (&id, &(z, error)) in cluster.ids.iter().zip(&roots[..size]) {
                 let mut root = self.charted(z, error, size <= 2 && z.im == 0.0 && 2.0 * error < gap);
-                root.pad_participation = cluster.share.map_or(f64::NAN, |share| values[share].clamp(0.0, 1.0));
+                root.pad_participation = cluster.share.map_or(f64::NAN, |share| beside[share].clamp(0.0, 1.0));
                 let weight = if self.undamped { 1.0 } else { 2.0 };
                 found[0] += weight * z.re;
                 found[1] += weight * (z * z).re;
                 limit[0] += weight * error;
-                limit[1] += weight * 2.0 * z.norm() * error;
+                limit[1] += weight * 2.0 * magnitude(z) * error;
                 out.push(Mode { id, root });
             }
         }
         for moment in 0..2 {
-            let rest = values[leaf.remainder + moment];
+            let rest = beside[moment];
             let difference = (found[moment] + rest - traces[moment]).abs();
             let limit = limit[moment] + leaf.remainder_errors[moment];
             if difference.is_nan() || difference > limit {
@@ -262,6 +270,24 @@ impl Chart {
             }
         }
         Ok(())
+    }
+
+    /// Whether `p` is in a box that converged.
+    pub fn covers(&self, p: &OperatingPoint) -> bool {
+        self.coordinates(p).is_ok_and(|x| self.find(&x).is_ok())
+    }
+
+    /// The coordinates of `p`.
+    fn coordinates(&self, p: &OperatingPoint) -> Result<[f64; MAX_AXES], NotCharted> {
+        let mut x = [0.0; MAX_AXES];
+        for (k, axis) in self.axes.iter().enumerate() {
+            x[k] = axis.coordinate(p);
+            // Written so that NaN is outside.
+            if !(x[k] >= self.low[k] && x[k] <= self.high[k]) {
+                return Err(NotCharted::Outside);
+            }
+        }
+        Ok(x)
     }
 
     fn find(&self, x: &[f64; MAX_AXES]) -> Result<usize, NotCharted> {
@@ -284,8 +310,12 @@ impl Chart {
         let leaf = self.expand(p, scratch)?;
         for cluster in &leaf.clusters {
             let size = cluster.ids.len();
-            let functions = self.functions(cluster, &scratch.channels);
-            out.extend(cluster::offsets(&functions[..size])[..size].iter().map(|w| functions[0] + w));
+            let functions = self.functions(cluster, &scratch.functions);
+            if size == 1 {
+                out.push(functions[0]);
+            } else {
+                out.extend(cluster::offsets(&functions[..size])[..size].iter().map(|w| functions[0] + w));
+            }
         }
         Ok(())
     }
@@ -303,38 +333,23 @@ impl Chart {
         functions
     }
 
-    /// The leaf that holds `p`, with all of its channels evaluated there.
+    /// The leaf that holds `p`, with the functions of its clusters and the basis evaluated there.
     fn expand(&self, p: &OperatingPoint, scratch: &mut Scratch) -> Result<&Leaf, NotCharted> {
-        let mut x = [0.0; MAX_AXES];
-        for (k, axis) in self.axes.iter().enumerate() {
-            x[k] = axis.coordinate(p);
-            // Written so that NaN is outside.
-            if !(x[k] >= self.low[k] && x[k] <= self.high[k]) {
-                return Err(NotCharted::Outside);
-            }
-        }
+        let x = self.coordinates(p)?;
         let leaf = &self.leaves[self.find(&x)?];
         let mut unit = [0.0; MAX_AXES];
         for (k, unit) in unit[..self.axes.len()].iter_mut().enumerate() {
             *unit = 2.0 * (x[k] - leaf.low[k]) / (leaf.high[k] - leaf.low[k]) - 1.0;
         }
         self.basis.values(&unit, &mut scratch.basis);
-        scratch.channels.clear();
-        scratch.channels.resize(leaf.widths[0], 0.0);
-        let mut coefficients = leaf.coefficients.as_slice();
-        for (degree, &width) in leaf.widths.iter().enumerate() {
-            let weights = &scratch.basis[self.basis.of_degree(degree)];
-            let (block, rest) = coefficients.split_at(weights.len() * width);
-            accumulate(&mut scratch.channels[..width], weights, block);
-            coefficients = rest;
-        }
+        leaf.functions.evaluate(&self.basis, &scratch.basis, &mut scratch.functions);
         Ok(leaf)
     }
 
     /// The root for a charted `z`; `apart` where an undamped one is known not to be one of a complex pair.
     fn charted(&self, z: c64, error: f64, apart: bool) -> Root {
         let (lambda, square, error) = if self.undamped {
-            let lambda = super::spectrum::square_root(z);
+            let lambda = square_root(z);
             (lambda, z, RootError::from_square(lambda, error, apart))
         } else {
             (z, z * z, RootError::from_lambda(z, error))
@@ -358,28 +373,6 @@ impl Chart {
         };
         if !in_order {
             roots.swap(0, 1);
-        }
-    }
-}
-
-/// Adds `weights` times `rows` to `sums`, four rows at a time: each sum is then loaded and stored a fourth as often.
-fn accumulate(sums: &mut [f64], weights: &[f64], rows: &[f64]) {
-    let width = sums.len();
-    if width == 0 {
-        return;
-    }
-    let whole = weights.len() / 4 * 4;
-    for (w, four) in weights.chunks_exact(4).zip(rows.chunks_exact(4 * width)) {
-        let (a, rest) = four.split_at(width);
-        let (b, rest) = rest.split_at(width);
-        let (c, d) = rest.split_at(width);
-        for ((((sum, a), b), c), d) in sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
-            *sum += w[0] * a + w[1] * b + w[2] * c + w[3] * d;
-        }
-    }
-    for (w, row) in weights[whole..].iter().zip(rows[whole * width..].chunks_exact(width)) {
-        for (sum, value) in sums.iter_mut().zip(row) {
-            *sum += w * value;
         }
     }
 }

@@ -2,10 +2,10 @@
 
 use super::chebyshev::Basis;
 use super::cluster::MAX_SIZE;
-use super::{Axis, Branch, Chart, Cluster, Leaf, MAX_AXES};
+use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
 /// Changes whenever the words, or what a build makes of a model, mean something else than before.
-pub const FORMAT: u64 = 2;
+pub const FORMAT: u64 = 3;
 
 const AXES: [Axis; 4] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed];
 
@@ -29,8 +29,9 @@ impl Chart {
         for leaf in &self.leaves {
             let numbers = leaf.low.iter().chain(&leaf.high).chain(&leaf.remainder_errors);
             words.extend(numbers.map(|x| x.to_bits()));
-            words.push(leaf.remainder as u64);
-            words.extend(leaf.widths.iter().map(|&width| width as u64));
+            for channels in [&leaf.functions, &leaf.beside] {
+                words.extend(channels.widths.iter().map(|&width| width as u64));
+            }
             words.push(leaf.clusters.len() as u64);
             for cluster in &leaf.clusters {
                 let share = cluster.share.map_or(0, |share| share as u64 + 1);
@@ -38,7 +39,8 @@ impl Chart {
                 words.extend(cluster.ids.iter().map(|&id| u64::from(id)));
                 words.extend(cluster.errors.iter().map(|error| error.to_bits()));
             }
-            words.extend(leaf.coefficients.iter().map(|x| x.to_bits()));
+            let coefficients = leaf.functions.coefficients.iter().chain(&leaf.beside.coefficients);
+            words.extend(coefficients.map(|x| x.to_bits()));
         }
         words
     }
@@ -119,30 +121,39 @@ impl Reader<'_> {
 
     fn leaf(&mut self, basis: &Basis, undamped: bool) -> Option<Leaf> {
         let (low, high, remainder_errors) = (self.numbers()?, self.numbers()?, self.numbers()?);
-        let remainder = self.count(usize::MAX)?;
-        let most = self.0.len();
-        let widths: Vec<usize> = (0..=basis.degree()).map(|_| self.count(most)).collect::<Option<_>>()?;
-        let descending = widths.windows(2).all(|pair| pair[0] >= pair[1]);
-        if !descending || remainder.checked_add(2)? > widths[0] {
+        let (functions, beside) = (self.widths(basis)?, self.widths(basis)?);
+        if beside[0] < REMAINDERS {
             return None;
         }
-        let clusters = (0..self.count(most)?).map(|_| self.cluster(widths[0], undamped)).collect::<Option<_>>()?;
+        let count = self.count(self.0.len())?;
+        let clusters = (0..count).map(|_| self.cluster(functions[0], beside[0], undamped)).collect::<Option<_>>()?;
+        let (functions, beside) = (self.channels(basis, functions)?, self.channels(basis, beside)?);
+        Some(Leaf { low, high, clusters, functions, beside, remainder_errors })
+    }
+
+    fn widths(&mut self, basis: &Basis) -> Option<Vec<usize>> {
+        let most = self.0.len();
+        let widths: Vec<usize> = (0..=basis.degree()).map(|_| self.count(most)).collect::<Option<_>>()?;
+        widths.windows(2).all(|pair| pair[0] >= pair[1]).then_some(widths)
+    }
+
+    fn channels(&mut self, basis: &Basis, widths: Vec<usize>) -> Option<Channels> {
         let count: usize = widths.iter().enumerate().map(|(degree, width)| basis.of_degree(degree).len() * width).sum();
         if count > self.0.len() {
             return None;
         }
         let coefficients = (0..count).map(|_| self.number()).collect::<Option<_>>()?;
-        Some(Leaf { low, high, clusters, widths, remainder, coefficients, remainder_errors })
+        Some(Channels { widths, coefficients })
     }
 
-    fn cluster(&mut self, channels: usize, undamped: bool) -> Option<Cluster> {
+    fn cluster(&mut self, functions: usize, beside: usize, undamped: bool) -> Option<Cluster> {
         let size = self.count(MAX_SIZE)?;
-        let channel = self.count(channels)?;
-        let share = self.count(channels)?.checked_sub(1);
+        let channel = self.count(functions)?;
+        let share = self.count(beside)?.checked_sub(1);
         let ascending = self.next()? != 0;
         let ids = (0..size).map(|_| u32::try_from(self.next()?).ok()).collect::<Option<_>>()?;
         let errors = (0..size).map(|_| self.number()).collect::<Option<_>>()?;
         let parts = if undamped { 1 } else { 2 };
-        (size > 0 && channel + size * parts <= channels).then_some(Cluster { ids, channel, errors, share, ascending })
+        (size > 0 && channel + size * parts <= functions).then_some(Cluster { ids, channel, errors, share, ascending })
     }
 }

@@ -1,0 +1,66 @@
+//! Expansions of many functions in one basis, evaluated together: a product of the basis values with a matrix.
+
+use super::chebyshev::Basis;
+
+/// Expansions of some functions on a box.
+#[derive(Clone, Debug)]
+pub struct Channels {
+    /// How many have coefficients of each total degree: those of high degree come first.
+    pub widths: Vec<usize>,
+    /// Degree by degree, polynomial by polynomial, channel fastest.
+    pub coefficients: Vec<f64>,
+}
+
+impl Channels {
+    /// Of functions with their total degrees, highest first, and coefficients of `basis`.
+    pub fn new(basis: &Basis, functions: &[(usize, Vec<f64>)]) -> Self {
+        let width = |degree: usize| functions.iter().take_while(|(last, _)| *last >= degree).count();
+        let widths: Vec<usize> = (0..=basis.degree()).map(width).collect();
+        let mut coefficients = vec![];
+        for (degree, &width) in widths.iter().enumerate() {
+            for row in basis.of_degree(degree) {
+                coefficients.extend(functions[..width].iter().map(|(_, coefficients)| coefficients[row]));
+            }
+        }
+        Self { widths, coefficients }
+    }
+
+    /// Their values where the polynomials of `basis` have `values`.
+    pub fn evaluate(&self, basis: &Basis, values: &[f64], out: &mut Vec<f64>) {
+        out.clear();
+        out.resize(self.widths[0], 0.0);
+        // With the widest registers there are. The sums are the same with any: each channel is added up by itself.
+        pulp::Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                let mut coefficients = self.coefficients.as_slice();
+                for (degree, &width) in self.widths.iter().enumerate().filter(|(_, width)| **width > 0) {
+                    let weights = &values[basis.of_degree(degree)];
+                    let (block, rest) = coefficients.split_at(weights.len() * width);
+                    accumulate(&mut out[..width], weights, block);
+                    coefficients = rest;
+                }
+            },
+        );
+    }
+}
+
+/// Adds `weights` times `rows` to `sums`, four rows at a time: each sum is then loaded and stored a fourth as often.
+#[inline(always)]
+fn accumulate(sums: &mut [f64], weights: &[f64], rows: &[f64]) {
+    let width = sums.len();
+    let whole = weights.len() / 4 * 4;
+    for (w, four) in weights.chunks_exact(4).zip(rows.chunks_exact(4 * width)) {
+        let (a, rest) = four.split_at(width);
+        let (b, rest) = rest.split_at(width);
+        let (c, d) = rest.split_at(width);
+        for ((((sum, a), b), c), d) in sums.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *sum += w[0] * a + w[1] * b + w[2] * c + w[3] * d;
+        }
+    }
+    for (w, row) in weights[whole..].iter().zip(rows[whole * width..].chunks_exact(width)) {
+        for (sum, value) in sums.iter_mut().zip(row) {
+            *sum += w * value;
+        }
+    }
+}
