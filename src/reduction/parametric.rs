@@ -222,6 +222,9 @@ fn oscillating(spectrum: &Spectrum) -> Vec<c64> {
     spectrum.modes().iter().map(|root| root.lambda).collect()
 }
 
+/// Reduced roots, each with the estimate of its relative error.
+type Estimates = Vec<(c64, f64)>;
+
 struct Building<'a, 'm> {
     full: &'a FullModel,
     solver: &'a mut FullSolver<'m>,
@@ -387,7 +390,7 @@ impl Building<'_, '_> {
                 .factor
                 .llt(self.metric.sigma)?
                 .ok_or_else(|| failed("the symmetric stiffness with its shift is not positive definite".to_owned()))?;
-            let mut worst: Option<(OperatingPoint, Vec<(c64, f64)>, f64)> = None;
+            let mut worst: Option<(OperatingPoint, Estimates, f64)> = None;
             for point in training.iter().filter(|point| !self.sampled.contains(point)) {
                 let spectrum = self.solve(&model, point, Vectors::Both)?;
                 let estimates = self.estimates(&factor, &projected, &spectrum)?;
@@ -422,7 +425,7 @@ impl Building<'_, '_> {
         factor: &Llt<'_>,
         projected: &Projected,
         spectrum: &Spectrum,
-    ) -> Result<Vec<(c64, f64)>, ReductionError> {
+    ) -> Result<Estimates, ReductionError> {
         let [mass, damping, stiffness] = self.full.matrices_at(&spectrum.point)?;
         let wanted: Vec<usize> =
             (0..spectrum.mode_count).filter(|&k| self.request.counted.counts(spectrum.roots[k].lambda)).collect();
