@@ -10,6 +10,9 @@ use crate::node::{SAMPLE_MODES, Sample, UnstableMode, VibrationSample};
 /// Quantities with a range in every bin, in the order of [`Bin::ranges`].
 pub const QUANTITIES: [&str; 5] = ["load", "speed", "mu", "growth", "margin"];
 
+/// A bin as JSON is seldom longer, bytes.
+const BIN_JSON: usize = 256;
+
 /// A stretch of time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Bin {
@@ -136,8 +139,10 @@ impl History {
             bin_s: f64,
             bins: &'a VecDeque<Bin>,
         }
+        let mut text = Vec::with_capacity(64 + BIN_JSON * self.bins.len());
         // Numbers only: nothing that JSON cannot hold.
-        serde_json::to_string(&Whole { bin_s: seconds(self.bin_ns), bins: &self.bins }).unwrap_or_default()
+        let whole = Whole { bin_s: seconds(self.bin_ns), bins: &self.bins };
+        serde_json::to_writer(&mut text, &whole).ok().and_then(|()| String::from_utf8(text).ok()).unwrap_or_default()
     }
 
     /// The bins from `index` on.

@@ -142,9 +142,8 @@ impl Source for Live {
     }
 
     fn history(&self) -> String {
-        // Written from a copy: the next state does not wait for it.
-        let history = self.followed().history.clone();
-        history.to_json()
+        // The next state waits for this; the node does not, and a copy would cost memory.
+        self.followed().history.to_json()
     }
 
     fn events(&self) -> Events {

@@ -37,6 +37,8 @@ use crate::rig::Rig;
 const EVERY: Duration = Duration::from_millis(34);
 /// A client that takes nothing for this long is dropped.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// Maps, shapes and histories that are prepared at a time; more wait.
+const BLOCKING_THREADS: usize = 2;
 /// Connections at a time; more wait.
 const MOST_CONNECTIONS: usize = 256;
 /// Pages that listen at a time; more are refused.
@@ -127,7 +129,9 @@ impl Server {
     /// # Errors
     /// None of them is, or the system gives no runtime.
     pub fn start(addresses: &[SocketAddr], source: Arc<dyn Source>) -> io::Result<Self> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
+        // Few threads for what takes longer: the allocator keeps memory for each.
+        let mut runtime = tokio::runtime::Builder::new_current_thread();
+        let runtime = runtime.enable_io().enable_time().max_blocking_threads(BLOCKING_THREADS).build()?;
         let listener = runtime.block_on(TcpListener::bind(addresses))?;
         let address = listener.local_addr()?;
         let (stop, stopped) = oneshot::channel();
