@@ -304,7 +304,7 @@ fn everything_that_is_derived_from_a_rig_works_with_residuals() {
 
 #[test]
 fn wrong_residuals_are_refused_by_name() {
-    let nodes = vec![[0.1, 0.0, 0.0], [0.11, 0.0, 0.0]];
+    let nodes = [[0.1, 0.0, 0.0], [0.11, 0.0, 0.0]];
     let good = |flexibility: Vec<f64>, inertia: Option<Vec<f64>>, shape: Vec<usize>| {
         let mut arrays = vec![
             ("omega_rad_s", vec![1], vec![100.0]),

@@ -178,7 +178,7 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     let to = text(&folder.path().join("rig.toml"));
     run(["reduce", &path, "--modes", "40+40", "--memory-gib", "0.01", "-o", &to])
         .exits(1)
-        .complains("modes need 0.")
+        .complains("it needs 0.")
         .complains("more than the 0.01 GiB allowed");
     run(["reduce", &path, "--modes", "40", "-o", &to])
         .exits(1)
