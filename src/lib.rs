@@ -3,12 +3,18 @@
 #[cfg(feature = "node")]
 pub mod bench;
 #[cfg(feature = "node")]
+pub mod certificate;
+#[cfg(feature = "node")]
 pub mod cmd;
 #[cfg(feature = "node")]
 pub mod display;
 #[cfg(feature = "node")]
 pub mod export;
 pub mod fem;
+#[cfg(feature = "node")]
+pub mod full_model;
+#[cfg(feature = "node")]
+pub mod html;
 #[cfg(feature = "node")]
 pub mod io;
 #[cfg(feature = "node")]
@@ -19,6 +25,8 @@ pub mod physics;
 #[cfg(feature = "node")]
 pub mod plot;
 pub mod reduction;
+#[cfg(feature = "node")]
+pub mod reproduce;
 #[cfg(feature = "node")]
 pub mod rig;
 #[cfg(feature = "node")]

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
+use plotters::data::float::FloatPrettyPrinter;
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -12,6 +13,7 @@ use crate::bench::Route;
 use crate::display::curves::Curves;
 use crate::display::history::{Bin, History};
 use crate::physics::Window;
+use crate::physics::identification::{Identified, Trial};
 use crate::wire::level;
 
 /// The library places points on whole units; this many to a px keeps curves smooth.
@@ -42,6 +44,24 @@ pub struct Point {
     pub growth_rate_per_s: f64,
 }
 
+/// In what frequencies are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Unit {
+    Hz,
+    RadPerS,
+}
+
+/// What is drawn against the friction coefficient.
+struct AgainstFriction<'a> {
+    lines: &'a [Point],
+    dots: &'a [Point],
+    windows: Vec<(f64, Option<f64>)>,
+    mu: (f64, f64),
+    /// A friction coefficient with a line of its own.
+    marked: Option<f64>,
+    unit: Unit,
+}
+
 /// Why a figure could not be drawn.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot draw the figure: {0}")]
@@ -53,8 +73,31 @@ pub struct PlotError(String);
 /// # Errors
 /// [`PlotError`] where the drawing library refuses.
 pub fn sweep(title: &str, points: &[Point], windows: &[Window]) -> Result<String, PlotError> {
-    let windows: Vec<_> = windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
-    against_friction(title, points, &windows, range(points.iter().map(|point| point.mu)), None)
+    AgainstFriction {
+        lines: points,
+        dots: &[],
+        windows: windows.iter().map(|window| (window.mu_from, window.mu_to)).collect(),
+        mu: range(points.iter().map(|point| point.mu)),
+        marked: None,
+        unit: Unit::Hz,
+    }
+    .draw(title)
+}
+
+/// Curves of one model as lines and of another as dots, up to `mu_max`; the windows are those of the lines.
+///
+/// # Errors
+/// [`PlotError`] where the drawing library refuses.
+pub fn against_full(
+    title: &str,
+    lines: &[Point],
+    dots: &[Point],
+    windows: &[Window],
+    mu_max: f64,
+    unit: Unit,
+) -> Result<String, PlotError> {
+    let windows = windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
+    AgainstFriction { lines, dots, windows, mu: (0.0, mu_max), marked: None, unit }.draw(title)
 }
 
 /// The curves of a stability map up to `mu_to`, as [`sweep`] draws them; a line marks the friction coefficient `marked`.
@@ -62,6 +105,14 @@ pub fn sweep(title: &str, points: &[Point], windows: &[Window]) -> Result<String
 /// # Errors
 /// [`PlotError`] where the drawing library refuses.
 pub fn map(title: &str, curves: &Curves, mu_to: f64, marked: Option<f64>) -> Result<String, PlotError> {
+    let windows = curves.windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
+    let from = curves.mu.first().copied().unwrap_or(0.0);
+    let (lines, mu) = (points(curves, mu_to), (from, mu_to.max(from + 1e-6)));
+    AgainstFriction { lines: &lines, dots: &[], windows, mu, marked, unit: Unit::Hz }.draw(title)
+}
+
+/// The points of some curves up to `mu_to`.
+pub fn points(curves: &Curves, mu_to: f64) -> Vec<Point> {
     let mut points = vec![];
     for mode in &curves.modes {
         for ((&mu, hz), growth) in curves.mu.iter().zip(&mode.frequency_hz).zip(&mode.growth_rate_per_s) {
@@ -71,52 +122,51 @@ pub fn map(title: &str, curves: &Curves, mu_to: f64, marked: Option<f64>) -> Res
             }
         }
     }
-    let windows: Vec<_> = curves.windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
-    let from = curves.mu.first().copied().unwrap_or(0.0);
-    against_friction(title, &points, &windows, (from, mu_to.max(from + 1e-6)), marked)
+    points
 }
 
-fn against_friction(
-    title: &str,
-    points: &[Point],
-    windows: &[(f64, Option<f64>)],
-    mu: (f64, f64),
-    marked: Option<f64>,
-) -> Result<String, PlotError> {
-    let mut modes: BTreeMap<u32, Vec<&Point>> = BTreeMap::new();
-    for point in points {
-        modes.entry(point.id).or_default().push(point);
-    }
-    let ids: Vec<u32> = modes.keys().copied().collect();
-    let rows = if ids.len() > LEGEND_MOST { 0 } else { ids.len().div_ceil(LEGEND_COLUMNS) as u32 };
-    figure(title, (1000, 760 + 24 * rows), |area| {
-        let (head, area) = area.split_vertically(24 * rows * FINE);
-        if rows > 0 {
-            legend(&head, &ids)?;
+impl AgainstFriction<'_> {
+    fn draw(&self, title: &str) -> Result<String, PlotError> {
+        let mu = self.mu;
+        let mut modes: BTreeMap<u32, Vec<&Point>> = BTreeMap::new();
+        for point in self.lines {
+            modes.entry(point.id).or_default().push(point);
         }
-        let (upper, lower) = area.split_vertically(50.percent());
-        let growth: fn(&Point) -> f64 = |point| point.growth_rate_per_s;
-        let frequency: fn(&Point) -> f64 = |point| point.frequency_hz;
-        for (area, label, value) in [(&upper, "growth rate, 1/s", growth), (&lower, "frequency, Hz", frequency)] {
-            let y = padded(range(points.iter().map(value)));
-            let mut chart = axes(area, mu, y, "friction coefficient", label)?;
-            for &(from, to) in windows {
-                let (from, to) = (from.max(mu.0), to.unwrap_or(mu.1).min(mu.1));
-                if from < to {
-                    chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
+        let ids: Vec<u32> = modes.keys().copied().collect();
+        let rows = if ids.len() > LEGEND_MOST { 0 } else { ids.len().div_ceil(LEGEND_COLUMNS) as u32 };
+        figure(title, (1000, 760 + 24 * rows), |area| {
+            let (head, area) = area.split_vertically(24 * rows * FINE);
+            if rows > 0 {
+                legend(&head, &ids)?;
+            }
+            let (upper, lower) = area.split_vertically(50.percent());
+            let growth: fn(&Point) -> f64 = |point| point.growth_rate_per_s;
+            let (frequency_label, frequency): (_, fn(&Point) -> f64) = match self.unit {
+                Unit::Hz => ("frequency, Hz", |point| point.frequency_hz),
+                Unit::RadPerS => ("frequency, rad/s", |point| std::f64::consts::TAU * point.frequency_hz),
+            };
+            for (area, label, value) in [(&upper, "growth rate, 1/s", growth), (&lower, frequency_label, frequency)] {
+                let y = padded(range(self.lines.iter().chain(self.dots).map(value)));
+                let mut chart = axes(area, mu, y, "friction coefficient", label)?;
+                for &(from, to) in &self.windows {
+                    let (from, to) = (from.max(mu.0), to.unwrap_or(mu.1).min(mu.1));
+                    if from < to {
+                        chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
+                    }
+                }
+                for (&id, points) in &modes {
+                    curve(&mut chart, id, points.iter().map(|point| (point.mu, value(point))).collect())?;
+                }
+                let dot = |point: &Point| Circle::new((point.mu, value(point)), 3 * FINE / 2, BLACK.filled());
+                chart.draw_series(self.dots.iter().map(dot)).map_err(failed)?;
+                if let Some(at) = self.marked.filter(|at| (mu.0..=mu.1).contains(at)) {
+                    let line = LineSeries::new([(at, y.0), (at, y.1)], BLACK.stroke_width(2 * FINE));
+                    chart.draw_series(line).map_err(failed)?;
                 }
             }
-            for (&id, points) in &modes {
-                curve(&mut chart, id, points.iter().map(|point| (point.mu, value(point))).collect())?;
-            }
-            if let Some(at) = marked.filter(|at| (mu.0..=mu.1).contains(at)) {
-                chart
-                    .draw_series(LineSeries::new([(at, y.0), (at, y.1)], BLACK.stroke_width(2 * FINE)))
-                    .map_err(failed)?;
-            }
-        }
-        Ok(())
-    })
+            Ok(())
+        })
+    }
 }
 
 /// A session over time, in seconds after `from_s`: ranges of load, speed, friction, growth and margin, of the measured
@@ -301,6 +351,45 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
     })
 }
 
+/// The errors of natural frequencies over the contact stiffness, as the paper's Fig. 13: rms below, largest above, the
+/// range in which the rms error is below twice its minimum shaded, the minimiser marked. `stiffness_n_per_m` is that of
+/// a factor of 1; without it the axis is the factor.
+///
+/// # Errors
+/// [`PlotError`] where the drawing library refuses.
+pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option<f64>) -> Result<String, PlotError> {
+    let at = |factor: f64| (factor * stiffness_n_per_m.unwrap_or(1.0)).log10();
+    // Errors of nothing at all are drawn at the lower edge.
+    let height = |error: f64| (100.0 * error).max(1e-12).log10();
+    let mut trials: Vec<&Trial> = found.curve.iter().chain([&found.best]).collect();
+    trials.sort_by(|a, b| a.factor.total_cmp(&b.factor));
+    let x = range(trials.iter().map(|trial| at(trial.factor)));
+    let y = padded(range(trials.iter().flat_map(|trial| [height(trial.rms_error), height(trial.largest_error)])));
+    let x_label = match stiffness_n_per_m {
+        Some(_) => "contact stiffness of a pair, log10 N/m",
+        None => "contact stiffness relative to the rig's, log10",
+    };
+    figure(title, (1000, 560), |area| {
+        let mut chart = axes(area, x, y, x_label, "error of the frequencies, log10 %")?;
+        let [from, to] = found.doubled;
+        let (from, to) = (from.map_or(x.0, &at), to.map_or(x.1, &at));
+        chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
+        for (name, colour, of) in [
+            ("rms", COLOURS[0], (|trial| trial.rms_error) as fn(&Trial) -> f64),
+            ("largest", COLOURS[1], |trial| trial.largest_error),
+        ] {
+            let line: Vec<_> = trials.iter().map(|trial| (at(trial.factor), height(of(trial)))).collect();
+            let beside = Pos::new(HPos::Left, VPos::Bottom);
+            let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(beside).color(&colour);
+            chart.draw_series([Text::new(format!(" {name}"), line[0], text)]).map_err(failed)?;
+            chart.draw_series(LineSeries::new(line, colour.stroke_width(2 * FINE))).map_err(failed)?;
+        }
+        let best = at(found.best.factor);
+        chart.draw_series(LineSeries::new([(best, y.0), (best, y.1)], BLACK.stroke_width(2 * FINE))).map_err(failed)?;
+        Ok(())
+    })
+}
+
 /// Bins without a gap between them that all have something, with it.
 fn stretches<T>(history: &History, of: impl Fn(&Bin) -> Option<T>) -> Vec<Vec<(i64, T)>> {
     let mut stretches: Vec<Vec<(i64, T)>> = vec![];
@@ -334,6 +423,8 @@ fn axes<'a>(
         .map_err(failed)?;
     chart
         .configure_mesh()
+        .x_label_formatter(&|value| tick(*value, x))
+        .y_label_formatter(&|value| tick(*value, y))
         .axis_style(BLACK.stroke_width(FINE))
         .set_all_tick_mark_size(5 * FINE)
         .light_line_style(TRANSPARENT)
@@ -346,6 +437,12 @@ fn axes<'a>(
         .draw()
         .map_err(failed)?;
     Ok(chart)
+}
+
+/// The label of a tick. Rounding leaves a zero that is none, and may be negative.
+fn tick(value: f64, (low, high): (f64, f64)) -> String {
+    let value = if value.abs() < 1e-9 * (high - low) { 0.0 } else { value };
+    FloatPrettyPrinter { allow_scientific: false, min_decimal: 1, max_decimal: 5 }.print(value)
 }
 
 /// Smallest and largest of `values`; something to draw on where there is nothing.

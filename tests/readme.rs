@@ -3,6 +3,8 @@
 //! `# exits with N` must do so. They run one after another in one folder, with what the repository holds beside them.
 #![cfg(feature = "node")]
 
+mod program;
+
 use std::fs::{self, File};
 use std::io::Write;
 use std::os::unix::fs::symlink;
@@ -18,8 +20,6 @@ use tempfile::TempDir;
 const LIMIT: Duration = Duration::from_secs(300);
 /// A command that goes on is let run for this, then it gets Ctrl-C.
 const LET_RUN: Duration = Duration::from_secs(3);
-/// Ctrl-C ends a command within this; 2 s are promised.
-const END_WITHIN: Duration = Duration::from_secs(4);
 
 #[derive(Debug, PartialEq, Eq)]
 struct Shown {
@@ -70,7 +70,7 @@ fn commands(text: &str) -> Vec<Shown> {
 fn goes_on(command: &str) -> bool {
     let words: Vec<&str> = command.split_whitespace().collect();
     match words[1] {
-        "run" | "demo" | "simulate" => true,
+        "run" | "demo" | "simulate" | "view" => true,
         "replay" => !words.contains(&"--verify"),
         _ => false,
     }
@@ -134,7 +134,9 @@ fn run(shown: &Shown, folder: &Path) {
     let interrupted = status.is_none() && goes_on(&shown.command);
     if interrupted {
         signal(&child.0, "-INT");
-        status = wait(&mut child.0, END_WITHIN);
+        let asked = Instant::now();
+        status = wait(&mut child.0, LIMIT);
+        program::promised("Ctrl-C", asked.elapsed(), Duration::from_secs(2));
     }
     let said = || [&stdout, &stderr].map(|path| fs::read_to_string(path).unwrap_or_default()).concat();
     let Some(status) = status else { panic!("{}: does not end\n{}", shown.command, said()) };

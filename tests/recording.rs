@@ -1,12 +1,14 @@
 //! Recordings end to end: what was recorded is read back, whatever happened to the process, the disk or the file.
 
+mod program;
+
 use std::{
     fs::{self, File},
     io::{self, BufRead, BufReader, Write},
     path::{Path, PathBuf},
     process::{Command, Stdio},
     sync::{
-        Arc,
+        Arc, Condvar, Mutex,
         atomic::{AtomicI64, Ordering},
     },
     time::{Duration, Instant, SystemTime, UNIX_EPOCH},
@@ -32,7 +34,7 @@ use tempfile::TempDir;
 
 /// The start of the recordings made here, ns since the epoch.
 const T0: u64 = 1_700_000_000_000_000_000;
-const LIMIT: Duration = Duration::from_secs(20);
+const LIMIT: Duration = Duration::from_secs(120);
 
 fn point(seq: u64, log_time_ns: u64) -> Message {
     let stamp = Time::from_ns(log_time_ns as i64);
@@ -223,7 +225,7 @@ fn recording_child() {
             io::stdout().flush().unwrap();
         }
         std::thread::sleep((start + Duration::from_millis(2) * seq as u32).saturating_duration_since(Instant::now()));
-        assert!(start.elapsed() < Duration::from_secs(60), "nobody killed this process");
+        assert!(start.elapsed() < 2 * LIMIT, "nobody killed this process");
     }
 }
 
@@ -271,7 +273,7 @@ fn a_killed_process_loses_less_than_a_second() {
         let last = entries.last().map_or(killed - milliseconds * 1_000_000, |entry| entry.log_time_ns);
         let lost_ms = killed.saturating_sub(last) / 1_000_000;
         eprintln!("killed after {milliseconds} ms: {} messages restored, the last {lost_ms} ms lost", entries.len());
-        assert!(lost_ms < 1000);
+        program::promised("what a kill loses", Duration::from_millis(lost_ms), Duration::from_secs(1));
         assert!(restored.path.parent().unwrap().join("metadata.yaml").exists());
         assert_eq!(Recording::open(&restored.path).unwrap().attachments().len(), 2);
     }
@@ -386,9 +388,7 @@ fn a_full_disk_stops_nobody_and_is_told() {
     let wait = |wanted: fn(&State) -> bool, seq: &mut u64| {
         let deadline = Instant::now() + LIMIT;
         while !wanted(&recorder.status().state) {
-            let before = Instant::now();
             assert!(recorder.record(prediction(*seq, T0 + *seq * 1000)));
-            assert!(before.elapsed() < Duration::from_millis(200), "recording never waits");
             *seq += 1;
             std::thread::sleep(Duration::from_micros(200));
             assert!(Instant::now() < deadline, "{:?}", recorder.status());
@@ -441,6 +441,57 @@ fn a_full_disk_stops_nobody_and_is_told() {
     let config = RecorderConfig { disk, ..RecorderConfig::new(empty.path()) };
     assert!(matches!(Recorder::start(config), Err(RecorderError::Write(_))));
     assert_eq!(fs::read_dir(empty.path()).unwrap().count(), 0);
+}
+
+/// A disk on which a write ends only once it is let go on.
+#[derive(Debug, Default)]
+struct HangingDisk {
+    hangs: Mutex<bool>,
+    goes_on: Condvar,
+}
+
+impl HangingDisk {
+    fn hang(&self, hangs: bool) {
+        *self.hangs.lock().unwrap() = hangs;
+        self.goes_on.notify_all();
+    }
+}
+
+impl Disk for HangingDisk {
+    fn write(&self, file: &File, bytes: &[u8]) -> io::Result<usize> {
+        drop(self.goes_on.wait_while(self.hangs.lock().unwrap(), |hangs| *hangs).unwrap());
+        FileSystem.write(file, bytes)
+    }
+
+    fn free_bytes(&self, path: &Path) -> io::Result<u64> {
+        FileSystem.free_bytes(path)
+    }
+}
+
+/// Recording never waits: the disk hangs until more was recorded than the queue holds, and all of that by one thread.
+#[test]
+fn a_disk_that_hangs_holds_nobody_up() {
+    let temp = TempDir::new().unwrap();
+    let disk = Arc::new(HangingDisk::default());
+    let config = RecorderConfig {
+        disk: Arc::clone(&disk) as Arc<dyn Disk>,
+        flush_interval: Duration::from_millis(10),
+        ..config(temp.path())
+    };
+    let recorder = Recorder::start(config).unwrap();
+    recorder.record(rig_info());
+    disk.hang(true);
+    let mut taken = 1;
+    let mut seq = 0;
+    // Were it to wait, nobody would let the disk go on.
+    while recorder.record(point(seq, T0 + seq * 1000)) {
+        (taken, seq) = (taken + 1, seq + 1);
+        assert!(seq < 10_000_000, "the queue has no bound");
+    }
+    disk.hang(false);
+    let finished = recorder.finish(LIMIT).unwrap();
+    assert_eq!((finished.status.messages_written, finished.status.dropped_queue_full), (taken, 1));
+    assert!(sequence_numbers(&read(&finished.directory)).into_iter().eq(0..seq), "not those that were taken");
 }
 
 #[test]

@@ -2,30 +2,15 @@
 //! value and limit; and no bytes at all that make a reader panic.
 #![cfg(feature = "node")]
 
+mod program;
+
 use std::io::{Cursor, Write};
 
-use npyz::WriterBuilder;
 use npyz::zip::write::FileOptions;
+use program::{npz_bytes, rig_file as file};
 use proptest::prelude::*;
 use squealcast::physics::{Law, OperatingPoint};
 use squealcast::rig::{Rig, RigError, RigFile, matrix_market, npz, scale};
-
-fn file(name: &str, bytes: impl Into<Vec<u8>>) -> RigFile {
-    RigFile { name: name.to_owned(), bytes: bytes.into() }
-}
-
-fn npz_bytes(arrays: &[(&str, &[u64], &[f64])]) -> Vec<u8> {
-    let mut bytes = Cursor::new(vec![]);
-    let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
-    for (name, shape, values) in arrays {
-        let array = archive.array(name, FileOptions::default()).unwrap();
-        let mut writer = array.default_dtype().shape(shape).begin_nd().unwrap();
-        writer.extend(values.iter().copied()).unwrap();
-        writer.finish().unwrap();
-    }
-    drop(archive);
-    bytes.into_inner()
-}
 
 /// One mode at some nodes.
 fn side(nodes: &[f64]) -> Vec<u8> {
@@ -262,7 +247,7 @@ fn bad_files_of_kind_3() {
     );
     told!(
         system("x", "x", UNIT, &UNIT.replace("1 1 1", "1 1 nan")),
-        RigError::MatrixMarket { line: 3, .. },
+        RigError::Line { line: 3, .. },
         "K.mtx, line 3: value is `nan`; expected a finite number"
     );
     // A header that claims a great many rows asks for no memory.

@@ -1,22 +1,14 @@
 //! What rig files become: closed forms, the published nine-degree-of-freedom table, the real brake, modal substructures.
 #![cfg(feature = "node")]
 
-use std::io::Cursor;
+mod program;
+
 use std::path::PathBuf;
 
 use faer::{Mat, c64};
-use npyz::WriterBuilder;
-use npyz::zip::write::FileOptions;
+use program::{launch, npz_bytes, rig_file as file};
 use squealcast::physics::OperatingPoint;
 use squealcast::rig::{EMBEDDED, Rig, RigFile};
-
-fn file(name: &str, bytes: impl Into<Vec<u8>>) -> RigFile {
-    RigFile { name: name.to_owned(), bytes: bytes.into() }
-}
-
-fn launch(name: &str) -> String {
-    format!("{}/launch/rigs/{name}", env!("CARGO_MANIFEST_DIR"))
-}
 
 fn matrices(rig: &Rig, p: &OperatingPoint) -> (Mat<f64>, Mat<f64>) {
     let n = rig.model.dimension();
@@ -257,21 +249,6 @@ fn the_real_brake_in_150_modes() {
     }
 }
 
-type ArrayOf<'a> = (&'a str, &'a [u64], Vec<f64>);
-
-fn npz_bytes(arrays: &[ArrayOf<'_>]) -> Vec<u8> {
-    let mut bytes = Cursor::new(vec![]);
-    let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
-    for (name, shape, values) in arrays {
-        let array = archive.array(name, FileOptions::default()).unwrap();
-        let mut writer = array.default_dtype().shape(shape).begin_nd().unwrap();
-        writer.extend(values.iter().copied()).unwrap();
-        writer.finish().unwrap();
-    }
-    drop(archive);
-    bytes.into_inner()
-}
-
 /// A mode shape linear in position: whatever interpolation is exact for linear fields gives the same contact rows.
 fn shape(node: &[f64; 3], mode: usize, sign: f64) -> [f64; 3] {
     let m = mode as f64 + 1.0;
@@ -280,13 +257,14 @@ fn shape(node: &[f64; 3], mode: usize, sign: f64) -> [f64; 3] {
 
 fn side(nodes: &[[f64; 3]], omega: [f64; 2], sign: f64) -> Vec<u8> {
     let count = nodes.len() as u64;
-    let phi = nodes
+    let phi: Vec<f64> = nodes
         .iter()
-        .flat_map(|node| (0..3).flat_map(move |axis| (0..2).map(move |mode| shape(node, mode, sign)[axis])));
+        .flat_map(|node| (0..3).flat_map(move |axis| (0..2).map(move |mode| shape(node, mode, sign)[axis])))
+        .collect();
     npz_bytes(&[
-        ("omega_rad_s", &[2], omega.to_vec()),
-        ("phi", &[count, 3, 2], phi.collect()),
-        ("nodes_m", &[count, 3], nodes.iter().flatten().copied().collect()),
+        ("omega_rad_s", &[2], &omega),
+        ("phi", &[count, 3, 2], &phi),
+        ("nodes_m", &[count, 3], nodes.as_flattened()),
     ])
 }
 

@@ -1,18 +1,29 @@
 use clap::Args;
 
 use super::{Outcome, print};
-use crate::rig::Rig;
+use crate::full_model::FullModelFile;
+use crate::rig::{Rig, RigError};
 
-/// Validate a rig file and say what it holds
+/// Validate a rig file or a full model and say what it holds
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Rig file, or the name of an embedded rig
+    /// Rig file, full model, or the name of an embedded rig
     rig: String,
 }
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        print(&format!("{}\n", Rig::load(&self.rig)?.describe()))?;
+        let path = std::path::Path::new(&self.rig);
+        let described = if FullModelFile::is_one(path) {
+            FullModelFile::load(path)?.describe()
+        } else {
+            match Rig::load(&self.rig) {
+                // A system too large to be a rig as it stands.
+                Err(RigError::Range { field, .. }) if field == "system.modes" => FullModelFile::load(path)?.describe(),
+                rig => rig?.describe(),
+            }
+        };
+        print(&format!("{described}\n"))?;
         Ok(Outcome::Done)
     }
 }

@@ -8,17 +8,24 @@ mod critical;
 mod demo;
 mod display;
 mod format;
+mod full;
+mod identify;
 mod import;
 mod live;
+mod on_basis;
 mod predict;
 mod recover;
+mod reduce;
 mod replay;
 mod report;
+mod reproduce;
 mod run;
 mod signals;
 mod simulate;
+mod steps;
 mod sweep;
 mod tribometer;
+mod verify;
 mod view;
 
 use std::io::Write;
@@ -53,8 +60,13 @@ enum Command {
     Import(import::Options),
     Recover(recover::Options),
     Check(check::Options),
+    Identify(identify::Options),
     Bench(bench::Options),
     Tribometer(tribometer::Options),
+    Reduce(reduce::Options),
+    Full(full::Options),
+    Verify(verify::Options),
+    Reproduce(reproduce::Options),
     Completions(completions::Options),
 }
 
@@ -90,8 +102,13 @@ pub fn main() -> ExitCode {
         Command::Sweep(options) => options.run(),
         Command::Critical(options) => options.run(),
         Command::Check(options) => options.run(),
+        Command::Identify(options) => options.run(),
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),
+        Command::Reduce(options) => options.run(),
+        Command::Full(options) => options.run(),
+        Command::Verify(options) => options.run(),
+        Command::Reproduce(options) => options.run(),
         Command::Completions(options) => options.run(),
     };
     match result {

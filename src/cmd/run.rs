@@ -10,6 +10,7 @@ use crossbeam_channel::{Receiver, Sender};
 use super::buses::BusOptions;
 use super::display::{self, DisplayOptions, ThresholdOption};
 use super::{Outcome, live, signals};
+use crate::display::server::Server;
 use crate::io::chart_file::ChartFile;
 use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig};
@@ -81,6 +82,9 @@ pub fn serve(
     listening: Listening,
     (sender, receiver): (Sender<Incoming>, Receiver<Incoming>),
 ) -> anyhow::Result<Outcome> {
+    if let Some(known) = &rig.reduction {
+        eprintln!("{}", known.told());
+    }
     let mut initial = Settings::for_rig(rig);
     let addresses = options.display.addresses()?;
     let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
@@ -128,7 +132,7 @@ pub fn serve(
     signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let watch = Watch::default();
     let display = display::of_node(&addresses, rig, &watch, options.threshold);
-    let shown = live::show(frame(rig, sender.clone()), watch.clone(), options.plain);
+    let shown = live::show(frame(rig, display.as_ref(), sender.clone()), watch.clone(), options.plain);
     let node = Node::new(rig.clone(), initial, outputs, sender.clone(), watch).with_shortcut(&shortcut);
     let kept = || ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);
     let kept = if options.no_chart_cache { None } else { kept() };
@@ -142,10 +146,12 @@ pub fn serve(
     outcome
 }
 
-/// What is around the table of a node for `rig`.
-fn frame(rig: &Rig, node: Sender<Incoming>) -> live::Frame {
+/// What is around the table of a node for `rig`; what was said before it is covered by it, so that it says again where
+/// the page is.
+fn frame(rig: &Rig, display: Option<&Server>, node: Sender<Incoming>) -> live::Frame {
+    let page = display.map(|display| format!("  http://{}/", display.address()));
     live::Frame {
-        title: rig.name.clone(),
+        title: format!("{}{}", rig.name, page.unwrap_or_default()),
         instability_threshold: rig.instability_threshold,
         foot: Box::new(|snapshot| {
             let Counters { solved, charted, reused, faults, .. } = snapshot.counters;

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 
 use serde::{Serialize, Serializer};
 
+use super::events::seconds;
 use crate::node::{SAMPLE_MODES, Sample, UnstableMode, VibrationSample};
 
 /// Quantities with a range in every bin, in the order of [`Bin::ranges`].
@@ -126,6 +127,17 @@ impl History {
     /// All bins, oldest first.
     pub fn bins(&self) -> &VecDeque<Bin> {
         &self.bins
+    }
+
+    /// All of it as JSON, written as it is read: a tree of it would take many times the memory.
+    pub fn to_json(&self) -> String {
+        #[derive(Serialize)]
+        struct Whole<'a> {
+            bin_s: f64,
+            bins: &'a VecDeque<Bin>,
+        }
+        // Numbers only: nothing that JSON cannot hold.
+        serde_json::to_string(&Whole { bin_s: seconds(self.bin_ns), bins: &self.bins }).unwrap_or_default()
     }
 
     /// The bins from `index` on.

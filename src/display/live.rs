@@ -142,9 +142,9 @@ impl Source for Live {
     }
 
     fn history(&self) -> String {
+        // Written from a copy: the next state does not wait for it.
         let history = self.followed().history.clone();
-        serde_json::to_string(&serde_json::json!({ "bin_s": seconds(BIN_NS), "bins": history.bins() }))
-            .unwrap_or_default()
+        history.to_json()
     }
 
     fn events(&self) -> Events {

@@ -242,8 +242,7 @@ impl Source for Recorded {
     }
 
     fn history(&self) -> String {
-        let bin_s = seconds(self.history.bin_ns());
-        serde_json::to_string(&serde_json::json!({ "bin_s": bin_s, "bins": self.history.bins() })).unwrap_or_default()
+        self.history.to_json()
     }
 
     fn events(&self) -> Events {

@@ -6,18 +6,17 @@ use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
 use super::events::{Event, Events, iso, seconds};
 use super::recorded::Recorded;
+use crate::html::{escaped, figure, page, section};
 use crate::plot;
 use crate::wire::{SessionEvent, event_kind, level};
 
-/// Moments whose stability map is drawn.
+/// Stability maps drawn.
 const WORST: usize = 3;
 /// Events listed; the rest is in the CSV file.
 const LISTED: usize = 500;
 
 /// Settings of the first moment are those the session starts with, s.
 const STARTING_S: f64 = 0.5;
-
-const STYLE: &str = include_str!("assets/report.css");
 
 /// What the report says about where its recording came from.
 #[derive(Clone, Debug)]
@@ -34,21 +33,13 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     let rig = &recorded.rig;
     let (from_s, to_s) = recorded.span_s().unwrap_or((0.0, 0.0));
     let title = format!("{}, {}", rig.name, iso(from_s));
-    let mut html = format!(
-        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\n\
-         <title>squealcast report: {}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n",
-        escaped(&title)
-    );
-    let _ = write!(html, "<h1>Session report</h1>\n<p class=\"lead\">{}</p>\n", escaped(&title));
+    let mut html = format!("<h1>Session report</h1>\n<p class=\"lead\">{}</p>\n", escaped(&title));
     html += &verdict(&recorded.events, to_s);
     html += &section("Session", &session(recorded, origin, from_s, to_s));
-    let figure = |svg: &str, caption: &str| format!("<figure>{svg}<figcaption>{caption}</figcaption></figure>\n");
     html += &section(
         "Conditions and predictions",
         &figure(
-            &inline(&plot::history("", &recorded.history, from_s, recorded.vibration.criteria().threshold_db)?),
+            &plot::history("", &recorded.history, from_s, recorded.vibration.criteria().threshold_db)?,
             "Smallest and largest value in each stretch of time; shaded where squeal was predicted. Dots are \
              frequencies at which squeal was measured.",
         ),
@@ -64,9 +55,15 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     html += &section("Prediction against measurement", &measured);
     html += &section("Maps, charts and settings during the session", &session_events(recorded, from_s));
     let mut maps = String::new();
+    let mut drawn = vec![];
     for event in worst(&recorded.events) {
         let at_s = event.onset_s;
         let number = recorded.map_number(event.end_s.unwrap_or(at_s)).max(1);
+        // One figure of each map, at its worst moment.
+        if drawn.len() == WORST || drawn.contains(&number) {
+            continue;
+        }
+        drawn.push(number);
         let Some(map) = recorded.stability_map(number) else { continue };
         let curves = Curves::new(&map, rig.band_max_hz);
         let caption = format!(
@@ -82,7 +79,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         let last = curves.mu.last().copied().unwrap_or(1.0);
         let wanted = [1.6 * curves.critical_friction.unwrap_or(last), 1.15 * mu, 0.05];
         let to = wanted.into_iter().filter(|mu| mu.is_finite()).fold(0.0, f64::max).min(last);
-        maps += &figure(&inline(&plot::map("", &curves, to, Some(mu))?), &escaped(&caption));
+        maps += &figure(&plot::map("", &curves, to, Some(mu))?, &escaped(&caption));
     }
     if maps.is_empty() {
         maps = "<p>No squeal was predicted.</p>\n".to_owned();
@@ -91,12 +88,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     html += &section("Error bounds", &error_bounds(recorded));
     html += &section("Skipped work and damage", &skipped(recorded));
     html += &section("Rig", &format!("<pre>{}</pre>\n", escaped(&rig.describe())));
-    html += "</main>\n</body>\n</html>\n";
-    Ok(html)
-}
-
-fn section(title: &str, body: &str) -> String {
-    format!("<section>\n<h2>{title}</h2>\n{body}</section>\n")
+    Ok(page(&format!("squealcast report: {title}"), &html))
 }
 
 /// One sentence for who reads no further.
@@ -307,11 +299,10 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
     html
 }
 
-/// The events of the fastest growth.
+/// The events that grow, the fastest first.
 fn worst(events: &Events) -> Vec<&Event> {
     let mut squeals: Vec<&Event> = events.iter().filter(|event| event.growth_rate_per_s.is_some()).collect();
     squeals.sort_by(|a, b| b.growth_rate_per_s.unwrap_or(0.0).total_cmp(&a.growth_rate_per_s.unwrap_or(0.0)));
-    squeals.truncate(WORST);
     squeals
 }
 
@@ -340,7 +331,11 @@ fn error_bounds(recorded: &Recorded) -> String {
                     <th>growth rate, ± 1/s</th></tr></thead><tbody>\n"
         .to_owned();
     for (id, [residual, frequency, growth]) in &bounds {
-        let shown = |value: f64| if value.is_finite() { format!("{value:.2e}") } else { "not computed".to_owned() };
+        let shown = |value: f64| match value {
+            0.0 => "0".to_owned(),
+            _ if value.is_finite() => format!("{value:.2e}"),
+            _ => "not computed".to_owned(),
+        };
         let cells = [id.to_string(), shown(*residual), shown(*frequency), shown(*growth)];
         let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
         let _ = writeln!(html, "<tr>{cells}</tr>");
@@ -368,11 +363,6 @@ fn skipped(recorded: &Recorded) -> String {
     html
 }
 
-/// A figure without the declaration a file of its own would have.
-fn inline(svg: &str) -> String {
-    svg.find("<svg").map_or(svg, |start| &svg[start..]).to_owned()
-}
-
 /// A number with six significant digits at most.
 fn number(value: f64) -> String {
     if !value.is_finite() {
@@ -387,21 +377,15 @@ fn number(value: f64) -> String {
     }
 }
 
-/// Text that is no markup.
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn numbers_and_text_are_written_for_html() {
+    fn numbers_are_written_for_people() {
         assert_eq!(number(0.334_599_12), "0.334599");
         assert_eq!(number(500.0), "500");
         assert_eq!(number(1234567.0), "1234567");
         assert_eq!(number(f64::NAN), "–");
-        assert_eq!(escaped("<a href=\"x\">&"), "&lt;a href=&quot;x&quot;&gt;&amp;");
     }
 }

@@ -7,6 +7,7 @@ pub mod critical;
 mod dense_eigen;
 pub mod ends;
 mod flexible_contact;
+pub mod identification;
 pub mod model;
 pub mod operating_point;
 pub mod reference;

@@ -1,5 +1,7 @@
 //! Why a model could not be reduced.
 
+use crate::physics::SolveError;
+
 /// Bytes in a GiB.
 const GIB: f64 = (1_u64 << 30) as f64;
 
@@ -34,13 +36,26 @@ pub enum ReductionError {
     MissedModes { what: String, found: usize, counted: usize, below: f64 },
     #[error("{what}: mode {mode} has |K phi - omega^2 M phi| = {value:.3e} of its parts, limit {limit:.1e}")]
     Residual { what: String, mode: usize, value: f64, limit: f64 },
+    #[error(
+        "{what}: the root {growth_per_s:e} + {omega_rad_s:e}i found around {found:e} rad/s was not found around \
+         {missed:e} rad/s"
+    )]
+    MissedRoot { what: String, growth_per_s: f64, omega_rad_s: f64, found: f64, missed: f64 },
     #[error("{what}: shifts covered the band up to {covered:.6e} rad/s only, expected {band:.6e} rad/s")]
     NotCovered { what: String, covered: f64, band: f64 },
     #[error(
-        "{what}: its modes need {:.2} GiB of memory, more than the {:.2} GiB allowed",
+        "{what}: it needs {:.2} GiB of memory, more than the {:.2} GiB allowed",
         *bytes as f64 / GIB, *limit as f64 / GIB
     )]
     Memory { what: String, bytes: usize, limit: usize },
+    #[error("{what} is {low} to {high}, expected {limit}")]
+    Range { what: String, low: f64, high: f64, limit: String },
+    #[error(
+        "{what}: |dlambda|/|lambda| is {value:.1e} with {vectors} vectors from {samples} operating points, limit {limit:.1e}"
+    )]
+    Tolerance { what: String, value: f64, limit: f64, vectors: usize, samples: usize },
+    #[error("{what}: {source}")]
+    Solve { what: String, source: Box<SolveError> },
     #[error("{what}: {reason}")]
     Factorisation { what: String, reason: String },
 }

@@ -8,7 +8,7 @@ use faer::Mat;
 
 use super::dense::{fix_signs, symmetric_eigen};
 use super::lanczos::{Iteration, capacity};
-use super::pencil::Pencil;
+use super::pencil::{Llt, Pencil};
 use super::sparse::{entries, one_norm, times};
 use super::{ReductionError, SparseMatrix, whiten};
 
@@ -20,6 +20,9 @@ const BACKWARD_LIMIT: f64 = 1e-12;
 const GAP: f64 = 1e-7;
 /// Below this many degrees of freedom a dense solve is at least as fast.
 const DENSE_BELOW: usize = 400;
+/// The first shift that is tried, and the largest, relative to `tr K / tr M`.
+const FIRST_SHIFT: f64 = 1e-8;
+const LARGEST_SHIFT: f64 = 1e5;
 /// Above this ratio of `θ` the shift is moved: small `θ` would drown in the rounding of the largest.
 const WIDEST_SPREAD: f64 = 1e6;
 
@@ -30,11 +33,15 @@ pub enum Wanted {
     Lowest(usize),
     /// Every one with `ω` below this, rad/s.
     Below(f64),
+    /// The same, as many as [`Analysed::count_below`] counted.
+    Counted { modes: usize, below_rad_s: f64 },
 }
 
 /// What a computation of modes is doing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Progress {
+    /// The system is being ordered and analysed.
+    Analysing,
     /// Ordered and analysed: the numbers in a factor and the bytes that will be needed in all.
     Analysed { factor_entries: usize, bytes: usize },
     /// `K + s M` is factored, `s` in rad²/s².
@@ -87,69 +94,128 @@ pub fn normal_modes(
     memory_limit_bytes: Option<usize>,
     progress: &mut dyn FnMut(Progress),
 ) -> Result<SparseModes, ReductionError> {
-    let pencil = Pencil::new(what, mass, stiffness)?;
-    let n = pencil.dimension();
-    let told = |count: usize| {
-        let (factor, vectors) = (pencil.factor_bytes(), size_of::<f64>() * n * (capacity(n, count) + count));
-        Progress::Analysed { factor_entries: pencil.factor_entries(), bytes: pencil.held_bytes() + factor + vectors }
-    };
-    let check = |analysed: Progress| match (analysed, memory_limit_bytes) {
-        (Progress::Analysed { bytes, .. }, Some(limit)) if bytes > limit => {
-            Err(ReductionError::Memory { what: what.to_owned(), bytes, limit })
-        }
-        _ => Ok(()),
-    };
-    // Without a count, the factor alone tells whether counting is possible.
-    let analysed = told(if let Wanted::Lowest(count) = wanted { count } else { 0 });
-    progress(analysed);
-    check(analysed)?;
-    let count = match wanted {
-        Wanted::Lowest(count) => count,
-        Wanted::Below(omega_rad_s) => {
-            let below = omega_rad_s * omega_rad_s;
-            let modes = pencil.count_below(below)?;
-            progress(Progress::Counted { modes, below });
-            progress(told(modes));
-            check(told(modes))?;
-            modes
-        }
-    };
-    if count == 0 || count > n {
-        let value = match wanted {
-            Wanted::Lowest(count) => format!("{count} modes"),
-            Wanted::Below(omega_rad_s) => format!("modes below {omega_rad_s} rad/s (there is none)"),
+    Analysed::new(what, mass, stiffness)?.modes(wanted, memory_limit_bytes, progress)
+}
+
+/// A sparse symmetric system `K - σ M`, checked, ordered and analysed: ready for its modes and what they leave out.
+pub struct Analysed<'a> {
+    pub(super) pencil: Pencil<'a>,
+}
+
+impl<'a> Analysed<'a> {
+    /// Analyses a system; see [`normal_modes`].
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `Factorisation`.
+    pub fn new(what: &'a str, mass: &'a SparseMatrix, stiffness: &'a SparseMatrix) -> Result<Self, ReductionError> {
+        Ok(Self { pencil: Pencil::new(what, mass, stiffness)? })
+    }
+
+    /// Bytes that are held already: both matrices as they came, and their lower triangles here.
+    pub fn held_bytes(&self) -> usize {
+        self.pencil.held_bytes()
+    }
+
+    /// Bytes that `count` modes need beside that: the factor and the vectors of the iteration.
+    pub fn bytes_for(&self, count: usize) -> usize {
+        let n = self.pencil.dimension();
+        self.pencil.factor_bytes() + size_of::<f64>() * n * (capacity(n, count) + count)
+    }
+
+    /// Numbers the factor holds.
+    pub fn factor_entries(&self) -> usize {
+        self.pencil.factor_entries()
+    }
+
+    /// How many modes lie below `omega_rad_s`, by the inertia of `K - ω² M`.
+    ///
+    /// # Errors
+    /// [`ReductionError::Factorisation`].
+    pub fn count_below(&self, omega_rad_s: f64) -> Result<usize, ReductionError> {
+        self.pencil.count_below(omega_rad_s * omega_rad_s)
+    }
+
+    /// The lowest modes; see [`normal_modes`].
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `ModeCount`, `Memory`, `NoShift`, `NotConverged`, `Residual`, `MissedModes`, `Factorisation`.
+    pub fn modes(
+        &self,
+        wanted: Wanted,
+        memory_limit_bytes: Option<usize>,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<SparseModes, ReductionError> {
+        let pencil = &self.pencil;
+        let (what, n) = (pencil.what, pencil.dimension());
+        let told = |count: usize| Progress::Analysed {
+            factor_entries: self.factor_entries(),
+            bytes: self.held_bytes() + self.bytes_for(count),
         };
-        let limit = format!("1 to {n} modes");
-        return Err(ReductionError::ModeCount { what: format!("{what}.modes"), value, limit });
-    }
-    let cutoff = match wanted {
-        Wanted::Lowest(_) => None,
-        Wanted::Below(omega_rad_s) => Some(omega_rad_s * omega_rad_s),
-    };
-    if n < DENSE_BELOW || 3 * count > n {
-        return finish(&pencil, dense(&pencil, count)?);
-    }
-    let mut shift = positive_definite_shift(&pencil)?;
-    for attempt in 0.. {
-        let found = shifted(&pencil, shift, count, cutoff, attempt as u64, progress)?;
-        let squares = &found.omega_squared;
-        let spread = (squares[count - 1] + shift) / (squares[0] + shift);
-        if spread > WIDEST_SPREAD && attempt == 0 {
-            shift = squares[count - 1] / WIDEST_SPREAD.sqrt();
-            continue;
-        }
-        let counted = match cutoff {
-            Some(below) => complete_below_cutoff(&pencil, squares, count, below),
-            None => complete_below_gap(&pencil, squares, count, progress),
+        let check = |analysed: Progress| match (analysed, memory_limit_bytes) {
+            (Progress::Analysed { bytes, .. }, Some(limit)) if bytes > limit => {
+                Err(ReductionError::Memory { what: what.to_owned(), bytes, limit })
+            }
+            _ => Ok(()),
         };
-        match counted {
-            Ok(()) => return finish(&pencil, found.first(count)),
-            // Another start vector, before giving up.
-            Err(ReductionError::MissedModes { .. }) if attempt < 3 => {}
-            Err(error) => return Err(error),
+        // Without a count, the factor alone tells whether counting is possible.
+        let analysed = told(match wanted {
+            Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
+            Wanted::Below(_) => 0,
+        });
+        progress(analysed);
+        check(analysed)?;
+        let count = match wanted {
+            Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
+            Wanted::Below(omega_rad_s) => {
+                let modes = self.count_below(omega_rad_s)?;
+                progress(Progress::Counted { modes, below: omega_rad_s * omega_rad_s });
+                progress(told(modes));
+                check(told(modes))?;
+                modes
+            }
+        };
+        if count == 0 || count > n {
+            let value = match wanted {
+                Wanted::Lowest(count) => format!("{count} modes"),
+                Wanted::Below(omega_rad_s) | Wanted::Counted { below_rad_s: omega_rad_s, .. } => {
+                    format!("modes below {omega_rad_s} rad/s (there is none)")
+                }
+            };
+            let limit = format!("1 to {n} modes");
+            return Err(ReductionError::ModeCount { what: format!("{what}.modes"), value, limit });
         }
+        let cutoff = match wanted {
+            Wanted::Lowest(_) => None,
+            Wanted::Below(omega_rad_s) | Wanted::Counted { below_rad_s: omega_rad_s, .. } => {
+                Some(omega_rad_s * omega_rad_s)
+            }
+        };
+        if n < DENSE_BELOW || 3 * count > n {
+            return finish(pencil, dense(pencil, count)?);
+        }
+        let mut shift = typical_square(pencil) * FIRST_SHIFT;
+        for attempt in 0.. {
+            let (found, used) = shifted(pencil, shift, count, cutoff, attempt as u64, progress)?;
+            shift = used;
+            let squares = &found.omega_squared;
+            let spread = (squares[count - 1] + shift) / (squares[0] + shift);
+            if spread > WIDEST_SPREAD && attempt == 0 {
+                shift = squares[count - 1] / WIDEST_SPREAD.sqrt();
+                continue;
+            }
+            let counted = match cutoff {
+                Some(below) => complete_below_cutoff(pencil, squares, count, below),
+                None => complete_below_gap(pencil, squares, count, progress),
+            };
+            match counted {
+                Ok(()) => return finish(pencil, found.first(count)),
+                // Another start vector, before giving up.
+                Err(ReductionError::MissedModes { .. }) if attempt < 3 => {}
+                Err(error) => return Err(error),
+            }
+        }
+        unreachable!("the loop ends by returning");
     }
-    unreachable!("the loop ends by returning");
 }
 
 /// Modes before their residuals are known.
@@ -164,14 +230,19 @@ impl Found {
     }
 }
 
-/// The smallest of a few shifts that make `K + s M` positive definite, rad²/s².
-fn positive_definite_shift(pencil: &Pencil<'_>) -> Result<f64, ReductionError> {
+/// `tr K / tr M`, rad²/s².
+fn typical_square(pencil: &Pencil<'_>) -> f64 {
     let trace = |matrix: &SparseMatrix| entries(matrix).filter(|e| e.0 == e.1).map(|e| e.2.abs()).sum::<f64>();
-    let typical = (trace(pencil.stiffness) / trace(pencil.mass)).max(f64::MIN_POSITIVE);
-    let mut shift = typical * 1e-8;
-    while shift < typical * 1e5 {
-        if pencil.llt(shift)?.is_some() {
-            return Ok(shift);
+    (trace(pencil.stiffness) / trace(pencil.mass)).max(f64::MIN_POSITIVE)
+}
+
+/// `K + s M = L Lᵀ` with the smallest of a few `s` from `first` on for which it is positive definite.
+fn factor_from<'p>(pencil: &'p Pencil<'_>, first: f64) -> Result<(Llt<'p>, f64), ReductionError> {
+    let most = typical_square(pencil) * LARGEST_SHIFT;
+    let mut shift = first;
+    while shift < most {
+        if let Some(factor) = pencil.llt(shift)? {
+            return Ok((factor, shift));
         }
         shift *= 100.0;
     }
@@ -188,18 +259,18 @@ fn dense(pencil: &Pencil<'_>, count: usize) -> Result<Found, ReductionError> {
     Ok(Found { omega_squared: squares[..count].to_vec(), phi })
 }
 
-/// Converged modes by Lanczos on `L⁻¹ M L⁻ᵀ`: `count` of them, and some more up to a gap where no cut-off is given.
+/// Converged modes by Lanczos on `L⁻¹ M L⁻ᵀ`: `count` of them, and some more up to a gap where no cut-off is given; and
+/// the shift, which is `first` or more.
 fn shifted(
     pencil: &Pencil<'_>,
-    shift: f64,
+    first: f64,
     count: usize,
     cutoff: Option<f64>,
     seed: u64,
     progress: &mut dyn FnMut(Progress),
-) -> Result<Found, ReductionError> {
+) -> Result<(Found, f64), ReductionError> {
     let n = pencil.dimension();
-    let no_shift = || ReductionError::NoShift { what: pencil.what.to_owned(), value: shift };
-    let factor = pencil.llt(shift)?.ok_or_else(no_shift)?;
+    let (factor, shift) = factor_from(pencil, first)?;
     progress(Progress::Factored { shift });
     let square = |theta: f64| 1.0 / theta - shift;
     let iteration = Iteration {
@@ -226,7 +297,7 @@ fn shifted(
     for (k, theta) in largest.theta.iter().enumerate() {
         phi.col_mut(k).iter_mut().for_each(|value| *value /= theta.sqrt());
     }
-    Ok(Found { omega_squared: largest.theta.into_iter().map(square).collect(), phi })
+    Ok((Found { omega_squared: largest.theta.into_iter().map(square).collect(), phi }, shift))
 }
 
 /// Compares the modes found below a gap with the inertia of `K - σ M` there.
@@ -374,6 +445,28 @@ mod tests {
         let modes = lowest_modes("system", &mass, &stiffness, 25).unwrap();
         for (found, expected) in modes.omega_squared.iter().zip(&expected) {
             assert!((found / expected - 1.0).abs() < 1e-12);
+        }
+    }
+
+    /// Every other point without inertia of its own against its neighbour's: `M = [1 1; 1 1]` in pairs. Condensed by hand,
+    /// `M` acts on the sum of a pair alone: `K⁻¹ M` and its projection on the sums have the same eigenvalues `1/ω²`.
+    #[test]
+    fn a_semidefinite_mass_has_as_many_modes_as_its_rank() {
+        let (_, stiffness, _) = membrane(25, 1.0);
+        let n = 625;
+        let mut triplets = vec![];
+        for first in (0..n).step_by(2) {
+            let pair = if first + 1 < n { vec![first, first + 1] } else { vec![first] };
+            triplets.extend(pair.iter().flat_map(|&i| pair.iter().map(move |&j| Triplet::new(i, j, 1.0))));
+        }
+        let mass = SparseMatrix::try_new_from_triplets(n, n, &triplets).unwrap();
+        let found = lowest_modes("system", &mass, &stiffness, 20).unwrap();
+        let sums = Mat::from_fn(n, n.div_ceil(2), |i, j| if i / 2 == j { 1.0 } else { 0.0 });
+        let inverse = faer::linalg::solvers::Solve::solve(&stiffness.to_dense().partial_piv_lu(), &sums);
+        let condensed = sums.transpose() * inverse;
+        let (squares, _) = symmetric_eigen("condensed", condensed.as_ref()).unwrap();
+        for (square, inverse) in found.omega_squared.iter().zip(squares.iter().rev()) {
+            assert!((square * inverse - 1.0).abs() < 1e-10, "{square} {inverse}");
         }
     }
 

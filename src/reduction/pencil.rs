@@ -1,7 +1,12 @@
 //! `K - σ M` of a sparse symmetric system: analysed once, factored at many shifts.
 
+use std::sync::Arc;
+
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::LltError;
+use faer::linalg::matmul::matmul;
+use faer::linalg::triangular_solve::{solve_unit_lower_triangular_in_place, solve_unit_upper_triangular_in_place};
+use faer::perm::Perm;
 use faer::sparse::linalg::SupernodalThreshold;
 use faer::sparse::linalg::cholesky::supernodal::{SupernodalLdltRef, SupernodalLltRef, SymbolicSupernodalCholesky};
 use faer::sparse::linalg::cholesky::{
@@ -9,11 +14,11 @@ use faer::sparse::linalg::cholesky::{
     factorize_symbolic_cholesky,
 };
 use faer::sparse::{SparseColMat, SparseColMatRef, SymbolicSparseColMat};
-use faer::{Conj, Mat, MatMut, Par, Side};
+use faer::{Accum, Conj, Mat, MatMut, Par, Side};
 
 use super::ordering::nested_dissection;
 use super::sparse::{entries, worst_asymmetry};
-use super::{DEFINITE_TOLERANCE, ReductionError, SparseMatrix};
+use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
 
 /// Steps of the Lanczos recurrence that looks for the smallest eigenvalue of a scaled mass matrix.
 const MASS_STEPS: usize = 40;
@@ -28,7 +33,7 @@ pub(super) struct Pencil<'a> {
     pattern: SymbolicSparseColMat<usize>,
     lower_mass: Vec<f64>,
     lower_stiffness: Vec<f64>,
-    symbolic: SymbolicCholesky<usize>,
+    symbolic: Arc<SymbolicCholesky<usize>>,
 }
 
 impl<'a> Pencil<'a> {
@@ -37,6 +42,16 @@ impl<'a> Pencil<'a> {
         what: &'a str,
         mass: &'a SparseMatrix,
         stiffness: &'a SparseMatrix,
+    ) -> Result<Self, ReductionError> {
+        Self::with_last(what, mass, stiffness, &[])
+    }
+
+    /// The same with the rows `last` eliminated after all others, in that order.
+    pub(super) fn with_last(
+        what: &'a str,
+        mass: &'a SparseMatrix,
+        stiffness: &'a SparseMatrix,
+        last: &[usize],
     ) -> Result<Self, ReductionError> {
         let n = mass.nrows();
         check("mass", what, mass, n)?;
@@ -55,11 +70,7 @@ impl<'a> Pencil<'a> {
         }
         let pattern = SymbolicSparseColMat::new_checked(n, n, starts, None, rows);
         let failed = |reason| ReductionError::Factorisation { what: what.to_owned(), reason };
-        let order = nested_dissection(n, &|row, out: &mut Vec<usize>| {
-            out.clear();
-            merge(mass, stiffness, row, |other, _, _| out.push(other));
-        })
-        .map_err(failed)?;
+        let order = ordered(mass, stiffness, last).map_err(failed)?;
         let symbolic = factorize_symbolic_cholesky(
             pattern.as_ref(),
             Side::Lower,
@@ -70,6 +81,7 @@ impl<'a> Pencil<'a> {
             },
         )
         .map_err(|error| failed(format!("symbolic analysis failed: {error:?}")))?;
+        let symbolic = Arc::new(symbolic);
         let pencil = Self { what, mass, stiffness, pattern, lower_mass, lower_stiffness, symbolic };
         pencil.check_mass()?;
         Ok(pencil)
@@ -134,8 +146,12 @@ impl<'a> Pencil<'a> {
         }
     }
 
-    /// The pivots of `L D Lᵀ`, each with the row it belongs to.
-    fn pivots(&self, lower: &[f64]) -> Result<Vec<(usize, f64)>, ReductionError> {
+    /// `P (K - σ M) Pᵀ = L D Lᵀ`, without exchanging pivots: what it solves is to be checked.
+    pub(super) fn ldlt(&self, square: f64) -> Result<Ldlt, ReductionError> {
+        self.factor_ldlt(&self.sum(1.0, -square))
+    }
+
+    fn factor_ldlt(&self, lower: &[f64]) -> Result<Ldlt, ReductionError> {
         let mut values = self.room(self.symbolic.len_val())?;
         let mut memory =
             MemBuffer::new(self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default()));
@@ -150,19 +166,18 @@ impl<'a> Pencil<'a> {
                 Default::default(),
             )
             .map_err(|error| self.failed(format!("L D Lᵀ met a zero pivot: {error:?}")))?;
-        let forward = forward(&self.symbolic);
-        let supernodes = supernodal(&self.symbolic);
-        let factor = SupernodalLdltRef::new(supernodes, &values);
-        let mut pivots = Vec::with_capacity(self.dimension());
-        for s in 0..supernodes.n_supernodes() {
-            let (start, block) = (factor.supernode(s).start(), factor.supernode(s).val());
-            pivots.extend((0..block.ncols()).map(|k| (forward[start + k], block[(k, k)])));
-        }
-        Ok(pivots)
+        Ok(Ldlt { symbolic: self.symbolic.clone(), values })
     }
 
-    /// That `M` is positive definite. A mesh's mass matrix, scaled to a unit diagonal, has eigenvalues well away from
-    /// zero, which a short Lanczos recurrence shows; only where it does not, `M` is factored.
+    /// The pivots of `L D Lᵀ`, each with the row it belongs to.
+    fn pivots(&self, lower: &[f64]) -> Result<Vec<(usize, f64)>, ReductionError> {
+        let factor = self.factor_ldlt(lower)?;
+        Ok(forward(&self.symbolic).iter().copied().zip(factor.pivots()).collect())
+    }
+
+    /// That `M` is positive semidefinite with a positive diagonal. A mesh's mass matrix, scaled to a unit diagonal, has
+    /// eigenvalues well away from zero, which a short Lanczos recurrence shows; only where it does not, `M` is factored,
+    /// its diagonal raised by [`SEMIDEFINITE_TOLERANCE`]: CalculiX gives the inner modes of its bricks a singular mass.
     fn check_mass(&self) -> Result<(), ReductionError> {
         let what = format!("{}.mass", self.what);
         let diagonal: Vec<f64> =
@@ -173,13 +188,15 @@ impl<'a> Pencil<'a> {
         if smallest_scaled(self.mass, &diagonal).is_some_and(|smallest| smallest > CLEARLY_DEFINITE) {
             return Ok(());
         }
-        for (row, value) in self.pivots(&self.sum(0.0, 1.0))? {
-            let limit = DEFINITE_TOLERANCE * diagonal[row];
-            if value.is_nan() || value <= limit {
-                return Err(ReductionError::Indefinite { what, row, value, limit });
-            }
+        let mut raised = self.sum(0.0, 1.0);
+        for (column, &start) in self.pattern.col_ptr()[..self.dimension()].iter().enumerate() {
+            // The lower triangle of a column begins on its diagonal.
+            raised[start] += SEMIDEFINITE_TOLERANCE * diagonal[column];
         }
-        Ok(())
+        match self.pivots(&raised)?.into_iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
+            Some((row, value)) => Err(ReductionError::Indefinite { what, row, value, limit: 0.0 }),
+            None => Ok(()),
+        }
     }
 
     /// Zeros, if there is memory for them.
@@ -244,6 +261,113 @@ impl Llt<'_> {
         }
         x
     }
+}
+
+/// `P (K - σ M) Pᵀ = L D Lᵀ`; vectors are in the order of elimination.
+pub(super) struct Ldlt {
+    symbolic: Arc<SymbolicCholesky<usize>>,
+    values: Vec<f64>,
+}
+
+impl Ldlt {
+    fn supernodal(&self) -> SupernodalLdltRef<'_, usize, f64> {
+        SupernodalLdltRef::new(supernodal(&self.symbolic), &self.values)
+    }
+
+    /// The row that is eliminated at each position.
+    pub(super) fn order(&self) -> &[usize] {
+        forward(&self.symbolic)
+    }
+
+    /// `D`.
+    pub(super) fn pivots(&self) -> Vec<f64> {
+        let factor = self.supernodal();
+        let mut pivots = vec![0.0; self.symbolic.nrows()];
+        for s in 0..supernodal(&self.symbolic).n_supernodes() {
+            let (start, block) = (factor.supernode(s).start(), factor.supernode(s).val());
+            (0..block.ncols()).for_each(|k| pivots[start + k] = block[(k, k)]);
+        }
+        pivots
+    }
+
+    /// `L` of the `count` rows eliminated last, dense.
+    pub(super) fn trailing(&self, count: usize) -> Mat<f64> {
+        let first = self.symbolic.nrows() - count;
+        let factor = self.supernodal();
+        let mut lower = Mat::<f64>::identity(count, count);
+        for s in 0..supernodal(&self.symbolic).n_supernodes() {
+            let node = factor.supernode(s);
+            let (start, block, pattern) = (node.start(), node.val(), node.pattern());
+            for k in first.saturating_sub(start)..block.ncols() {
+                for i in k + 1..block.nrows() {
+                    let row = if i < block.ncols() { start + i } else { pattern[i - block.ncols()] };
+                    lower[(row - first, start + k - first)] = block[(i, k)];
+                }
+            }
+        }
+        lower
+    }
+
+    /// `L⁻¹ Z` in place.
+    pub(super) fn forward(&self, z: &mut Mat<f64>) {
+        let (factor, columns) = (self.supernodal(), z.ncols());
+        let mut below = Mat::<f64>::zeros(0, columns);
+        for s in 0..supernodal(&self.symbolic).n_supernodes() {
+            let node = factor.supernode(s);
+            let (start, block, pattern) = (node.start(), node.val(), node.pattern());
+            let (top, rest) = block.split_at_row(block.ncols());
+            let mut of_node = z.subrows_mut(start, block.ncols());
+            solve_unit_lower_triangular_in_place(top, of_node.as_mut(), Par::Seq);
+            below.resize_with(pattern.len(), columns, |_, _| 0.0);
+            matmul(below.as_mut(), Accum::Replace, rest, of_node.as_ref(), 1.0, Par::Seq);
+            for column in 0..columns {
+                let (from, to) = (below.col_as_slice(column), z.col_as_slice_mut(column));
+                pattern.iter().zip(from).for_each(|(&row, value)| to[row] -= value);
+            }
+        }
+    }
+
+    /// `L⁻ᵀ Z` in place.
+    pub(super) fn backward(&self, z: &mut Mat<f64>) {
+        let (factor, columns) = (self.supernodal(), z.ncols());
+        let mut below = Mat::<f64>::zeros(0, columns);
+        for s in (0..supernodal(&self.symbolic).n_supernodes()).rev() {
+            let node = factor.supernode(s);
+            let (start, block, pattern) = (node.start(), node.val(), node.pattern());
+            let (top, rest) = block.split_at_row(block.ncols());
+            below.resize_with(pattern.len(), columns, |_, _| 0.0);
+            for column in 0..columns {
+                let (from, to) = (z.col_as_slice(column), below.col_as_slice_mut(column));
+                pattern.iter().zip(to).for_each(|(&row, value)| *value = from[row]);
+            }
+            let mut of_node = z.subrows_mut(start, block.ncols());
+            matmul(of_node.as_mut(), Accum::Add, rest.transpose(), below.as_ref(), -1.0, Par::Seq);
+            solve_unit_upper_triangular_in_place(top.transpose(), of_node, Par::Seq);
+        }
+    }
+}
+
+/// The order of elimination: nested dissection of all rows but those that come last.
+fn ordered(mass: &SparseMatrix, stiffness: &SparseMatrix, last: &[usize]) -> Result<Perm<usize>, String> {
+    let n = mass.nrows();
+    let mut place = vec![0; n];
+    last.iter().for_each(|&row| place[row] = usize::MAX);
+    let others: Vec<usize> = (0..n).filter(|&row| place[row] != usize::MAX).collect();
+    others.iter().enumerate().for_each(|(position, &row)| place[row] = position);
+    let mut forward: Vec<usize> = if others.is_empty() {
+        vec![]
+    } else {
+        let order = nested_dissection(others.len(), &|position, out: &mut Vec<usize>| {
+            out.clear();
+            merge(mass, stiffness, others[position], |other, _, _| out.extend(Some(place[other])));
+            out.retain(|&other| other != usize::MAX);
+        })?;
+        order.arrays().0.iter().map(|&position| others[position]).collect()
+    };
+    forward.extend_from_slice(last);
+    let mut inverse = vec![0; n];
+    forward.iter().enumerate().for_each(|(position, &row)| inverse[row] = position);
+    Ok(Perm::new_checked(forward.into(), inverse.into(), n))
 }
 
 /// The row that is eliminated at each position.

@@ -4,24 +4,29 @@
 //! R = Σ φ φᵀ / ω²,   Q = Σ φ φᵀ / ω⁴     over the modes left out, at the contact's degrees of freedom
 //! ```
 //!
-//! The modes themselves are not needed. Unit loads `F`, freed of the kept modes, are applied to `K + s M`:
-//! `X = (K + s M)⁻¹ (F - M Φ Φᵀ F)` gives `R_s = Fᵀ X` and `Q_s = Xᵀ M X`, which differ from `R` and `Q` by powers of
-//! `s/ω²`. `s` is a millionth of the last kept `ω²`: a body that floats freely needs no other treatment, and
-//! `R = R_s + s Q_s` is good to 1e-12.
+//! The modes themselves are not needed. Unit loads `F`, freed of the kept modes, are applied to `A = K + s M`, and the
+//! inertia of the answers again:
+//!
+//! ```text
+//! X = A⁻¹ (F - M Φ Φᵀ F),   R_s = Fᵀ X,   Q_s = Fᵀ A⁻¹ M X = Xᵀ M X
+//! ```
+//!
+//! A few loads at a time: nothing of the size of the system times all loads is ever held. `R_s` and `Q_s` differ from `R`
+//! and `Q` by powers of `s/ω²`; `s` is a millionth of the last kept `ω²`: a body that floats freely needs no other
+//! treatment, and `R = R_s + s Q_s` is good to 1e-12.
 //!
 //! Source: MacNeal 1971; Rubin 1975.
 
 use faer::Mat;
 
-use super::normal_modes::{Progress, SparseModes};
-use super::pencil::Pencil;
+use super::normal_modes::{Analysed, Progress, SparseModes};
 use super::sparse::times;
 use super::{ReductionError, SparseMatrix};
 
 /// The shift, relative to the last kept `ω²`.
 const SHIFT: f64 = 1e-6;
 /// Loads that are solved for at once.
-const TOGETHER: usize = 48;
+const TOGETHER: usize = 32;
 
 /// Residuals between degrees of freedom of the contact, in the order they were asked for.
 #[derive(Clone, Debug)]
@@ -48,54 +53,97 @@ pub fn residual(
     rows: &[Option<usize>],
     progress: &mut dyn FnMut(Progress),
 ) -> Result<Residual, ReductionError> {
-    let last = modes.omega_squared.last().copied().unwrap_or(0.0);
-    let limit = -super::SEMIDEFINITE_TOLERANCE * last.abs();
-    if let Some((mode, &value)) = modes.omega_squared.iter().enumerate().find(|(_, square)| **square < limit) {
-        return Err(ReductionError::NegativeStiffness { what: format!("{what}.stiffness"), mode, value, limit });
+    Analysed::new(what, mass, stiffness)?.residual(modes, rows, progress)
+}
+
+impl Analysed<'_> {
+    /// Bytes that residuals need beside what is held already and `count` modes.
+    pub fn bytes_for_residual(&self, count: usize) -> usize {
+        // The modes, their inertia, and loads, answers, products and room to permute them of one set of loads.
+        let columns = 2 * count + 5 * TOGETHER;
+        self.pencil.factor_bytes() + size_of::<f64>() * self.pencil.dimension() * columns
     }
-    let pencil = Pencil::new(what, mass, stiffness)?;
-    let n = pencil.dimension();
-    let shift = SHIFT * last;
-    let factor = pencil.llt(shift)?.ok_or(ReductionError::NoShift { what: what.to_owned(), value: shift })?;
-    progress(Progress::Factored { shift });
-    let free: Vec<usize> = rows.iter().flatten().copied().collect();
-    let inertia_of_modes = times(mass, modes.phi.as_ref());
-    let mut responses = Mat::<f64>::zeros(n, free.len());
-    for (chunk, loaded) in free.chunks(TOGETHER).enumerate() {
-        let kept = Mat::from_fn(modes.phi.ncols(), loaded.len(), |mode, load| modes.phi[(loaded[load], mode)]);
-        let mut x = -(&inertia_of_modes * kept);
-        for (load, &row) in loaded.iter().enumerate() {
-            x[(row, load)] += 1.0;
+
+    /// Residual flexibility and inertia of the modes beyond `modes`; see [`residual`].
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `NegativeStiffness`, `NoShift`, `Factorisation`.
+    pub fn residual(
+        &self,
+        modes: &SparseModes,
+        rows: &[Option<usize>],
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<Residual, ReductionError> {
+        let pencil = &self.pencil;
+        let (what, mass, n) = (pencil.what, pencil.mass, pencil.dimension());
+        let last = modes.omega_squared.last().copied().unwrap_or(0.0);
+        let limit = -super::SEMIDEFINITE_TOLERANCE * last.abs();
+        if let Some((mode, &value)) = modes.omega_squared.iter().enumerate().find(|(_, square)| **square < limit) {
+            return Err(ReductionError::NegativeStiffness { what: format!("{what}.stiffness"), mode, value, limit });
         }
-        factor.solve(x.as_mut());
-        // What rounding brought back of the kept modes, rigid ones above all.
-        let back = inertia_of_modes.transpose() * &x;
-        x -= &modes.phi * back;
-        responses.subcols_mut(chunk * TOGETHER, loaded.len()).copy_from(&x);
-        let solved = chunk * TOGETHER + loaded.len();
-        progress(Progress::Loaded { solved, loads: free.len() });
-    }
-    let q = responses.transpose() * times(mass, responses.as_ref());
-    let mut position = 0;
-    let place: Vec<Option<usize>> = rows
-        .iter()
-        .map(|row| {
-            row.map(|_| {
-                position += 1;
-                position - 1
+        let shift = SHIFT * last;
+        let factor = pencil.llt(shift)?.ok_or(ReductionError::NoShift { what: what.to_owned(), value: shift })?;
+        progress(Progress::Factored { shift });
+        let free: Vec<usize> = rows.iter().flatten().copied().collect();
+        let phi = modes.phi.as_ref();
+        let inertia_of_modes = times(mass, phi);
+        // Of an answer, what rounding brought back of the kept modes, rigid ones above all.
+        let freed = |mut x: Mat<f64>| {
+            let back = inertia_of_modes.transpose() * &x;
+            x -= phi * back;
+            x
+        };
+        let mut of_shift = [0, 1].map(|_| Mat::<f64>::zeros(free.len(), free.len()));
+        for (chunk, loaded) in free.chunks(TOGETHER).enumerate() {
+            let kept = Mat::from_fn(phi.ncols(), loaded.len(), |mode, load| phi[(loaded[load], mode)]);
+            let mut x = Mat::<f64>::zeros(n, loaded.len());
+            faer::linalg::matmul::matmul(
+                x.as_mut(),
+                faer::Accum::Replace,
+                inertia_of_modes.as_ref(),
+                kept.as_ref(),
+                -1.0,
+                faer::Par::Seq,
+            );
+            for (load, &row) in loaded.iter().enumerate() {
+                x[(row, load)] += 1.0;
+            }
+            for matrix in &mut of_shift {
+                factor.solve(x.as_mut());
+                x = freed(x);
+                for load in 0..loaded.len() {
+                    for (place, &row) in free.iter().enumerate() {
+                        matrix[(place, chunk * TOGETHER + load)] = x[(row, load)];
+                    }
+                }
+                // The inertia of the answers is the load that gives Q; the last product is not used.
+                x = times(mass, x.as_ref());
+            }
+            let solved = chunk * TOGETHER + loaded.len();
+            progress(Progress::Loaded { solved, loads: free.len() });
+        }
+        let mut position = 0;
+        let place: Vec<Option<usize>> = rows
+            .iter()
+            .map(|row| {
+                row.map(|_| {
+                    position += 1;
+                    position - 1
+                })
             })
+            .collect();
+        let full = |entry: &dyn Fn(usize, usize) -> f64| {
+            Mat::from_fn(rows.len(), rows.len(), |i, j| match (place[i], place[j]) {
+                (Some(i), Some(j)) => 0.5 * (entry(i, j) + entry(j, i)),
+                _ => 0.0,
+            })
+        };
+        let [flexibility, inertia] = of_shift;
+        Ok(Residual {
+            flexibility: full(&|i, j| flexibility[(i, j)] + shift * inertia[(i, j)]),
+            inertia: full(&|i, j| inertia[(i, j)]),
         })
-        .collect();
-    let full = |entry: &dyn Fn(usize, usize) -> f64| {
-        Mat::from_fn(rows.len(), rows.len(), |i, j| match (place[i], place[j]) {
-            (Some(i), Some(j)) => 0.5 * (entry(i, j) + entry(j, i)),
-            _ => 0.0,
-        })
-    };
-    Ok(Residual {
-        flexibility: full(&|i, j| responses[(free[i], j)] + shift * q[(i, j)]),
-        inertia: full(&|i, j| q[(i, j)]),
-    })
+    }
 }
 
 #[cfg(test)]

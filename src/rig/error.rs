@@ -9,6 +9,8 @@ use crate::reduction::ReductionError;
 pub enum RigError {
     #[error("{value}: neither a readable rig file ({reason}) nor one of the embedded rigs, expected {limit}")]
     NoSuchRig { value: String, reason: String, limit: String },
+    #[error("{value}: cannot be read: {reason}; expected {limit}")]
+    NoSuchFile { value: String, reason: String, limit: String },
     #[error("{file}: {field} = \"{value}\" cannot be read: {reason}; expected {limit}")]
     MissingFile { file: String, field: String, value: String, reason: String, limit: String },
     #[error("{file}, line {line}: {value}; expected {limit}")]
@@ -28,7 +30,7 @@ pub enum RigError {
     #[error("{file}: `{field}` = \"{value}\": {reason}; expected {limit}")]
     Scale { file: String, field: String, value: String, reason: String, limit: String },
     #[error("{file}, line {line}: {field} {value}; expected {limit}")]
-    MatrixMarket { file: String, line: usize, field: String, value: String, limit: String },
+    Line { file: String, line: usize, field: String, value: String, limit: String },
     #[error("{file}: array `{field}` {value}; expected {limit}")]
     Npz { file: String, field: String, value: String, limit: String },
     #[error(

@@ -2,9 +2,12 @@
 //!
 //! Source: Boisvert, Pozo, Remington, "The Matrix Market exchange formats", NISTIR 5935 (1996).
 
+use std::io::BufRead;
+
 use faer::sparse::Triplet;
 
 use super::RigError;
+use super::lines::{Lines, refuse, told};
 use crate::reduction::SparseMatrix;
 
 /// A matrix as its file lists it, mirrored where the header says so.
@@ -40,68 +43,91 @@ enum Symmetry {
     Skew,
 }
 
+/// What a file says of the matrix as a whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Size {
+    pub rows: usize,
+    pub columns: usize,
+    /// Which sign the entries mirrored at the diagonal have, where they are not listed: `+1` or `-1`.
+    pub mirrored: Option<i8>,
+}
+
 /// Reads a Matrix Market file; `file` is how errors name it. Memory grows with the entries that are there, never with
 /// what the header claims.
 ///
 /// # Errors
-/// [`RigError::MatrixMarket`], with the line.
+/// [`RigError::Line`].
 pub fn read(file: &str, bytes: &[u8]) -> Result<Listed, RigError> {
-    let text = String::from_utf8_lossy(bytes);
-    let refuse = |line: usize, field: &str, value: String, limit: &str| RigError::MatrixMarket {
-        file: file.to_owned(),
-        line,
-        field: field.to_owned(),
-        value,
-        limit: limit.to_owned(),
-    };
-    let mut lines = text.lines().enumerate().map(|(index, line)| (index + 1, line.trim()));
-    let (_, header) = lines.next().unwrap_or((1, ""));
-    let (coordinate, integer, symmetry) =
-        read_header(header).map_err(|(f, value, limit)| refuse(1, f, value, limit))?;
-    let mut lines = lines.filter(|(_, line)| !line.is_empty() && !line.starts_with('%'));
-    let last_line = text.lines().count().max(1);
+    let mut entries = vec![];
+    let Size { rows, columns, mirrored } = read_entries(file, bytes, |row, column, value| {
+        entries.push((row, column, value));
+    })?;
+    if let Some(sign) = mirrored {
+        for index in 0..entries.len() {
+            let (row, column, value) = entries[index];
+            if row != column {
+                entries.push((column, row, f64::from(sign) * value));
+            }
+        }
+    }
+    Ok(Listed { rows, columns, entries })
+}
 
+/// Reads a Matrix Market file line by line: `each` hears row and column, counted from 0, and value of every entry that
+/// is listed, in its order; those of symmetric and skew-symmetric matrices lie on or below the diagonal.
+///
+/// # Errors
+/// [`RigError::Line`].
+pub fn read_entries(
+    file: &str,
+    input: impl BufRead,
+    mut each: impl FnMut(usize, usize, f64),
+) -> Result<Size, RigError> {
+    let mut lines = Lines::new(file, input);
+    let header = lines.advance()?.map(|(_, header)| header.to_owned()).unwrap_or_default();
+    let (coordinate, integer, symmetry) =
+        read_header(&header).map_err(|(field, value, limit)| refuse(file, 1, field, value, limit))?;
     let size_limit = if coordinate { "rows, columns and entries" } else { "rows and columns" };
-    let (size_line, sizes) =
-        lines.next().ok_or_else(|| refuse(last_line, "size", "is missing".to_owned(), size_limit))?;
+    let sizes = loop {
+        match lines.advance()? {
+            None => return Err(lines.refuse("size", "is missing".to_owned(), size_limit)),
+            Some((_, line)) if is_content(line) => break line.to_owned(),
+            Some(_) => {}
+        }
+    };
     let numbers: Option<Vec<usize>> = sizes.split_whitespace().map(|word| word.parse().ok()).collect();
-    let bad_size = || refuse(size_line, "size", format!("is `{}`", shortened(sizes)), size_limit);
     let (rows, columns, listed) = match (numbers.as_deref(), coordinate) {
         (Some(&[rows, columns, listed]), true) => (rows, columns, listed as u128),
         (Some(&[rows, columns]), false) => (rows, columns, count_of_array(rows, columns, symmetry)),
-        _ => return Err(bad_size()),
+        _ => return Err(lines.refuse("size", told(&sizes), size_limit)),
     };
     if symmetry != Symmetry::General && rows != columns {
-        return Err(refuse(
-            size_line,
-            "size",
-            format!("is {rows}x{columns}"),
-            "a square matrix, as its header says symmetric",
-        ));
+        let limit = "a square matrix, as its header says symmetric";
+        return Err(lines.refuse("size", format!("is {rows}x{columns}"), limit));
     }
 
-    let mut entries: Vec<(usize, usize, f64)> = vec![];
     let (mut seen, mut array_row, mut array_column) = (0_u128, first_row(0, symmetry), 0_usize);
-    for (line, content) in lines {
+    while let Some((line, content)) = lines.advance()? {
+        if !is_content(content) {
+            continue;
+        }
+        let refuse = |field: &str, value: String, limit: &str| refuse(file, line, field, value, limit);
         if seen == listed {
-            return Err(refuse(
-                line,
-                "entries",
-                format!("go on with `{}`", shortened(content)),
-                "no more than the size says",
-            ));
+            let value = format!("go on with {}", &told(content)[3..]);
+            return Err(refuse("entries", value, "no more than the size says"));
         }
         seen += 1;
-        let words: Vec<&str> = content.split_whitespace().take(4).collect();
-        let (row, column, word) = match (words.as_slice(), coordinate) {
-            (&[row, column, word], true) => {
+        let mut words = content.split_whitespace();
+        let words = [words.next(), words.next(), words.next(), words.next()];
+        let (row, column, word) = match (words, coordinate) {
+            ([Some(row), Some(column), Some(word), None], true) => {
                 let index = |word: &str, limit: usize, what: &str| match word.parse::<usize>() {
                     Ok(index) if (1..=limit).contains(&index) => Ok(index - 1),
-                    _ => Err(refuse(line, what, format!("is `{}`", shortened(word)), &format!("1 to {limit}"))),
+                    _ => Err(refuse(what, told(word), &format!("1 to {limit}"))),
                 };
                 (index(row, rows, "row")?, index(column, columns, "column")?, word)
             }
-            (&[word], false) => {
+            ([Some(word), None, ..], false) => {
                 let position = (array_row, array_column);
                 array_row += 1;
                 // Columns of a skew-symmetric array get empty towards the last one.
@@ -111,34 +137,42 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<Listed, RigError> {
                 }
                 (position.0, position.1, word)
             }
-            (_, true) => {
-                return Err(refuse(line, "entry", format!("is `{}`", shortened(content)), "row, column and value"));
-            }
-            (_, false) => return Err(refuse(line, "entry", format!("is `{}`", shortened(content)), "one value")),
+            (_, true) => return Err(refuse("entry", told(content), "row, column and value")),
+            (_, false) => return Err(refuse("entry", told(content), "one value")),
         };
         let value = if integer { word.parse::<i64>().ok().map(|value| value as f64) } else { word.parse::<f64>().ok() };
         let kind = if integer { "an integer" } else { "a finite number" };
         let value = match value {
             Some(value) if value.is_finite() => value,
-            _ => return Err(refuse(line, "value", format!("is `{}`", shortened(word)), kind)),
+            _ => return Err(refuse("value", told(word), kind)),
         };
-        match symmetry {
-            Symmetry::General => entries.push((row, column, value)),
-            Symmetry::Symmetric if row == column => entries.push((row, column, value)),
-            Symmetry::Symmetric if row > column => entries.extend([(row, column, value), (column, row, value)]),
-            Symmetry::Skew if row > column => entries.extend([(row, column, value), (column, row, -value)]),
-            _ => {
-                let place = format!("is at row {}, column {}", row + 1, column + 1);
-                let limit =
-                    if symmetry == Symmetry::Skew { "one below the diagonal" } else { "one on or below the diagonal" };
-                return Err(refuse(line, "entry", place, limit));
-            }
+        let allowed = match symmetry {
+            Symmetry::General => true,
+            Symmetry::Symmetric => row >= column,
+            Symmetry::Skew => row > column,
+        };
+        if !allowed {
+            let place = format!("is at row {}, column {}", row + 1, column + 1);
+            let skew = symmetry == Symmetry::Skew;
+            let limit = if skew { "one below the diagonal" } else { "one on or below the diagonal" };
+            return Err(refuse("entry", place, limit));
         }
+        each(row, column, value);
     }
     if seen != listed {
-        return Err(refuse(last_line, "entries", format!("end after {seen}"), &format!("{listed}, as the size says")));
+        return Err(lines.refuse("entries", format!("end after {seen}"), &format!("{listed}, as the size says")));
     }
-    Ok(Listed { rows, columns, entries })
+    let mirrored = match symmetry {
+        Symmetry::General => None,
+        Symmetry::Symmetric => Some(1),
+        Symmetry::Skew => Some(-1),
+    };
+    Ok(Size { rows, columns, mirrored })
+}
+
+/// Neither empty nor a comment.
+fn is_content(line: &str) -> bool {
+    !line.is_empty() && !line.starts_with('%')
 }
 
 type HeaderError = (&'static str, String, &'static str);
@@ -148,14 +182,13 @@ fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
     let words: Vec<String> = header.split_whitespace().take(6).map(str::to_ascii_lowercase).collect();
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
     let &[banner, object, format, field, symmetry] = words.as_slice() else {
-        let value = format!("is `{}`", shortened(header));
+        let value = told(header);
         return Err((
             "header",
             value,
             "%%MatrixMarket matrix coordinate|array real|integer general|symmetric|skew-symmetric",
         ));
     };
-    let told = |word: &str| format!("is `{}`", shortened(word));
     if banner != "%%matrixmarket" {
         return Err(("banner", told(banner), "%%MatrixMarket"));
     }
@@ -206,14 +239,6 @@ fn first_row(column: usize, symmetry: Symmetry) -> usize {
         Symmetry::General => 0,
         Symmetry::Symmetric => column,
         Symmetry::Skew => column.saturating_add(1),
-    }
-}
-
-/// A word short enough for an error message.
-fn shortened(text: &str) -> String {
-    match text.char_indices().nth(40) {
-        Some((end, _)) => format!("{}...", &text[..end]),
-        None => text.to_owned(),
     }
 }
 

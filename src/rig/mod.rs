@@ -1,30 +1,39 @@
 //! Rig files: raw form, validation, embedded rigs.
 //!
 //! A rig file is TOML (`raw`), says which of three kinds it is by the tables it has, and is built into a [`Rig`]:
-//! `inline` substructures, `modal` substructures of a finite-element program (`npz`, touching in a `patch`), or a
+//! `inline` substructures, `modal` substructures of a finite-element program (`npz` or `uff`, touching in a `patch`), or a
 //! `system` of matrices (`matrix_market`, times a `scale`). What it refers to is read by name through `source`, so
 //! that a recording's attachments serve as well as a directory.
 
+mod basis;
 mod embedded;
 mod error;
 mod inline;
 mod interpolation;
+pub(crate) mod lines;
 pub mod matrix_market;
 mod modal;
+mod modal_data;
 pub mod npz;
-mod patch;
-mod raw;
+pub(crate) mod patch;
+pub(crate) mod raw;
+mod residual;
 pub mod scale;
-mod settings;
+pub(crate) mod settings;
 mod source;
-mod system;
+pub(crate) mod system;
+pub mod uff;
 
 use faer::Mat;
 
+use crate::certificate::Certificate;
 use crate::physics::{Model, OperatingPoint};
 
 pub use embedded::EMBEDDED;
 pub use error::RigError;
+pub use modal_data::{ModalData, Residual};
+pub use patch::Pair;
+pub use settings::Settings;
 
 use source::Source;
 
@@ -37,7 +46,7 @@ pub struct Rig {
     pub model: Model,
     /// `[reference]`: the operating point used where none is given.
     pub reference: OperatingPoint,
-    /// `[band] max_hz`: modes above are neither listed nor judged.
+    /// `[band] max_hz`: modes above are neither listed nor judged. At most the cut-off of a rig with residual flexibility.
     pub band_max_hz: Option<f64>,
     /// `[search] mu_max`: windows of instability are sought in `[0, mu_max]`.
     pub mu_max: f64,
@@ -57,6 +66,8 @@ pub struct Rig {
     pub files: Vec<RigFile>,
     /// What the rig is made of, a line each, for [`Rig::describe`].
     pub contents: Vec<String>,
+    /// `[reduction]`: how far it is from the full model it was reduced from.
+    pub reduction: Option<Certificate>,
     /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
     pub shapes: Vec<SideShapes>,
 }
@@ -158,23 +169,27 @@ impl Rig {
     }
 
     fn build(rig_file: RigFile, read: &dyn Fn(&str) -> Result<Vec<u8>, String>, limit: &str) -> Result<Self, RigError> {
-        let raw = raw::parse(&rig_file.name, &rig_file.bytes)?;
+        let raw: raw::RawRig = raw::parse(&rig_file.name, &rig_file.bytes)?;
         let mut source = Source::new(rig_file, read, limit);
         let settings = settings::check(&source.rig_file, &raw)?;
-        let built = match settings::kind(&source.rig_file, &raw)? {
+        let mut built = match settings::kind(&source.rig_file, &raw)? {
             settings::Kind::Inline { pad, disc, contacts } => {
-                inline::build(&source.rig_file, pad, disc, contacts, settings.contact_law)?
+                inline::build(&source.rig_file, pad, disc, contacts, &settings)?
             }
             settings::Kind::Modal { pad, disc, patches } => {
-                modal::build(&mut source, pad, disc, patches, settings.contact_law)?
+                let shared = raw.basis.as_ref().is_some_and(|basis| basis.shared);
+                modal::build(&mut source, pad, disc, patches, shared, &settings)?
             }
             settings::Kind::System(system) => system::build(&mut source, system, &settings)?,
         };
+        if let Some(basis) = &raw.basis {
+            built.contents.extend(basis.describe(&source.rig_file)?);
+        }
         Ok(Self {
             name: raw.name,
             model: built.model,
             reference: settings.reference,
-            band_max_hz: settings.band_max_hz,
+            band_max_hz: built.band_max_hz,
             mu_max: settings.mu_max,
             instability_threshold: settings.instability_threshold,
             limits: settings.limits,
@@ -183,9 +198,45 @@ impl Rig {
             path: None,
             content_hash: source.content_hash(),
             files: source.into_files(),
-            contents: built.contents,
+            contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::told)).collect(),
+            reduction: raw.reduction,
             shapes: built.shapes,
         })
+    }
+
+    /// The stiffness of the rig's contact pairs as its file lists it, N/m: one value, or one for each pair of a patch.
+    pub fn contact_stiffness_n_per_m(&self) -> Vec<f64> {
+        let mut listed = vec![];
+        self.visit_contact_stiffness(&mut |value| {
+            listed.push(value);
+            value
+        });
+        listed
+    }
+
+    /// The same rig with the stiffness of every contact pair multiplied by `factor`.
+    ///
+    /// # Errors
+    /// [`RigError`]: the rig's own files are at fault, or `factor` takes the stiffness out of range.
+    pub fn with_contact_stiffness_times(&self, factor: f64) -> Result<Self, RigError> {
+        let Some(text) = self.visit_contact_stiffness(&mut |value| factor * value) else { return Ok(self.clone()) };
+        let mut files = self.files.clone();
+        files[0].bytes = text.into_bytes();
+        Self::from_files(&files)
+    }
+
+    /// The text of the rig file with every contact stiffness replaced by what `change` makes of it.
+    fn visit_contact_stiffness(&self, change: &mut dyn FnMut(f64) -> f64) -> Option<String> {
+        let text = std::str::from_utf8(&self.files.first()?.bytes).ok()?;
+        let mut table: toml::Table = text.parse().ok()?;
+        for key in ["contact", "contact_patch"] {
+            for contact in table.get_mut(key).and_then(toml::Value::as_array_mut).into_iter().flatten() {
+                if let Some(stiffness) = contact.get_mut("stiffness_n_per_m") {
+                    change_numbers(stiffness, change);
+                }
+            }
+        }
+        Some(table.to_string())
     }
 
     /// What the rig is and holds, a few lines for people.
@@ -208,9 +259,20 @@ impl Rig {
     }
 }
 
+/// Replaces a number, or every number of a list.
+fn change_numbers(value: &mut toml::Value, change: &mut dyn FnMut(f64) -> f64) {
+    if let toml::Value::Array(values) = value {
+        values.iter_mut().for_each(|value| change_numbers(value, change));
+    } else if let Some(number) = value.as_float().or_else(|| value.as_integer().map(|whole| whole as f64)) {
+        *value = toml::Value::Float(change(number));
+    }
+}
+
 /// What each kind of rig builds.
 struct Built {
     model: Model,
     contents: Vec<String>,
     shapes: Vec<SideShapes>,
+    /// `[band] max_hz`, lower where the model ends below.
+    band_max_hz: Option<f64>,
 }

@@ -2,35 +2,18 @@
 
 use std::io::{Cursor, Read};
 
+use faer::Mat;
 use npyz::{NpyFile, Order, TypeChar};
 
 use super::RigError;
+use super::modal_data::{ModalData, Residual};
 
 /// Largest array that is read, in bytes: a limit for archives that unpack to far more than they hold.
 const LARGEST: u64 = 2 << 30;
 /// Longest header of an array, in bytes; numpy writes 128.
 const LONGEST_HEADER: usize = 1024;
-
-/// Modes at the nodes of a contact interface.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ModalData {
-    /// `ω`, rad/s, one for each of `i` modes.
-    pub omega_rad_s: Vec<f64>,
-    /// `Φ`, kg^-1/2, `(c, 3, i)` with the mode running fastest.
-    pub phi: Vec<f64>,
-    /// Positions of the `c` nodes, m.
-    pub nodes_m: Vec<[f64; 3]>,
-    /// `ζ`, one for each mode, where given.
-    pub damping_ratio: Option<Vec<f64>>,
-}
-
-impl ModalData {
-    /// Displacement of `node` in `mode`, kg^-1/2; 0 outside.
-    pub fn shape(&self, node: usize, mode: usize) -> [f64; 3] {
-        let modes = self.omega_rad_s.len();
-        [0, 1, 2].map(|axis| self.phi.get((3 * node + axis) * modes + mode).copied().unwrap_or(0.0))
-    }
-}
+/// Two mirrored entries of a residual may differ by this times its largest entry: what printing with ten digits leaves.
+const SYMMETRY: f64 = 1e-9;
 
 /// A numpy array, rewritten to C order.
 struct Array {
@@ -38,7 +21,8 @@ struct Array {
     values: Vec<f64>,
 }
 
-/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and, where it is there, `damping_ratio` (i).
+/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and, where they are there, `damping_ratio` (i), `mass_share`
+/// (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
 ///
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
@@ -57,6 +41,8 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     let phi = required("phi", array("phi")?, "(c, 3, i)")?;
     let nodes = required("nodes_m", array("nodes_m")?, "(c, 3)")?;
     let damping = array("damping_ratio")?;
+    let mass_share = array("mass_share")?;
+    let residuals = [array("residual_flexibility")?, array("residual_inertia")?];
 
     let wrong = |name: &str, array: &Array, limit: &str| {
         Err(refuse(file, name, &format!("has shape ({})", told(&array.shape)), limit))
@@ -77,13 +63,56 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     if let Some((mode, value)) = omega.values.iter().enumerate().find(|(_, value)| **value < 0.0) {
         return Err(refuse(file, &format!("omega_rad_s[{mode}]"), &format!("is {value}"), "at least 0"));
     }
+    let mass_share = match mass_share {
+        Some(share) if share.shape != [modes, modes] => {
+            return wrong("mass_share", &share, &format!("({modes}, {modes}), by omega_rad_s"));
+        }
+        share => share.map(|share| Mat::from_fn(modes, modes, |i, j| share.values[i * modes + j])),
+    };
+    let residual = residual(file, count, residuals)?;
     let nodes_m = nodes.values.chunks_exact(3).map(|node| [node[0], node[1], node[2]]).collect();
     Ok(ModalData {
         omega_rad_s: omega.values,
         phi: phi.values,
         nodes_m,
         damping_ratio: damping.map(|damping| damping.values),
+        mass_share,
+        residual,
     })
+}
+
+/// Residual flexibility and inertia between the three directions of every one of `count` nodes.
+fn residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> Result<Option<Residual>, RigError> {
+    let names = ["residual_flexibility", "residual_inertia"];
+    let symmetric = |name: &str, array: Array| -> Result<Mat<f64>, RigError> {
+        let size = 3 * count;
+        if array.shape != [size, size] {
+            let limit = format!("({size}, {size}), by nodes_m");
+            return Err(refuse(file, name, &format!("has shape ({})", told(&array.shape)), &limit));
+        }
+        let at = |row: usize, column: usize| array.values[row * size + column];
+        let limit = SYMMETRY * array.values.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+        for row in 0..size {
+            if at(row, row) < 0.0 {
+                let value = format!("is {}", at(row, row));
+                return Err(refuse(file, &format!("{name}[{row}, {row}]"), &value, "at least 0"));
+            }
+            if let Some(column) = (0..row).find(|&column| (at(row, column) - at(column, row)).abs() > limit) {
+                let value = format!("is {}, its mirror image {}", at(row, column), at(column, row));
+                let limit = format!("a difference of at most {limit:.3e}: a symmetric matrix");
+                return Err(refuse(file, &format!("{name}[{row}, {column}]"), &value, &limit));
+            }
+        }
+        Ok(Mat::from_fn(size, size, |row, column| 0.5 * (at(row, column) + at(column, row))))
+    };
+    match arrays {
+        [None, None] => Ok(None),
+        [None, Some(_)] => Err(refuse(file, names[1], "stands without residual_flexibility", "both, or neither")),
+        [Some(flexibility), inertia] => Ok(Some(Residual {
+            flexibility: symmetric(names[0], flexibility)?,
+            inertia: inertia.map(|inertia| symmetric(names[1], inertia)).transpose()?,
+        })),
+    }
 }
 
 fn refuse(file: &str, field: &str, value: &str, limit: &str) -> RigError {

@@ -3,6 +3,7 @@
 use serde::Deserialize;
 
 use super::RigError;
+use crate::certificate::Certificate;
 
 /// A whole rig file.
 #[derive(Debug, Deserialize)]
@@ -30,6 +31,8 @@ pub struct RawRig {
     pub contact: Option<Vec<RawContact>>,
     pub contact_patch: Option<Vec<RawPatch>>,
     pub system: Option<RawSystem>,
+    pub basis: Option<RawBasis>,
+    pub reduction: Option<Certificate>,
 }
 
 /// Declares a table whose keys all have defaults.
@@ -166,6 +169,22 @@ pub struct RawSystem {
     pub stiffness: Vec<RawTerm>,
 }
 
+/// `[basis]`: the coordinates are those of a basis of a whole full model; what it was made for and found good for.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RawBasis {
+    /// Pad and disc have the same coordinates.
+    pub shared: bool,
+    pub degrees_of_freedom: Option<usize>,
+    pub friction_coefficient: Option<[f64; 2]>,
+    pub normal_load_n: Option<[f64; 2]>,
+    pub disc_speed_rad_s: Option<[f64; 2]>,
+    pub growth_floor_per_s: Option<f64>,
+    pub tolerance: Option<f64>,
+    pub held_out: Option<usize>,
+    pub largest_error: Option<f64>,
+}
+
 /// A matrix times a scale.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -179,11 +198,11 @@ fn one() -> String {
     "1".to_owned()
 }
 
-/// Reads the text of a rig file.
+/// Reads the text of a rig file, or of another file of tables.
 ///
 /// # Errors
 /// [`RigError::Syntax`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
-pub fn parse(file: &str, bytes: &[u8]) -> Result<RawRig, RigError> {
+pub fn parse<T: serde::de::DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, RigError> {
     let text = std::str::from_utf8(bytes).map_err(|error| {
         let line = 1 + bytes.iter().take(error.valid_up_to()).filter(|byte| **byte == b'\n').count();
         let value = format!("bytes that are not UTF-8 ({error})");

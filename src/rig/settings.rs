@@ -6,6 +6,7 @@ use crate::physics::{ContactLaw, OperatingPoint};
 use crate::reduction::ModeSelection;
 
 /// The common tables, checked.
+#[derive(Clone, Debug)]
 pub struct Settings {
     pub reference: OperatingPoint,
     pub band_max_hz: Option<f64>,
@@ -15,6 +16,13 @@ pub struct Settings {
     pub limits: Limits,
     pub warning: Warning,
     pub chart: ChartRange,
+}
+
+impl Settings {
+    /// The largest friction coefficient a prediction is made for: of the search and of the limits.
+    pub fn largest_friction(&self) -> f64 {
+        self.limits.friction_coefficient.iter().fold(self.mu_max, |largest, mu| largest.max(mu.abs()))
+    }
 }
 
 /// The kind of a rig, by the tables it has.
@@ -129,12 +137,18 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
         if let Some((field, _)) = friction_or_load.iter().find(|(_, set)| *set) {
             return mixed(field, "has nothing to act on beside [system]", "a scale of a matrix instead");
         }
+        if raw.basis.as_ref().is_some_and(|basis| basis.shared) {
+            return mixed("basis.shared", "is true beside [system]", "[pad] and [disc] with modal");
+        }
         return Ok(Kind::System(system));
     }
     let Some(pad) = &raw.pad else {
         return missing("pad", "[pad] with mass and stiffness, [pad] with modal, or [system]");
     };
     let modal = pad.modal.is_some();
+    if !modal && raw.basis.is_some() {
+        return mixed("basis", "stands beside inline substructures", "[pad] and [disc] with modal, or [system]");
+    }
     for (side, substructure) in [("pad", Some(pad)), ("disc", raw.disc.as_ref())] {
         let Some(substructure) = substructure else { continue };
         let inline = substructure.mass.is_some() || substructure.stiffness.is_some();
@@ -147,7 +161,7 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
             return mixed(&format!("{side}.mass"), "stands beside a modal pad", limit);
         }
         if modal && substructure.modal.is_none() {
-            return missing(&format!("{side}.modal"), "an .npz file");
+            return missing(&format!("{side}.modal"), "an .npz, .unv or .uff file");
         }
     }
     match (modal, &raw.contact, &raw.contact_patch) {

@@ -104,7 +104,7 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
     });
     contents.extend(stiffness.iter().map(|term| format!("stiffness  {}", term.told)));
     contents.extend(damping.iter().map(|term| format!("damping    {}", term.told)));
-    Ok(Built { model, contents, shapes: vec![] })
+    Ok(Built { model, contents, shapes: vec![], band_max_hz: settings.band_max_hz })
 }
 
 /// Reads `[[system.stiffness]]` or `[[system.damping]]`.
@@ -119,26 +119,7 @@ fn read_terms(
     let mut terms = vec![];
     for (index, raw) in raw.iter().enumerate() {
         let field = |name: &str| format!("system.{key}[{index}].{name}");
-        let law = scale::parse(&raw.scale).map_err(|error| RigError::Scale {
-            file: file.clone(),
-            field: field("scale"),
-            value: raw.scale.clone(),
-            reason: error.reason,
-            limit: error.limit,
-        })?;
-        let at_reference = value_at(&law, reference);
-        if !at_reference.is_finite() {
-            return Err(RigError::Scale {
-                file: file.clone(),
-                field: field("scale"),
-                value: raw.scale.clone(),
-                reason: format!(
-                    "is {at_reference} at the reference point ({} N, {} rad/s, friction coefficient {})",
-                    reference.normal_load_n, reference.disc_speed_rad_s, reference.friction_coefficient
-                ),
-                limit: "a finite number".to_owned(),
-            });
-        }
+        let (law, at_reference) = checked_law(&file, &field("scale"), &raw.scale, reference)?;
         let listed = matrix_market::read(&raw.matrix, source.read(&field("matrix"), &raw.matrix)?)?;
         if (listed.rows, listed.columns) != (n, n) {
             let value = format!("{}x{} ({})", listed.rows, listed.columns, raw.matrix);
@@ -157,6 +138,32 @@ fn read_terms(
         terms.push(ReadTerm { matrix, symmetric, law, at_reference, told });
     }
     Ok(terms)
+}
+
+/// The law that a scale is written as, and its value at the reference point.
+///
+/// # Errors
+/// [`RigError::Scale`].
+pub(crate) fn checked_law(
+    file: &str,
+    field: &str,
+    text: &str,
+    reference: &OperatingPoint,
+) -> Result<(Law, f64), RigError> {
+    let refuse = |reason, limit| {
+        let (file, field, value) = (file.to_owned(), field.to_owned(), text.to_owned());
+        RigError::Scale { file, field, value, reason, limit }
+    };
+    let law = scale::parse(text).map_err(|error| refuse(error.reason, error.limit))?;
+    let at_reference = value_at(&law, reference);
+    if at_reference.is_finite() {
+        return Ok((law, at_reference));
+    }
+    let reason = format!(
+        "is {at_reference} at the reference point ({} N, {} rad/s, friction coefficient {})",
+        reference.normal_load_n, reference.disc_speed_rad_s, reference.friction_coefficient
+    );
+    Err(refuse(reason, "a finite number".to_owned()))
 }
 
 /// A law of kind 3 at the reference point, with the friction coefficient that the model hands to it there.

@@ -67,7 +67,7 @@ const work = ((await worked()) - work0) * 1000 / (Date.now() - began);
 await wall.context().close();
 
 // A mode moves when chosen, and stands when paused.
-const pixels = () => page.locator("#stage canvas").evaluate((canvas) => canvas.toDataURL());
+const pixels = () => page.locator("#shape").evaluate((canvas) => canvas.toDataURL());
 await page.locator("#modes .mode-button").nth(2).click();
 await page.locator("#stage").scrollIntoViewIfNeeded();
 await page.waitForFunction(() => !/no mode/.test(document.getElementById("shape-note").textContent));

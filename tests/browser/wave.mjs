@@ -11,7 +11,7 @@ await page.route("**/shape.json*", async (route) => {
   const response = held ? null : await route.fetch();
   if (!held) await route.fulfill({ response });
 });
-const growing = () => document.querySelector("#stage canvas").displacements && /it grows/.test(document.querySelector("#shape-note").textContent);
+const growing = () => document.querySelector("#shape").displacements && /it grows/.test(document.querySelector("#shape-note").textContent);
 for (let attempt = 0; ; attempt++) {
   held = false;
   await page.locator("tr.grows .mode-button").first().click();
@@ -25,9 +25,9 @@ await page.locator("#shape-play").click();
 const turn = (degrees) => page.locator("#shape-phase").evaluate((slider, value) => {
   slider.value = value;
   slider.dispatchEvent(new Event("input", { bubbles: true }));
-  return document.querySelector("#stage canvas").displacements[0];
+  return document.querySelector("#shape").displacements[0];
 }, degrees);
-const pixels = () => page.locator("#stage canvas").screenshot();
+const pixels = () => page.locator("#shape").screenshot();
 
 /** Phase of the wave with two waves around the ring: the argument of the sum of z e^{-2 i theta}. */
 const phaseOf = (u) => {

@@ -1,11 +1,32 @@
 //! The real binary as a test runs it: folders of its own, exit code, both outputs.
 #![allow(dead_code)] // each test binary uses its part
 
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use npyz::WriterBuilder;
+use npyz::zip::write::FileOptions;
 use serde_json::Value;
+use squealcast::rig::RigFile;
+use tempfile::TempDir;
+
+/// Longer than anything takes on any machine, however busy.
+pub const PATIENCE: Duration = Duration::from_secs(120);
+
+/// Whether times are judged: `SQUEALCAST_MEASURE` is set on a quiet machine.
+pub fn measuring() -> bool {
+    std::env::var_os("SQUEALCAST_MEASURE").is_some()
+}
+
+/// Asserts that something took no longer than promised; on a machine that is not quiet it only says how long it took.
+#[track_caller]
+pub fn promised(what: &str, took: Duration, limit: Duration) {
+    eprintln!("{what}: {took:.1?}, promised {limit:?}");
+    assert!(!measuring() || took < limit, "{what} took {took:?}, promised {limit:?}");
+}
 
 /// What a run left behind.
 pub struct Run {
@@ -85,6 +106,30 @@ pub fn text(path: &Path) -> String {
     path.to_str().expect("a path of a test is UTF-8").to_owned()
 }
 
+/// A folder that goes when the test ends.
+pub fn folder() -> TempDir {
+    tempfile::tempdir().expect("a temporary folder")
+}
+
+/// A file of a rig, in memory.
+pub fn rig_file(name: &str, bytes: impl Into<Vec<u8>>) -> RigFile {
+    RigFile { name: name.to_owned(), bytes: bytes.into() }
+}
+
+/// An NPZ archive of arrays with name, shape and values in C order.
+pub fn npz_bytes(arrays: &[(&str, &[u64], &[f64])]) -> Vec<u8> {
+    let mut bytes = Cursor::new(vec![]);
+    let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
+    for (name, shape, values) in arrays {
+        let array = archive.array(name, FileOptions::default()).expect("an entry");
+        let mut writer = array.default_dtype().shape(shape).begin_nd().expect("an array");
+        writer.extend(values.iter().copied()).expect("its values");
+        writer.finish().expect("as many as its shape says");
+    }
+    drop(archive);
+    bytes.into_inner()
+}
+
 /// Writes a file and says where.
 pub fn write(directory: &Path, name: &str, content: &str) -> String {
     let path = directory.join(name);
@@ -111,19 +156,25 @@ impl Running {
         Self(Some(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the program starts")))
     }
 
-    /// Sends a signal (`INT`, `TERM`) and waits; how long it took to end.
-    pub fn signal(mut self, signal: &str) -> (Run, Duration) {
+    /// Sends a signal (`INT`, `TERM`) and waits for the end, which is promised within 2 s.
+    pub fn signal(mut self, signal: &str) -> Run {
         let child = self.0.take().expect("still running");
-        let sent = Command::new("kill").args([format!("-{signal}"), child.id().to_string()]).status();
-        assert!(sent.expect("kill is there").success(), "the program had ended before SIG{signal}");
+        let id = child.id().to_string();
+        let kill = move |signal: &str| Command::new("kill").args([&format!("-{signal}"), &id]).status();
+        assert!(kill(signal).expect("kill is there").success(), "the program had ended before SIG{signal}");
         let started = Instant::now();
+        // One that does not end at all is a failure, not a test that hangs.
+        let (done, waiting) = mpsc::channel::<()>();
+        let watch = std::thread::spawn(move || {
+            if waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
+                let _ = kill("KILL");
+            }
+        });
         let output = child.wait_with_output().expect("the program ends");
-        (ended(output), started.elapsed())
-    }
-
-    /// Waits for the end.
-    pub fn wait(mut self) -> Run {
-        ended(self.0.take().expect("still running").wait_with_output().expect("the program ends"))
+        drop(done);
+        watch.join().expect("the watch ends");
+        promised(&format!("SIG{signal}"), started.elapsed(), Duration::from_secs(2));
+        ended(output)
     }
 }
 
@@ -136,12 +187,12 @@ impl Drop for Running {
     }
 }
 
-/// Waits until something holds, at most 20 s.
+/// Waits until something holds.
 #[track_caller]
 pub fn until(what: &str, mut holds: impl FnMut() -> bool) {
     let started = Instant::now();
     while !holds() {
-        assert!(started.elapsed() < Duration::from_secs(20), "waited 20 s for {what}");
+        assert!(started.elapsed() < PATIENCE, "waited {PATIENCE:?} for {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }

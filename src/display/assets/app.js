@@ -1,5 +1,6 @@
 // Wires the page to what is served: a node's stream of states, or a recording asked moment by moment.
 
+import { next } from "./clock.js";
 import { Events } from "./events.js";
 import { History } from "./history.js";
 import { StabilityMap } from "./map.js";
@@ -7,6 +8,7 @@ import { Modes } from "./modes.js";
 import { ShapeView } from "./shape.js";
 import { Status } from "./status.js";
 import { Timeline } from "./timeline.js";
+import { forgetColours } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 const ask = async (path) => {
@@ -15,8 +17,7 @@ const ask = async (path) => {
   return answer.json();
 };
 /** Time between two changes of the numbers, ms: faster than that nobody reads. */
-const NUMBERS_EVERY = 200;
-const HISTORY_EVERY = 500;
+const NUMBERS_EVERY = 300;
 
 const about = await ask("about.json");
 const recording = about.kind === "recording";
@@ -31,7 +32,6 @@ const modes = new Modes(about, choose);
 let timeline;
 const events = new Events(about, recording ? (moment) => timeline.go(moment) : undefined);
 
-let taken = 0;
 let latest = null;
 let heardAt = 0;
 let mapShown = 0;
@@ -75,16 +75,16 @@ function take(state) {
   latest = state;
   heardAt = performance.now();
   if (!recording && at("link").dataset.link !== "live") link("live", "live");
-  status.level(state.level, state.reason);
-  status.needle(state);
-  map.cursor(state);
-  if (++taken % 3 === 0) map.dots();
+  next(paint);
+  if (!recording) history.now = state.time_s;
   if (!history.add(state.bins)) loadHistory();
   if (state.map && state.map !== mapShown) {
     once("map", async () => {
       const number = state.map;
       map.show(await ask(`map.json?number=${number}`));
       mapShown = number;
+      // Which mode to look at first is for the map to say.
+      if (recording) next(numbers);
     });
   }
   // Those of a recording are all there from the beginning.
@@ -97,12 +97,18 @@ function take(state) {
   }
 }
 
+/** What moves with every state. */
+function paint() {
+  status.level(latest.level, latest.reason);
+  status.needle(latest);
+  map.cursor(latest);
+}
+
 function numbers() {
   if (!latest) return;
   const age = typeof latest.age_s === "number" ? latest.age_s + (recording ? 0 : (performance.now() - heardAt) / 1000) : undefined;
   status.numbers(latest, age);
   modes.numbers(latest);
-  if (recording) map.dots();
   if (modes.chosen === null && latest.modes?.length) {
     // The one to look at first: the fastest growing, or else the one that would grow first.
     const fastest = latest.modes.reduce((best, mode) => (mode[1][1] > best[1][1] ? mode : best));
@@ -114,6 +120,8 @@ function numbers() {
     choose(modes.chosen);
   }
 }
+
+const refresh = () => history.refreshIfDue();
 
 function link(kind, text) {
   at("link").dataset.link = kind;
@@ -127,8 +135,8 @@ function theme() {
   at("theme").querySelector(".choice-name").textContent = now;
 }
 function repaint() {
+  forgetColours();
   map.draw();
-  map.dots();
   history.draw();
   shape.draw();
 }
@@ -150,6 +158,7 @@ theme();
 if (recording) {
   link("file", "recording");
   at("age-unit").textContent = "s before";
+  at("work").hidden = true;
   timeline = new Timeline(about, async (moment) => {
     const state = await ask(`state.json?at=${moment}`);
     take(state);
@@ -177,9 +186,7 @@ if (recording) {
   setInterval(() => {
     // A node that lives sends twice a second.
     if (latest && performance.now() - heardAt > 3000) link("gone", "no answer");
-    numbers();
+    next(numbers);
+    next(refresh);
   }, NUMBERS_EVERY);
-  setInterval(() => {
-    if (!document.hidden) history.refresh();
-  }, HISTORY_EVERY);
 }

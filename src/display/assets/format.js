@@ -17,6 +17,14 @@ export function signed(value, decimals) {
   return text === NONE || text.startsWith("\u2212") ? text : `+${text}`;
 }
 
+/** Labels of evenly spaced ticks: as many decimals as the step between them needs. */
+export function labels(ticks) {
+  const step = Math.abs(ticks[1] - ticks[0]);
+  let decimals = 0;
+  while (decimals < 8 && Math.abs(step * 10 ** decimals - Math.round(step * 10 ** decimals)) > 1e-6) decimals++;
+  return ticks.map((tick) => fixed(tick, decimals));
+}
+
 /** Decimals for a quantity by the largest value seen: they do not change with every value. */
 export class Decimals {
   constructor(digits, least = 0) {
@@ -32,9 +40,11 @@ export class Decimals {
   text(value) { return fixed(value, this.of(value)); }
 }
 
-/** Writes text and the exact value behind it; only where it changed. */
+/** Writes text and the exact value behind it; only where it changed, and into the text that is there. */
 export function put(element, text, value) {
-  if (element.textContent !== text) element.textContent = text;
+  const node = element.firstChild;
+  if (node?.nodeType !== Node.TEXT_NODE) element.textContent = text;
+  else if (node.data !== text) node.data = text;
   if (element.localName === "data") {
     const exact = known(value) ? String(value) : "";
     if (element.value !== exact) element.value = exact;
@@ -48,8 +58,16 @@ export const time = (seconds, digits = 1) => {
   return `${two(date.getHours())}:${two(date.getMinutes())}:${rest}`;
 };
 
+const colours = new Map();
+
 /** A colour of the style sheet. */
-export const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export function colour(name) {
+  if (!colours.has(name)) colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return colours.get(name);
+}
+
+/** The colours are others now. */
+export const forgetColours = () => colours.clear();
 
 export const modeColour = (id) => colour(`--mode-${id % 7}`);
 

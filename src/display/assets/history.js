@@ -1,7 +1,7 @@
 // The last minutes: ranges of load, speed, friction, growth and margin, of the measured vibration where there is one, and
 // a waterfall of the unstable frequencies with the measured ones.
 
-import { Decimals, colour, fixed, known, put, time } from "./format.js";
+import { colour, fixed, known, labels, time } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 /** `least` is the least range shown of a quantity, so that noise does not fill the plot. */
@@ -14,6 +14,12 @@ const ROWS = [
 ];
 const MEASURED = { key: "measured", label: "measured", unit: "dB", paint: "--mode-3", least: 20, range: (bin) => bin.v && [bin.v.lo, bin.v.hi] };
 
+/** Without anything for longer than this, and than five times as usual, the lines are broken, s. */
+const GAP_S = 2;
+
+/** No silence is as long, s. */
+const ANOTHER_CLOCK_S = 86400;
+
 export class History {
   constructor(about) {
     this.live = about.kind === "live";
@@ -22,6 +28,7 @@ export class History {
     this.length = 300;
     this.plots = [];
     this.moment = null;
+    this.now = -Infinity;
     this.threshold = about.vibration_threshold_db;
     this.measured = false;
     if (this.live) {
@@ -33,6 +40,9 @@ export class History {
       at("history-range").hidden = true;
     }
     new ResizeObserver(() => this.#resize()).observe(at("history-plots"));
+    new IntersectionObserver((entries) => {
+      this.visible = entries.at(-1).isIntersecting;
+    }).observe(at("history-plots"));
     this.draw();
   }
 
@@ -88,18 +98,18 @@ export class History {
     const grid = { stroke: colour("--grid"), width: 1 };
     const px = Math.round(parseFloat(getComputedStyle(element).fontSize) * 0.75);
     const font = `${px}px system-ui, sans-serif`;
-    const scale = new Decimals(3);
     return {
       width: Math.max(120, element.clientWidth),
       height: Math.max(40, element.clientHeight),
-      padding: [5, 8, xAxis ? 0 : 5, 0],
+      // The last time of the axis is as wide as this on either side of its tick.
+      padding: [5, 2.4 * px, xAxis ? 0 : 5, 0],
       pxAlign: 0,
       legend: { show: false },
       cursor: { show: false },
       scales: { x: { time: true, range: () => this.#span() }, y },
       axes: [
         { show: xAxis, stroke: ink, grid, ticks: grid, font, size: 2.2 * px, space: 6 * px, values: (_, ticks) => ticks.map((tick) => this.#clock(tick)) },
-        { stroke: ink, grid, ticks: { ...grid, size: 4 }, font, size: 5 * px, space: 1.9 * px, values: (_, ticks) => ticks.map((tick) => { scale.of(Math.max(...ticks.map(Math.abs))); return fixed(tick, Math.min(4, scale.of(tick))); }) },
+        { stroke: ink, grid, ticks: { ...grid, size: 4 }, font, size: 5 * px, space: 1.9 * px, values: (_, ticks) => labels(ticks) },
       ],
     };
   }
@@ -113,7 +123,9 @@ export class History {
   }
 
   #span() {
-    const end = this.bins.length ? (this.bins[this.bins.length - 1].k + 1) * this.binS : Date.now() / 1000;
+    const last = this.bins.length ? (this.bins[this.bins.length - 1].k + 1) * this.binS : Date.now() / 1000;
+    // Time goes on in silence too, unless the stamps are of another clock.
+    const end = this.now - last < ANOTHER_CLOCK_S ? Math.max(last, this.now) : last;
     // A young session fills the width; it is never less than a minute.
     const start = this.live ? Math.max(end - this.length, Math.min(this.#start(), end - 60)) : this.#start();
     return [Math.min(start, end - this.binS), end];
@@ -159,10 +171,10 @@ export class History {
     const paint = (u) => {
       const { ctx, bbox } = u;
       const fastest = Math.max(1e-12, ...shown.flatMap((bin) => bin.u.map(([, growth]) => growth)));
-      const width = Math.max(1.5 * devicePixelRatio, bbox.width * this.binS / (u.scales.x.max - u.scales.x.min) + 1);
+      const width = Math.max(1.5 * devicePixelRatio, bbox.width * this.shownS / (u.scales.x.max - u.scales.x.min) + 1);
       const height = 6 * devicePixelRatio;
       for (const bin of shown) {
-        const x = u.valToPos(bin.k * this.binS, "x", true);
+        const x = u.valToPos((bin.k + 0.5) * this.binS, "x", true) - width / 2;
         if (x < bbox.left - width) continue;
         for (const [hz, growth] of bin.u) {
           ctx.fillStyle = heat(growth / fastest);
@@ -203,18 +215,35 @@ export class History {
     return marker;
   }
 
-  /** Draws anew; a few times a second is enough. */
+  /** Draws anew if that shows much: where it is in sight, and went on by some pixels. */
+  refreshIfDue() {
+    const [from, to] = this.#span();
+    const each = Math.min(1000, Math.max(500, 2500 * (to - from) / this.plots[0].u.width));
+    if (this.visible && !(performance.now() - this.drawnAt < each)) this.refresh();
+  }
+
+  /** Draws anew. */
   refresh() {
+    this.drawnAt = performance.now();
     if (!this.measured && this.bins.some((bin) => bin.v)) {
       this.measured = true;
       return this.draw();
     }
+    const bins = this.#seen();
+    for (const plot of this.plots) plot.u.setData(plot.data(bins));
+    if (this.moment !== null) this.mark(this.moment);
+  }
+
+  /** The bins of the time shown, one for every other pixel at most. */
+  #seen() {
     const from = this.#span()[0];
     let first = this.bins.findIndex((bin) => (bin.k + 1) * this.binS >= from);
     if (first < 0) first = 0;
-    const bins = this.bins.slice(first);
-    for (const plot of this.plots) plot.u.setData(plot.data(bins));
-    if (this.moment !== null) this.mark(this.moment);
+    const bins = first ? this.bins.slice(first) : this.bins;
+    const each = Math.max(1, Math.ceil(2 * bins.length / this.plots[0].u.width));
+    this.shownS = each * this.binS;
+    const usual = (bins[bins.length - 1]?.k - bins[0]?.k) / bins.length;
+    return merged(bins, each, Math.max(GAP_S / this.binS, 5 * usual));
   }
 
   /** The moment of a recording that the rest of the page shows. */
@@ -233,6 +262,28 @@ export class History {
     }
     if (this.moment !== null) this.mark(this.moment);
   }
+}
+
+/** Bins of `each` times the length, as the node merges them; an empty one where `gap` or more are missing. */
+function merged(bins, each, gap) {
+  const all = [];
+  let before = Infinity;
+  for (const bin of bins) {
+    const place = Math.floor(bin.k / each);
+    const tail = all[all.length - 1];
+    if (bin.k - before > gap) all.push({ k: before + 1, r: bin.r.map(() => null), u: [] });
+    before = bin.k;
+    if (tail?.place !== place) {
+      all.push({ ...bin, place, k: (place + 0.5) * each - 0.5, r: bin.r.slice() });
+      continue;
+    }
+    if (bin.r[3] && !(tail.r[3]?.[1] >= bin.r[3][1])) tail.u = bin.u;
+    bin.r.forEach((range, k) => {
+      if (range) tail.r[k] = tail.r[k] ? [Math.min(tail.r[k][0], range[0]), Math.max(tail.r[k][1], range[1])] : range;
+    });
+    if (bin.v) tail.v = tail.v ? { hz: (bin.v.hi > tail.v.hi ? bin.v : tail.v).hz, lo: Math.min(tail.v.lo, bin.v.lo), hi: Math.max(tail.v.hi, bin.v.hi) } : bin.v;
+  }
+  return all;
 }
 
 /** From dark to bright with rising growth; its brightness alone tells (after cividis). */

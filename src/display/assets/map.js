@@ -1,9 +1,11 @@
 // Growth rates and frequencies against the friction coefficient, with the present one as a moving cursor.
 
-import { colour, fixed, known, modeColour, put } from "./format.js";
+import { colour, fixed, known, labels, modeColour, put } from "./format.js";
 
 /** Seven colours; beyond that, dashes tell the modes apart. */
 const DASHES = [undefined, [8, 4], [2, 3]];
+/** From the middle of a dot to the edge of its strip, px. */
+const REACH = 6;
 
 const at = (id) => document.getElementById(id);
 
@@ -59,7 +61,7 @@ export class StabilityMap {
     if (this.state) this.cursor(this.state);
   }
 
-  #plot(element, label, values, zero) {
+  #plot(element, label, quantity, zero) {
     const { mu, modes, windows } = this.curves;
     const ink = colour("--muted");
     const grid = { stroke: colour("--grid"), width: 1 };
@@ -98,6 +100,7 @@ export class StabilityMap {
       ctx.restore();
     };
     const size = this.#size(element);
+    const values = (_, ticks) => labels(ticks);
     const u = new uPlot({
       ...size,
       padding: [8, 12, 0, 0],
@@ -106,19 +109,20 @@ export class StabilityMap {
       cursor: { show: false },
       scales: { x: { time: false, min, max, auto: false, range: (_, low, high) => [low, high] }, y: { range: padded } },
       axes: [
-        { stroke: ink, grid, ticks: grid, font, labelFont: font, label: zero ? undefined : "friction coefficient μ", labelSize: zero ? 0 : 1.7 * px, size: 2.3 * px },
-        { stroke: ink, grid, ticks: grid, font, labelFont: font, label, labelSize: 1.7 * px, size: 5.8 * px },
+        { stroke: ink, grid, ticks: grid, font, labelFont: font, label: zero ? undefined : "friction coefficient μ", labelSize: zero ? 0 : 1.7 * px, size: 2.3 * px, values },
+        { stroke: ink, grid, ticks: grid, font, labelFont: font, label, labelSize: 1.7 * px, size: 5.8 * px, values },
       ],
       series: [{}, ...modes.map((mode) => ({ stroke: modeColour(mode.id), width: 2, dash: DASHES[Math.floor(mode.id / 7) % DASHES.length], points: { show: false } }))],
       hooks: { drawClear: [shade] },
-    }, [mu, ...modes.map(values)], element);
+    }, [mu, ...modes.map(quantity)], element);
     const spread = document.createElement("div");
     spread.className = "mu-spread";
     const line = document.createElement("div");
     line.className = "mu-cursor";
     const dots = document.createElement("canvas");
     dots.className = "mu-dots";
-    u.over.append(spread, dots, line);
+    dots.setAttribute("aria-hidden", "true");
+    u.over.append(spread, line, dots);
     return { u, element, spread, line, dots, growth: zero };
   }
 
@@ -134,7 +138,7 @@ export class StabilityMap {
     if (this.state) this.cursor(this.state);
   }
 
-  /** Moves the cursor: a transform, no drawing. */
+  /** Moves the cursor to the present conditions, with a dot where each mode is. */
   cursor(state) {
     this.state = state;
     const { mu, spread } = state;
@@ -142,44 +146,41 @@ export class StabilityMap {
       this.highest = mu;
       if (this.plots.length && mu > 0.95 * this.plots[0].u.scales.x.max) this.#zoom();
     }
+    const shown = known(mu);
     for (const plot of this.plots) {
-      const shown = known(mu);
-      plot.line.hidden = !shown;
+      plot.line.hidden = plot.dots.hidden = !shown;
       plot.spread.hidden = !shown || !spread;
       if (!shown) continue;
-      plot.line.style.transform = `translateX(${plot.u.valToPos(mu, "x").toFixed(1)}px)`;
+      const x = plot.u.valToPos(mu, "x").toFixed(1);
+      plot.line.style.transform = plot.dots.style.transform = `translateX(${x}px)`;
       if (spread) {
         const [low, high] = spread.map((value) => plot.u.valToPos(value, "x"));
         plot.spread.style.transform = `translateX(${low.toFixed(1)}px) scaleX(${Math.max(1, high - low).toFixed(1)})`;
       }
+      this.#dots(plot, state.modes ?? []);
     }
   }
 
-  /** Where each mode is at this moment. */
-  dots() {
-    const state = this.state;
-    for (const { u, dots, growth } of this.plots) {
-      const { clientWidth: width, clientHeight: height } = u.over;
-      const ratio = devicePixelRatio;
-      if (dots.width !== Math.round(width * ratio) || dots.height !== Math.round(height * ratio)) {
-        dots.width = Math.round(width * ratio);
-        dots.height = Math.round(height * ratio);
-      }
-      const ctx = dots.getContext("2d");
-      ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-      ctx.clearRect(0, 0, width, height);
-      if (!state || !known(state.mu)) continue;
-      const x = u.valToPos(state.mu, "x");
-      ctx.lineWidth = 1.5;
-      ctx.strokeStyle = colour("--panel");
-      for (const [id, [hz, sigma]] of state.modes ?? []) {
-        const y = u.valToPos(growth ? sigma : hz, "y");
-        ctx.fillStyle = modeColour(id);
-        ctx.beginPath();
-        ctx.arc(x, y, 4.5, 0, 2 * Math.PI);
-        ctx.fill();
-        ctx.stroke();
-      }
+  /** A strip as wide as a dot that the cursor carries along; drawn anew where a dot went up or down. */
+  #dots({ u, dots, growth }, modes) {
+    const ratio = devicePixelRatio;
+    const [width, height] = [Math.round(2 * REACH * ratio), Math.round(u.bbox.height * ratio / uPlot.pxRatio)];
+    const places = modes.map(([id, [hz, sigma]]) => [id, Math.round(u.valToPos(growth ? sigma : hz, "y") * ratio) / ratio]);
+    const picture = `${height} ${colour("--panel")} ${places}`;
+    if (dots.picture === picture) return;
+    dots.picture = picture;
+    if (dots.width !== width || dots.height !== height) [dots.width, dots.height] = [width, height];
+    const ctx = dots.getContext("2d");
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ctx.clearRect(0, 0, 2 * REACH, height);
+    ctx.lineWidth = 1.5;
+    ctx.strokeStyle = colour("--panel");
+    for (const [id, y] of places) {
+      ctx.fillStyle = modeColour(id);
+      ctx.beginPath();
+      ctx.arc(REACH, y, 4.5, 0, 2 * Math.PI);
+      ctx.fill();
+      ctx.stroke();
     }
   }
 }

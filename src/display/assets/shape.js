@@ -1,10 +1,13 @@
 // A mode in motion: Re(x e^{iφ}) with the phase φ running forward, so that travelling waves travel the right way.
 
+import { next } from "./clock.js";
 import { colour, fixed } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 /** Seconds of a period on the screen. */
 const PERIOD = 2.4;
+/** Time between two places of the slider while it plays, ms. */
+const SLIDER_EVERY = 150;
 
 /** Displacements at a phase: Re((re + i im) e^{iφ}). */
 export function displaced(re, im, phase) {
@@ -47,13 +50,17 @@ export class ShapeView {
       this.#play(false);
       this.#turn(Number(event.target.value) * Math.PI / 180);
     });
+    this.size = [this.stage.clientWidth, this.stage.clientHeight];
+    this.frame = this.frame.bind(this);
     this.#play(this.playing);
-    new ResizeObserver(() => this.#draw()).observe(this.stage);
+    new ResizeObserver(() => {
+      this.size = [this.stage.clientWidth, this.stage.clientHeight];
+      this.#draw();
+    }).observe(this.stage);
     new IntersectionObserver((entries) => {
-      this.visible = entries.some((entry) => entry.isIntersecting);
+      this.visible = entries.at(-1).isIntersecting;
       this.#run();
     }).observe(this.stage);
-    this.frame = this.frame.bind(this);
   }
 
   async show(shape) {
@@ -93,6 +100,7 @@ export class ShapeView {
 
   #play(playing) {
     this.playing = playing;
+    this.sliderAt = undefined;
     const button = at("shape-play");
     button.textContent = playing ? "Pause" : "Play";
     button.setAttribute("aria-pressed", String(playing));
@@ -103,33 +111,34 @@ export class ShapeView {
     if (this.running || !this.playing || !this.visible || !this.shape) return;
     this.running = true;
     this.before = performance.now();
-    requestAnimationFrame(this.frame);
+    next(this.frame);
   }
 
   frame(now) {
     this.running = this.playing && this.visible;
     if (!this.running) return;
-    // 30 pictures a second are enough.
-    if (now - this.before >= 30) {
-      this.#turn(this.phase + 2 * Math.PI * Math.min(0.2, (now - this.before) / 1000) / PERIOD);
-      this.before = now;
-    }
-    requestAnimationFrame(this.frame);
+    this.#turn(this.phase + 2 * Math.PI * Math.max(0, Math.min(0.2, (now - this.before) / 1000)) / PERIOD);
+    this.before = now;
+    next(this.frame);
   }
 
   #turn(phase) {
     this.phase = phase % (2 * Math.PI);
-    const degrees = Math.round(this.phase * 180 / Math.PI);
-    at("shape-phase").value = degrees;
-    at("shape-degrees").textContent = `${degrees}°`;
+    const now = performance.now();
+    // Moving a slider is work: while it plays that is done now and then.
+    if (!this.playing || !(now - this.sliderAt < SLIDER_EVERY)) {
+      this.sliderAt = now;
+      const degrees = Math.round(this.phase * 180 / Math.PI) % 360;
+      at("shape-phase").value = degrees;
+      at("shape-degrees").textContent = `${degrees}°`;
+    }
     this.#draw();
   }
 
   #draw() {
-    if (!this.shape || !this.picture) return;
-    const { clientWidth: width, clientHeight: height } = this.stage;
-    this.picture.draw(this.phase, width, height);
-    this.canvas.dataset.phase = this.phase.toFixed(4);
+    // Without room, as in a window that is being closed, there is nothing to draw.
+    if (!this.shape || !this.picture || Math.min(...this.size) < 50) return;
+    this.picture.draw(this.phase, ...this.size);
   }
 }
 
@@ -138,83 +147,64 @@ class Sticks {
   constructor(canvas) {
     this.canvas = canvas;
     this.ctx = canvas.getContext("2d");
+    // What stands still has a canvas of its own and is drawn once.
+    this.behind = document.createElement("canvas");
+    this.behind.setAttribute("aria-hidden", "true");
+    canvas.before(this.behind);
   }
 
   take(shape) {
     this.shape = shape;
     this.paint = { ink: colour("--ink"), muted: colour("--muted"), grid: colour("--grid"), pad: colour("--mode-0"), disc: colour("--mode-1"), other: colour("--mode-2") };
+    this.laidFor = undefined;
   }
 
-  dispose() {}
+  dispose() {
+    this.behind.remove();
+  }
 
-  draw(phase, width, height) {
-    const { ctx, canvas, paint } = this;
+  /** Where everything is, and what stands still. */
+  #lay(width, height) {
+    const { shape, paint } = this;
     const ratio = devicePixelRatio;
-    const size = [Math.round(width * ratio), Math.round(height * ratio)];
-    if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
-    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-    ctx.clearRect(0, 0, width, height);
+    this.laidFor = `${width} ${height} ${ratio}`;
+    for (const canvas of [this.canvas, this.behind]) [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
+    const ctx = this.behind.getContext("2d");
+    for (const each of [this.ctx, ctx]) each.setTransform(ratio, 0, 0, ratio, 0, 0);
     const text = Math.max(11, Math.min(18, width / 34));
     ctx.font = `${text}px system-ui, sans-serif`;
-    const count = this.shape.parts.reduce((sum, part) => sum + part.re.length, 0);
-    const gap = this.shape.parts.length > 1 ? 1 : 0;
-    const step = (width - 24) / (count + gap * (this.shape.parts.length - 1));
+    const count = shape.parts.reduce((sum, part) => sum + part.re.length, 0);
+    const gaps = shape.parts.length - 1;
+    const step = (width - 24) / (count + gaps);
     const dial = Math.min(step * 0.3, height * 0.06, 14);
     const middle = (height - 2 * dial - 2.2 * text) / 2 + text * 0.6;
     const head = Math.max(2.5, Math.min(9, step * 0.22));
     const reach = middle - text * 1.5 - head;
+    const hands = height - dial - text * 1.35;
     let x = 12 + step / 2;
-    for (const part of this.shape.parts) {
-      const u = displaced(part.re, part.im, phase);
-      const from = x - step / 2;
+    const parts = shape.parts.map((part) => {
+      const tone = paint[part.name] ?? paint.other;
+      const first = x;
       ctx.fillStyle = paint.muted;
       ctx.textAlign = "left";
-      ctx.fillText(part.name, from + 2, text);
+      ctx.fillText(part.name, first - step / 2 + 2, text);
       ctx.strokeStyle = paint.muted;
       ctx.lineWidth = 1;
       ctx.beginPath();
-      ctx.moveTo(from, middle);
-      ctx.lineTo(from + step * u.length, middle);
+      ctx.moveTo(first - step / 2, middle);
+      ctx.lineTo(first + step * (part.re.length - 0.5), middle);
       ctx.stroke();
-      const tone = paint[part.name] ?? paint.other;
-      const heights = u.map((value) => middle - value * reach);
-      // The line through the heads makes the figure.
-      ctx.strokeStyle = tone;
-      ctx.globalAlpha = 0.35;
-      ctx.beginPath();
-      heights.forEach((y, k) => ctx[k ? "lineTo" : "moveTo"](x + k * step, y));
-      ctx.stroke();
-      u.forEach((value, k) => {
-        const magnitude = Math.hypot(part.re[k], part.im[k]);
+      part.re.forEach((re, k) => {
+        const magnitude = Math.hypot(re, part.im[k]);
         ctx.globalAlpha = 0.16;
         ctx.fillStyle = tone;
         ctx.fillRect(x - head, middle - magnitude * reach, 2 * head, 2 * magnitude * reach);
         ctx.globalAlpha = 1;
-        ctx.strokeStyle = tone;
-        ctx.lineWidth = Math.max(1.5, head / 3);
-        ctx.beginPath();
-        ctx.moveTo(x, middle);
-        ctx.lineTo(x, heights[k]);
-        ctx.stroke();
-        ctx.beginPath();
-        ctx.arc(x, heights[k], head, 0, 2 * Math.PI);
-        ctx.fill();
-        const y = height - dial - text * 1.35;
         ctx.strokeStyle = paint.grid;
         ctx.lineWidth = 1.5;
         ctx.beginPath();
-        ctx.arc(x, y, dial, 0, 2 * Math.PI);
+        ctx.arc(x, hands, dial, 0, 2 * Math.PI);
         ctx.stroke();
-        if (magnitude > 1e-3) {
-          const angle = Math.atan2(part.im[k], part.re[k]) + phase;
-          const length = dial * (0.35 + 0.65 * magnitude);
-          ctx.strokeStyle = tone;
-          ctx.lineWidth = 2;
-          ctx.beginPath();
-          ctx.moveTo(x, y);
-          ctx.lineTo(x + length * Math.cos(angle), y - length * Math.sin(angle));
-          ctx.stroke();
-        }
         if (step > text * 0.9) {
           ctx.fillStyle = paint.muted;
           ctx.textAlign = "center";
@@ -222,7 +212,51 @@ class Sticks {
         }
         x += step;
       });
-      x += gap * step;
+      x += step;
+      return { part, tone, first };
+    });
+    this.laid = { parts, step, dial, middle, head, reach, hands };
+  }
+
+  draw(phase, width, height) {
+    const { ctx } = this;
+    if (this.laidFor !== `${width} ${height} ${devicePixelRatio}`) this.#lay(width, height);
+    const { parts, step, dial, middle, head, reach, hands } = this.laid;
+    ctx.clearRect(0, 0, width, height);
+    for (const { part, tone, first } of parts) {
+      const heights = displaced(part.re, part.im, phase).map((value) => middle - value * reach);
+      ctx.strokeStyle = ctx.fillStyle = tone;
+      // The line through the heads makes the figure.
+      ctx.lineWidth = 1;
+      ctx.globalAlpha = 0.35;
+      ctx.beginPath();
+      heights.forEach((y, k) => ctx.lineTo(first + k * step, y));
+      ctx.stroke();
+      ctx.globalAlpha = 1;
+      ctx.lineWidth = Math.max(1.5, head / 3);
+      ctx.beginPath();
+      heights.forEach((y, k) => {
+        ctx.moveTo(first + k * step, middle);
+        ctx.lineTo(first + k * step, y);
+      });
+      ctx.stroke();
+      ctx.beginPath();
+      heights.forEach((y, k) => {
+        ctx.moveTo(first + k * step + head, y);
+        ctx.arc(first + k * step, y, head, 0, 2 * Math.PI);
+      });
+      ctx.fill();
+      ctx.lineWidth = 2;
+      ctx.beginPath();
+      part.re.forEach((re, k) => {
+        const magnitude = Math.hypot(re, part.im[k]);
+        if (magnitude <= 1e-3) return;
+        const angle = Math.atan2(part.im[k], re) + phase;
+        const length = dial * (0.35 + 0.65 * magnitude);
+        ctx.moveTo(first + k * step, hands);
+        ctx.lineTo(first + k * step + length * Math.cos(angle), hands - length * Math.sin(angle));
+      });
+      ctx.stroke();
     }
   }
 }

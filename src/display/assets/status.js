@@ -14,16 +14,20 @@ export class Status {
     this.#scale(Math.max(0.1, 2 * this.warn));
   }
 
-  /** The level at once. */
+  /** The level at once, and its reason with it. */
   level(level, reason) {
     const name = LEVELS[level] ?? "none";
     const panel = at("status");
     if (panel.dataset.level !== name) {
+      this.#reason(level, reason);
       panel.dataset.level = name;
       document.documentElement.dataset.level = name;
       at("status-shape").setAttribute("href", `#shape-${name}`);
       at("level").textContent = WORDS[level] ?? "WAITING";
     }
+  }
+
+  #reason(level, reason) {
     if (level !== undefined) put(at("reason"), reason || CALM);
   }
 
@@ -49,16 +53,17 @@ export class Status {
     if (!known(margin)) return;
     if (Math.abs(margin) > this.reach) this.#scale(Math.abs(margin));
     const x = this.#x(margin);
-    needle.setAttribute("transform", `translate(${x.toFixed(1)} 0)`);
+    needle.style.transform = `translateX(${x.toFixed(2)}%)`;
     if (known(trend)) {
-      const trail = at("gauge-trail");
-      trail.setAttribute("x1", x.toFixed(1));
-      trail.setAttribute("x2", this.#x(margin + trend).toFixed(1));
+      const length = this.#x(margin + trend) - x;
+      at("gauge-trail").style.transform = `translateX(${x.toFixed(2)}%) scaleX(${(length / 100).toFixed(4)})`;
     }
   }
 
   numbers(state, age) {
     const { growth, worst, load, speed } = this.decimals;
+    // Its numbers change with every state; nobody reads as fast.
+    if (!at("status").classList.contains("stale")) this.#reason(state.level, state.reason);
     put(at("margin"), signed(state.margin, 4), state.margin);
     put(at("mu"), fixed(state.mu, 4), state.mu);
     put(at("critical"), fixed(state.critical, 4), state.critical);
@@ -85,8 +90,9 @@ export class Status {
     put(element, arrow);
   }
 
+  /** Place on the gauge, %. */
   #x(margin) {
-    return 200 + 190 * Math.max(-1, Math.min(1, margin / this.reach));
+    return 50 + 47.5 * Math.max(-1, Math.min(1, margin / this.reach));
   }
 
   /** The scale only grows, in steps: it does not follow the needle about. */
@@ -94,9 +100,8 @@ export class Status {
     const steps = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
     this.reach = steps.find((step) => step >= reach) ?? reach;
     const warn = this.#x(this.warn);
-    at("gauge-warn").setAttribute("width", Math.max(0, warn - 200));
-    at("gauge-ok").setAttribute("x", warn);
-    at("gauge-ok").setAttribute("width", 400 - warn);
+    at("gauge-warn").style.width = `${Math.max(0, warn - 50)}%`;
+    at("gauge-ok").style.left = `${warn}%`;
     put(at("gauge-low"), fixed(-this.reach, 1));
     put(at("gauge-high"), signed(this.reach, 1));
   }

@@ -1,0 +1,247 @@
+//! A rig against the full model it stands for: what `verify` tells and what a rig file carries in `[reduction]`.
+
+use anyhow::{Context, ensure};
+use faer::c64;
+use serde::{Deserialize, Serialize};
+
+use crate::full_model::FullModelFile;
+use crate::physics::{MapOptions, OperatingPoint, Solver, StabilityMap, Window};
+use crate::reduction::{
+    FullProgress, FullSolver, FullVectors, Judged, compare_roots, compare_windows, full_windows, reduced_roots,
+};
+use crate::rig::Rig;
+
+/// Band where neither rig nor full model names one, Hz.
+const DEFAULT_BAND_HZ: f64 = 5000.0;
+/// Roots that decay faster are not compared, 1/s.
+const DECAY_PER_S: f64 = 20.0;
+
+/// How a reduced model differs from the full one: the table `[reduction]` of a rig file.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Certificate {
+    /// `content_hash` of the full model.
+    pub full_model_hash: String,
+    /// How the rig was reduced, in words.
+    #[serde(default)]
+    pub method: String,
+    /// Frequencies up to this were compared, Hz.
+    pub band_hz: f64,
+    /// Held-out operating points.
+    pub points: usize,
+    /// Largest `|Δf| / f`.
+    pub max_frequency_error: f64,
+    /// Largest `|Δσ|`, 1/s.
+    pub max_growth_error_per_s: f64,
+    /// Largest `|Δλ| / |λ|`.
+    pub max_relative_error: f64,
+    /// Largest difference of an end of a window of instability; none where both models have no windows.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub critical_friction_error: Option<f64>,
+    /// Unstable modes of the full model that the rig does not have, over all points, and windows it does not have.
+    pub missed: usize,
+    /// Unstable modes and windows of the rig that the full model does not have.
+    pub invented: usize,
+}
+
+impl Certificate {
+    /// A line for people.
+    pub fn told(&self) -> String {
+        let critical = match self.critical_friction_error {
+            Some(error) => format!(", critical friction {error:.1e}"),
+            None => String::new(),
+        };
+        format!(
+            "reduction  errors at {} held-out points up to {} Hz: frequency {:.1e} relative, growth rate {:.1e} 1/s{critical}; \
+             {} unstable modes missed, {} invented",
+            self.points,
+            self.band_hz,
+            self.max_frequency_error,
+            self.max_growth_error_per_s,
+            self.missed,
+            self.invented
+        )
+    }
+}
+
+/// What is compared.
+#[derive(Clone, Debug)]
+pub struct Against {
+    /// Held-out operating points.
+    pub points: usize,
+    /// Which ones.
+    pub seed: u64,
+    /// Highest frequency, Hz, in place of the rig's or the full model's.
+    pub band_hz: Option<f64>,
+    pub memory_limit_bytes: Option<usize>,
+    /// Whether windows of instability are compared too.
+    pub windows: bool,
+}
+
+/// The errors at one operating point.
+#[derive(Clone, Debug, Serialize)]
+pub struct PointReport {
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub friction_coefficient: f64,
+    pub modes: usize,
+    pub max_frequency_error: f64,
+    pub max_growth_error_per_s: f64,
+    pub max_relative_error: f64,
+    /// Growth rate, 1/s, and frequency, Hz.
+    pub missed: Vec<[f64; 2]>,
+    pub invented: Vec<[f64; 2]>,
+    pub unpaired: usize,
+}
+
+/// A window of instability of one model or of both.
+#[derive(Clone, Debug, Serialize)]
+pub struct WindowReport {
+    pub normal_load_n: f64,
+    pub disc_speed_rad_s: f64,
+    pub kind: &'static str,
+    pub full: Option<WindowEnds>,
+    pub rig: Option<WindowEnds>,
+}
+
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct WindowEnds {
+    pub mu_from: f64,
+    pub mu_to: Option<f64>,
+    pub frequency_hz: f64,
+}
+
+/// Everything `verify` found.
+#[derive(Clone, Debug, Serialize)]
+pub struct Verified {
+    pub certificate: Certificate,
+    pub points: Vec<PointReport>,
+    pub windows: Vec<WindowReport>,
+}
+
+/// Compares a rig with its full model at held-out operating points of the rig's range, and their windows of instability
+/// at the reference and at the corners of that range. `progress` hears what is done.
+///
+/// # Errors
+/// A full model that cannot be solved, or a rig.
+pub fn verify_against(
+    rig: &Rig,
+    full: &FullModelFile,
+    against: &Against,
+    progress: &mut dyn FnMut(&str, FullProgress),
+) -> anyhow::Result<Verified> {
+    ensure!(against.points > 0, "--points is 0, expected at least 1");
+    full.refuse_modal_damping()?;
+    let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
+    let band_rad_s = std::f64::consts::TAU * band_hz;
+    let judged = Judged { band_rad_s, instability_threshold: rig.instability_threshold, decay_per_s: DECAY_PER_S };
+    let mut full_solver =
+        FullSolver::new(&full.name, &full.model, against.memory_limit_bytes, &mut |p| progress("analysis", p))
+            .with_context(|| full.path.display().to_string())?;
+    let mut solver = Solver::new(rig.model.dimension());
+    let mut points = vec![];
+    for (index, p) in held_out(rig, against).into_iter().enumerate() {
+        let told = format!("point {} of {}", index + 1, against.points);
+        let found = full_solver
+            .roots(&p, band_rad_s, FullVectors::None, &mut |step| progress(&told, step))
+            .with_context(|| format!("full model at {p:?}"))?;
+        let lambdas: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
+        let reduced = reduced_roots(&rig.model, &mut solver, &p).with_context(|| format!("rig at {p:?}"))?;
+        let comparison = compare_roots(&lambdas, &reduced, &judged);
+        let listed = |roots: &[c64]| roots.iter().map(|l| [l.re, l.im / std::f64::consts::TAU]).collect();
+        points.push(PointReport {
+            normal_load_n: p.normal_load_n,
+            disc_speed_rad_s: p.disc_speed_rad_s,
+            friction_coefficient: p.friction_coefficient,
+            modes: comparison.pairs.len(),
+            max_frequency_error: comparison.frequency_error(),
+            max_growth_error_per_s: comparison.growth_error_per_s(),
+            max_relative_error: comparison.relative_error(),
+            missed: listed(&comparison.missed),
+            invented: listed(&comparison.invented),
+            unpaired: comparison.unpaired,
+        });
+    }
+    let options = MapOptions {
+        mu_min: 0.0,
+        mu_max: rig.mu_max.min(rig.limits.friction_coefficient[1]),
+        band_max_hz: Some(band_hz),
+        instability_threshold: rig.instability_threshold,
+        windows: true,
+    };
+    let (mut windows, mut critical, mut missed, mut invented) = (vec![], None::<f64>, 0, 0);
+    for p in places(rig).into_iter().filter(|_| against.windows) {
+        let told = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
+        let of_full =
+            full_windows(&full.model, &mut full_solver, &p, band_rad_s, &options, &mut |step| progress(&told, step))?;
+        let of_rig = StabilityMap::build(&rig.model, &mut solver, &p, &options)?.windows;
+        let compared = compare_windows(&of_full, &of_rig);
+        if !compared.pairs.is_empty() {
+            critical = Some(critical.unwrap_or(0.0).max(compared.friction_error()));
+        }
+        missed += compared.missed.len();
+        invented += compared.invented.len();
+        let report = |full: Option<&Window>, rig: Option<&Window>| WindowReport {
+            normal_load_n: p.normal_load_n,
+            disc_speed_rad_s: p.disc_speed_rad_s,
+            kind: full.or(rig).map_or("", |window| window.kind.name()),
+            full: full.map(ends),
+            rig: rig.map(ends),
+        };
+        windows.extend(compared.pairs.iter().map(|(full, rig)| report(Some(full), Some(rig))));
+        windows.extend(compared.missed.iter().map(|full| report(Some(full), None)));
+        windows.extend(compared.invented.iter().map(|rig| report(None, Some(rig))));
+    }
+    let largest = |of: fn(&PointReport) -> f64| points.iter().map(of).fold(0.0, f64::max);
+    let certificate = Certificate {
+        full_model_hash: full.content_hash.clone(),
+        method: rig.reduction.as_ref().map(|known| known.method.clone()).unwrap_or_default(),
+        band_hz,
+        points: points.len(),
+        max_frequency_error: largest(|point| point.max_frequency_error),
+        max_growth_error_per_s: largest(|point| point.max_growth_error_per_s),
+        max_relative_error: largest(|point| point.max_relative_error),
+        critical_friction_error: critical,
+        missed: missed + points.iter().map(|point| point.missed.len()).sum::<usize>(),
+        invented: invented + points.iter().map(|point| point.invented.len()).sum::<usize>(),
+    };
+    Ok(Verified { certificate, points, windows })
+}
+
+fn ends(window: &Window) -> WindowEnds {
+    WindowEnds { mu_from: window.mu_from, mu_to: window.mu_to, frequency_hz: window.frequency_hz }
+}
+
+/// Operating points of the rig's chart, friction coefficients from 0 to the highest that is searched.
+fn held_out(rig: &Rig, against: &Against) -> Vec<OperatingPoint> {
+    use rand::{RngExt, SeedableRng};
+    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(against.seed);
+    let mut within = |[low, high]: [f64; 2]| low + (high - low) * random.random::<f64>();
+    let [mu_low, mu_high] = rig.limits.friction_coefficient;
+    (0..against.points)
+        .map(|_| OperatingPoint {
+            normal_load_n: within(rig.chart.normal_load_n),
+            disc_speed_rad_s: within(rig.chart.disc_speed_rad_s),
+            friction_coefficient: within([mu_low.max(0.0), mu_high.min(rig.mu_max)]),
+        })
+        .collect()
+}
+
+/// Where windows are compared: at the reference, and at the ends of the rig's range of loads and speeds where they matter.
+fn places(rig: &Rig) -> Vec<OperatingPoint> {
+    let mut places = vec![rig.reference];
+    let (load, speed) = rig.model.depends_on_load_and_speed();
+    if load || speed {
+        for end in 0..2 {
+            let mut place = rig.reference;
+            if load {
+                place.normal_load_n = rig.chart.normal_load_n[end];
+            }
+            if speed {
+                place.disc_speed_rad_s = rig.chart.disc_speed_rad_s[end];
+            }
+            places.push(place);
+        }
+    }
+    places
+}

@@ -1,0 +1,188 @@
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::Context;
+use clap::Args;
+use serde::Serialize;
+
+use super::{Outcome, finite, positive, print};
+use crate::full_model::FullModelFile;
+use crate::physics::OperatingPoint;
+use crate::reduction::{FullProgress, FullSolver, FullSpectrum, FullVectors};
+
+/// Bytes in a GiB.
+pub const GIB: f64 = (1_u64 << 30) as f64;
+/// Band where the full model names none, Hz.
+const DEFAULT_BAND_HZ: f64 = 5000.0;
+
+/// Find the complex eigenvalues of a full model under one set of conditions
+///
+/// Every root of the band, as far as discs around shifts on the imaginary axis cover it; each with its residual.
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Full model (TOML)
+    full: PathBuf,
+    /// Friction coefficient [default: the model's reference]
+    #[arg(long, value_name = "MU", value_parser = finite, allow_negative_numbers = true)]
+    mu: Option<f64>,
+    /// Normal load in N [default: the model's reference]
+    #[arg(long, value_name = "N", value_parser = finite, allow_negative_numbers = true)]
+    load: Option<f64>,
+    /// Disc speed in rad/s; negative turns the other way [default: the model's reference]
+    #[arg(long, value_name = "RAD_S", value_parser = finite, allow_negative_numbers = true)]
+    speed: Option<f64>,
+    /// Highest frequency in Hz [default: the model's band, else 5000]
+    #[arg(long, value_name = "HZ", value_parser = positive)]
+    band_hz: Option<f64>,
+    /// Refuse to start where more memory than this is needed
+    #[arg(long, value_name = "GIB", value_parser = positive)]
+    memory_gib: Option<f64>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// What `full --json` prints.
+#[derive(Serialize)]
+struct Report<'a> {
+    full_model: &'a str,
+    content_hash: &'a str,
+    degrees_of_freedom: usize,
+    normal_load_n: f64,
+    disc_speed_rad_s: f64,
+    friction_coefficient: f64,
+    band_hz: f64,
+    /// Growth rates up to this, either way, were covered at every frequency of the band; null where all were.
+    covered_growth_per_s: f64,
+    discs: Vec<DiscReport>,
+    roots: Vec<RootReport>,
+}
+
+#[derive(Serialize)]
+struct DiscReport {
+    shift_hz: f64,
+    from_hz: f64,
+    to_hz: f64,
+}
+
+#[derive(Serialize)]
+struct RootReport {
+    growth_rate_per_s: f64,
+    omega_rad_s: f64,
+    frequency_hz: f64,
+    damping_ratio: f64,
+    residual: f64,
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let started = Instant::now();
+        let full = FullModelFile::load(&self.full)?;
+        full.refuse_modal_damping()?;
+        eprintln!("{} degrees of freedom read ({:.1} s)", full.model.dimension(), started.elapsed().as_secs_f64());
+        let reference = full.settings.reference;
+        let p = OperatingPoint {
+            normal_load_n: self.load.unwrap_or(reference.normal_load_n),
+            disc_speed_rad_s: self.speed.unwrap_or(reference.disc_speed_rad_s),
+            friction_coefficient: self.mu.unwrap_or(reference.friction_coefficient),
+        };
+        let band_hz = self.band_hz.or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
+        let mut said = |step: FullProgress| {
+            eprintln!("{} ({:.1} s)", told(step), started.elapsed().as_secs_f64());
+        };
+        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize);
+        let mut solver = FullSolver::new(&full.name, &full.model, limit, &mut said)
+            .with_context(|| self.full.display().to_string())?;
+        let found = solver
+            .roots(&p, std::f64::consts::TAU * band_hz, FullVectors::None, &mut said)
+            .with_context(|| self.full.display().to_string())?;
+        if self.json {
+            print(&(serde_json::to_string(&report(&full, &p, band_hz, &found))? + "\n"))?;
+        } else {
+            print(&table(&full, &p, band_hz, &found))?;
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+/// What a full solve is doing, in words.
+pub fn told(step: FullProgress) -> String {
+    let hz = |omega: f64| omega / std::f64::consts::TAU;
+    match step {
+        FullProgress::Analysed { bytes } => format!("ordered and analysed: needs {:.2} GiB", bytes as f64 / GIB),
+        FullProgress::Factored { shift_rad_s } => format!("factored at {:.1} Hz", hz(shift_rad_s)),
+        FullProgress::Iterated { shift_rad_s, vectors, converged } => {
+            format!("around {:.1} Hz: {vectors} vectors, {converged} roots", hz(shift_rad_s))
+        }
+        FullProgress::Covered { disc, roots } => {
+            let [from, to] = disc.stretch_rad_s();
+            format!("covered {:.1} to {:.1} Hz with {roots} roots", hz(from), hz(to))
+        }
+    }
+}
+
+fn report<'a>(full: &'a FullModelFile, p: &OperatingPoint, band_hz: f64, found: &FullSpectrum) -> Report<'a> {
+    let hz = |omega: f64| omega / std::f64::consts::TAU;
+    Report {
+        full_model: &full.name,
+        content_hash: &full.content_hash,
+        degrees_of_freedom: full.model.dimension(),
+        normal_load_n: p.normal_load_n,
+        disc_speed_rad_s: p.disc_speed_rad_s,
+        friction_coefficient: p.friction_coefficient,
+        band_hz,
+        covered_growth_per_s: found.covered_growth_per_s,
+        discs: found
+            .discs
+            .iter()
+            .map(|disc| {
+                let [from, to] = disc.stretch_rad_s();
+                DiscReport { shift_hz: hz(disc.shift_rad_s), from_hz: hz(from), to_hz: hz(to) }
+            })
+            .collect(),
+        roots: found
+            .roots
+            .iter()
+            .map(|root| RootReport {
+                growth_rate_per_s: root.lambda.re,
+                omega_rad_s: root.lambda.im,
+                frequency_hz: hz(root.lambda.im),
+                damping_ratio: -root.lambda.re / root.lambda.norm(),
+                residual: root.residual,
+            })
+            .collect(),
+    }
+}
+
+fn table(full: &FullModelFile, p: &OperatingPoint, band_hz: f64, found: &FullSpectrum) -> String {
+    let mut text = format!(
+        "{}: {} degrees of freedom, {} N, {} rad/s, friction coefficient {}\n\n   frequency     growth rate  damping ratio  residual\n          Hz             1/s\n",
+        full.name,
+        full.model.dimension(),
+        p.normal_load_n,
+        p.disc_speed_rad_s,
+        p.friction_coefficient
+    );
+    for root in &found.roots {
+        let lambda = root.lambda;
+        let mark = if lambda.re > full.settings.instability_threshold * lambda.norm() { "  unstable" } else { "" };
+        text += &format!(
+            "{:>12.4}  {:>14.6}  {:>13.3e}  {:>8.1e}{mark}\n",
+            lambda.im / std::f64::consts::TAU,
+            lambda.re,
+            -lambda.re / lambda.norm(),
+            root.residual
+        );
+    }
+    let growth = found.covered_growth_per_s;
+    text += &if growth.is_finite() {
+        let discs = found.discs.len();
+        format!(
+            "\n{} roots; covered: 0 to {band_hz} Hz, growth rates from -{growth:.0} to {growth:.0} 1/s, by {discs} discs\n",
+            found.roots.len()
+        )
+    } else {
+        format!("\n{} roots: all up to {band_hz} Hz\n", found.roots.len())
+    };
+    text
+}

@@ -1,0 +1,132 @@
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use clap::Args;
+
+use super::full::{GIB, told};
+use super::{Outcome, positive, print};
+use crate::certificate::{Against, Verified, WindowEnds, verify_against};
+use crate::full_model::FullModelFile;
+use crate::rig::Rig;
+
+/// Compare a reduced rig with the full model it stands for
+///
+/// Frequencies and growth rates at operating points drawn from the rig's chart, windows of instability at its reference
+/// and at the corners of that range. Exit code 3 where an unstable mode is missed or invented, or an error exceeds the
+/// tolerance.
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    rig: String,
+    /// Full model (TOML) to compare with
+    #[arg(long, value_name = "FULL")]
+    against: PathBuf,
+    /// Held-out operating points
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    points: usize,
+    /// Which points are drawn
+    #[arg(long, value_name = "SEED", default_value_t = 1)]
+    seed: u64,
+    /// Largest relative error of an eigenvalue that is agreement
+    #[arg(long, value_name = "R", value_parser = positive, default_value = "0.01")]
+    tolerance: f64,
+    /// Highest frequency in Hz [default: the rig's band, else the full model's, else 5000]
+    #[arg(long, value_name = "HZ", value_parser = positive)]
+    band_hz: Option<f64>,
+    /// Compare roots only: the windows of a large damped model take long
+    #[arg(long)]
+    no_windows: bool,
+    /// Refuse to start where more memory than this is needed
+    #[arg(long, value_name = "GIB", value_parser = positive)]
+    memory_gib: Option<f64>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let started = Instant::now();
+        let rig = Rig::load(&self.rig)?;
+        let full = FullModelFile::load(&self.against)?;
+        if let Some(known) = rig.reduction.as_ref().filter(|known| known.full_model_hash != full.content_hash) {
+            eprintln!(
+                "the rig was reduced from another full model: {}, this one is {}",
+                known.full_model_hash, full.content_hash
+            );
+        }
+        let against = Against {
+            points: self.points,
+            seed: self.seed,
+            band_hz: self.band_hz,
+            windows: !self.no_windows,
+            memory_limit_bytes: self.memory_gib.map(|gib| (gib * GIB) as usize),
+        };
+        let found = verify_against(&rig, &full, &against, &mut |what, step| {
+            eprintln!("{what}: {} ({:.1} s)", told(step), started.elapsed().as_secs_f64());
+        })?;
+        print(&if self.json { serde_json::to_string(&found)? + "\n" } else { text(&rig, &full, &found) })?;
+        let certificate = &found.certificate;
+        let agrees = certificate.missed == 0
+            && certificate.invented == 0
+            && certificate.max_relative_error <= self.tolerance
+            && found.points.iter().all(|point| point.unpaired == 0);
+        Ok(if agrees { Outcome::Done } else { Outcome::Differences })
+    }
+}
+
+fn text(rig: &Rig, full: &FullModelFile, found: &Verified) -> String {
+    let mut text = format!(
+        "{} against {} ({} degrees of freedom)\n\n      load     speed  friction  modes  frequency error  growth error  |error|\n         N     rad/s                          relative           1/s  relative\n",
+        rig.name,
+        full.name,
+        full.model.dimension()
+    );
+    for point in &found.points {
+        let _ = writeln!(
+            text,
+            "{:>10.3}{:>10.4}{:>10.5}{:>7}{:>17.2e}{:>14.2e}{:>9.1e}",
+            point.normal_load_n,
+            point.disc_speed_rad_s,
+            point.friction_coefficient,
+            point.modes,
+            point.max_frequency_error,
+            point.max_growth_error_per_s,
+            point.max_relative_error
+        );
+        for (what, roots) in [("missed", &point.missed), ("invented", &point.invented)] {
+            for [growth, hz] in roots {
+                let _ = writeln!(text, "            {what}: {hz:.3} Hz growing at {growth:.4} 1/s");
+            }
+        }
+        if point.unpaired > 0 {
+            let _ = writeln!(text, "            {} modes of the full model have no partner", point.unpaired);
+        }
+    }
+    if !found.windows.is_empty() {
+        text += "\nwindows of instability\n";
+    }
+    let told = |ends: &Option<WindowEnds>| match ends {
+        None => "none".to_owned(),
+        Some(WindowEnds { mu_from, mu_to: Some(to), frequency_hz }) => {
+            format!("{mu_from:.8} to {to:.8} at {frequency_hz:.3} Hz")
+        }
+        Some(WindowEnds { mu_from, mu_to: None, frequency_hz }) => {
+            format!("from {mu_from:.8} at {frequency_hz:.3} Hz")
+        }
+    };
+    for window in &found.windows {
+        let _ = writeln!(
+            text,
+            "  {} N, {} rad/s, {}: full {}, rig {}",
+            window.normal_load_n,
+            window.disc_speed_rad_s,
+            window.kind,
+            told(&window.full),
+            told(&window.rig)
+        );
+    }
+    text += &format!("\n{}\n", found.certificate.told());
+    text
+}

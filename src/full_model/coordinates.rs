@@ -1,0 +1,219 @@
+//! Matrices as plain lines, as CalculiX and Abaqus write them, and the rows they are over.
+//!
+//! Three values: row, column, entry (CalculiX `.sti`, `.mas`; Abaqus `FORMAT=COORDINATE`). Five: node, direction, node,
+//! direction, entry (Abaqus `FORMAT=MATRIX INPUT` and `LABELS`). Commas and spaces part them; lines that begin with `*`
+//! are passed over. Where only one triangle is listed, the matrix is symmetric. CalculiX lists in its `.dof` file which
+//! `node.direction` each row is.
+//!
+//! Source: Dhondt, "CalculiX CrunchiX user's manual version 2.20", *FREQUENCY, parameter SOLVER=MATRIXSTORAGE; Abaqus
+//! analysis user's guide, "Generating structural matrices".
+
+use std::collections::{BTreeMap, HashMap};
+use std::io::BufRead;
+
+use super::entries::{Entries, MOST_ROWS};
+use super::tables::Nodes;
+use crate::rig::RigError;
+use crate::rig::lines::{Lines, refuse, told};
+
+/// A diagonal entry of at least this holds its row: what Abaqus writes for a boundary condition.
+const HELD: f64 = 1e35;
+
+/// A row by its labels: node and direction, from 0.
+pub type Label = (u64, usize);
+
+/// An entry as a line lists it.
+enum Listed {
+    Numbers(usize, usize, f64),
+    Labels(Label, Label, f64),
+}
+
+/// Hands every entry to `each` with the number of its line.
+fn scan(
+    file: &str,
+    input: impl BufRead,
+    mut each: impl FnMut(usize, Listed) -> Result<(), RigError>,
+) -> Result<(), RigError> {
+    let mut lines = Lines::new(file, input);
+    while let Some((line, content)) = lines.advance()? {
+        if content.is_empty() || content.starts_with('*') {
+            continue;
+        }
+        let mut words = [""; 6];
+        let mut count = 0;
+        for word in content.split([',', ' ', '\t']).filter(|word| !word.is_empty()).take(6) {
+            words[count] = word;
+            count += 1;
+        }
+        let refuse = |field: &str, word: &str, limit: &str| refuse(file, line, field, told(word), limit);
+        let value = |word: &str| match word.replace(['D', 'd'], "e").parse::<f64>() {
+            Ok(value) if value.is_finite() => Ok(value),
+            _ => Err(refuse("value", word, "a finite number")),
+        };
+        let number = |field: &str, word: &str| match word.parse::<usize>() {
+            Ok(number) if (1..=MOST_ROWS).contains(&number) => Ok(number),
+            _ => Err(refuse(field, word, "a whole number from 1 on")),
+        };
+        let direction = |word: &str| match word.parse::<usize>() {
+            Ok(number @ 1..=6) => Ok(number - 1),
+            _ => Err(refuse("direction", word, "1 to 6")),
+        };
+        let listed = match count {
+            3 => Listed::Numbers(number("row", words[0])? - 1, number("column", words[1])? - 1, value(words[2])?),
+            5 => {
+                let label = |k: usize| Ok((number("node", words[k])? as u64, direction(words[k + 1])?));
+                Listed::Labels(label(0)?, label(2)?, value(words[4])?)
+            }
+            _ => {
+                let limit = "row, column and value, or node, direction, node, direction and value";
+                return Err(refuse("entry", content, limit));
+            }
+        };
+        each(line, listed)?;
+    }
+    Ok(())
+}
+
+/// The rows of a matrix with labels, ascending; those that are held are left out.
+///
+/// # Errors
+/// [`RigError::Line`].
+pub fn rows_of(file: &str, input: impl BufRead) -> Result<Vec<Label>, RigError> {
+    let mut held: BTreeMap<Label, bool> = BTreeMap::new();
+    scan(file, input, |line, listed| match listed {
+        Listed::Labels(row, column, value) => {
+            *held.entry(row).or_default() |= row == column && value >= HELD;
+            held.entry(column).or_default();
+            Ok(())
+        }
+        Listed::Numbers(..) => {
+            let limit = "node, direction, node, direction and value, or `rows` that say what the numbers are";
+            Err(refuse(file, line, "entry", "has a row number".to_owned(), limit))
+        }
+    })?;
+    Ok(held.into_iter().filter(|(_, held)| !held).map(|(label, _)| label).collect())
+}
+
+/// Reads a matrix of `n` rows; `row_of` says which row a label is, `None` where it is held.
+///
+/// # Errors
+/// [`RigError::Line`].
+pub fn read(
+    file: &str,
+    input: impl BufRead,
+    n: usize,
+    row_of: &HashMap<Label, usize>,
+) -> Result<(Entries, Option<i8>), RigError> {
+    let mut entries = Entries::default();
+    let (mut below, mut above) = (false, false);
+    scan(file, input, |line, listed| {
+        let (row, column, value) = match listed {
+            Listed::Numbers(row, column, value) => {
+                for (what, index) in [("row", row), ("column", column)] {
+                    if index >= n {
+                        return Err(refuse(file, line, what, told(&(index + 1).to_string()), &format!("1 to {n}")));
+                    }
+                }
+                (row, column, value)
+            }
+            Listed::Labels(row, column, value) => match (row_of.get(&row), row_of.get(&column)) {
+                (Some(&row), Some(&column)) => (row, column, value),
+                // What is held does not move.
+                _ => return Ok(()),
+            },
+        };
+        below |= row > column;
+        above |= row < column;
+        entries.push(row, column, value);
+        Ok(())
+    })?;
+    Ok((entries, if below && above { None } else { Some(1) }))
+}
+
+/// The line of an entry, either way round; 1 where it is not listed.
+///
+/// # Errors
+/// [`RigError::Line`].
+pub fn line_of(
+    file: &str,
+    input: impl BufRead,
+    row_of: &HashMap<Label, usize>,
+    (row, column): (usize, usize),
+) -> Result<usize, RigError> {
+    let mut found = 1;
+    scan(file, input, |line, listed| {
+        let place = match listed {
+            Listed::Numbers(row, column, _) => (Some(row), Some(column)),
+            Listed::Labels(row, column, _) => (row_of.get(&row).copied(), row_of.get(&column).copied()),
+        };
+        if found == 1 && (place == (Some(row), Some(column)) || place == (Some(column), Some(row))) {
+            found = line;
+        }
+        Ok(())
+    })?;
+    Ok(found)
+}
+
+/// Reads a `.dof` file of CalculiX: `node.direction` of every row.
+///
+/// # Errors
+/// [`RigError::Line`].
+pub fn dof(file: &str, input: impl BufRead) -> Result<Vec<Label>, RigError> {
+    let mut lines = Lines::new(file, input);
+    let mut rows = vec![];
+    while let Some((line, content)) = lines.advance()? {
+        if content.is_empty() {
+            continue;
+        }
+        let label = content.split_once('.').and_then(|(node, direction)| {
+            let direction = direction.parse::<usize>().ok().filter(|direction| (1..=6).contains(direction))?;
+            Some((node.parse::<u64>().ok()?, direction - 1))
+        });
+        match label {
+            Some(label) => rows.push(label),
+            None => return Err(refuse(file, line, "row", told(content), "node.direction, the direction from 1 to 6")),
+        }
+    }
+    Ok(rows)
+}
+
+/// Reads the nodes of a deck of CalculiX or Abaqus: the lines below `*NODE`, lengths multiplied by `scale`.
+///
+/// # Errors
+/// [`RigError::Line`].
+pub fn deck_nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, RigError> {
+    let mut lines = Lines::new(file, input);
+    let (mut labels, mut positions, mut seen) = (vec![], vec![], HashMap::new());
+    let mut inside = false;
+    while let Some((line, content)) = lines.advance()? {
+        if content.starts_with("**") || content.is_empty() {
+            continue;
+        }
+        if let Some(keyword) = content.strip_prefix('*') {
+            let keyword = keyword.split(',').next().unwrap_or("").trim();
+            inside = keyword.eq_ignore_ascii_case("NODE");
+            continue;
+        }
+        if !inside {
+            continue;
+        }
+        let cells: Vec<&str> = content.split(',').map(str::trim).filter(|cell| !cell.is_empty()).collect();
+        let node = cells.first().and_then(|label| label.parse::<u64>().ok());
+        let coordinates: Vec<f64> = cells.iter().skip(1).filter_map(|cell| cell.parse().ok()).collect();
+        match (node, coordinates.as_slice()) {
+            (Some(label), &[x, y, z]) if [x, y, z].iter().all(|value| value.is_finite()) && cells.len() == 4 => {
+                if let Some(before) = seen.insert(label, line) {
+                    let limit = format!("every node once; line {before} has it too");
+                    return Err(refuse(file, line, "node", told(&label.to_string()), &limit));
+                }
+                labels.push(label);
+                positions.push([scale * x, scale * y, scale * z]);
+            }
+            _ => return Err(refuse(file, line, "node", told(content), "a node and three finite coordinates")),
+        }
+    }
+    if labels.is_empty() {
+        return Err(lines.refuse("nodes", "are missing".to_owned(), "lines below *NODE"));
+    }
+    Ok(Nodes::new(&labels, positions))
+}

@@ -1,0 +1,97 @@
+//! The files of a full model, read once from beginning to end, and their hash.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest, Sha256};
+
+use crate::rig::RigError;
+
+/// Bytes that are read at once.
+const CHUNK: usize = 1 << 20;
+
+/// Files beside the TOML file, by the names it uses.
+pub struct Files {
+    /// Name of the TOML file, for errors.
+    pub toml: String,
+    directory: PathBuf,
+    digests: Vec<(String, [u8; 32])>,
+}
+
+impl Files {
+    /// Reads the TOML file itself.
+    ///
+    /// # Errors
+    /// [`RigError::NoSuchFile`].
+    pub fn open(path: &Path) -> Result<(Self, Vec<u8>), RigError> {
+        let bytes = std::fs::read(path).map_err(|error| RigError::NoSuchFile {
+            value: path.display().to_string(),
+            reason: error.to_string(),
+            limit: "the TOML file of a full model".to_owned(),
+        })?;
+        let toml = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let digests = vec![(toml.clone(), Sha256::digest(&bytes).into())];
+        Ok((Self { toml, directory: path.parent().unwrap_or(Path::new("")).to_owned(), digests }, bytes))
+    }
+
+    /// What `work` makes of a file that `field` refers to.
+    ///
+    /// # Errors
+    /// [`RigError::MissingFile`], those of `work`.
+    pub fn read<T>(
+        &mut self,
+        field: &str,
+        name: &str,
+        work: impl FnOnce(&mut dyn BufRead) -> Result<T, RigError>,
+    ) -> Result<T, RigError> {
+        let missing = |error: io::Error| RigError::MissingFile {
+            file: self.toml.clone(),
+            field: field.to_owned(),
+            value: name.to_owned(),
+            reason: error.to_string(),
+            limit: "a readable file, relative to the TOML file".to_owned(),
+        };
+        let file = File::open(self.directory.join(name)).map_err(missing)?;
+        let hashing = Hashing { inner: file, hasher: Sha256::new() };
+        let mut reader = BufReader::with_capacity(CHUNK, hashing);
+        let made = work(&mut reader)?;
+        // Whatever was left unread belongs to the hash all the same.
+        io::copy(&mut reader, &mut io::sink()).map_err(missing)?;
+        let digest = reader.into_inner().hasher.finalize().into();
+        if !self.digests.iter().any(|(known, _)| known == name) {
+            self.digests.push((name.to_owned(), digest));
+        }
+        Ok(made)
+    }
+
+    /// The names of all files read, the TOML file first.
+    pub fn names(&self) -> Vec<&str> {
+        self.digests.iter().map(|(name, _)| name.as_str()).collect()
+    }
+
+    /// SHA-256 over the names and hashes of all files, hexadecimal.
+    pub fn content_hash(&self) -> String {
+        let mut hasher = Sha256::new();
+        for (name, digest) in &self.digests {
+            hasher.update((name.len() as u64).to_le_bytes());
+            hasher.update(name.as_bytes());
+            hasher.update(digest);
+        }
+        hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+}
+
+/// Hashes what is read through it.
+struct Hashing<R> {
+    inner: R,
+    hasher: Sha256,
+}
+
+impl<R: Read> Read for Hashing<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.inner.read(buffer)?;
+        self.hasher.update(&buffer[..count]);
+        Ok(count)
+    }
+}

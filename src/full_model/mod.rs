@@ -1,0 +1,316 @@
+//! Full models from files: the matrices of a finite-element program, before anything is left out.
+//!
+//! A TOML file with the common tables of a rig file and either `[pad]`, `[disc]` and `[[contact_patch]]` (`part`), or
+//! `[system]` as in rig files of kind 3. Matrices are read line by line into 16 bytes for each entry listed (`entries`);
+//! what is kept of the files is their hash (`files`).
+
+mod coordinates;
+mod entries;
+mod files;
+mod part;
+mod raw;
+mod tables;
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use crate::physics::ContactLaw;
+use crate::reduction::{FullContact, FullModel, FullPart, SparseMatrix, SparseRow, SparseTerm};
+use crate::rig::raw::{RawPatch, RawSystem, RawTerm};
+use crate::rig::settings::{Settings, spread, within};
+use crate::rig::{Pair, RigError, patch, settings, system};
+
+use files::Files;
+use part::Part;
+use raw::{RawFullModel, RawPart};
+
+/// Tables that a full model has in common with rig files.
+const COMMON: [&str; 8] = ["reference", "band", "search", "friction", "load", "limits", "warning", "chart"];
+
+/// A full model with everything its files say.
+#[derive(Clone, Debug)]
+pub struct FullModelFile {
+    /// Its own name.
+    pub name: String,
+    /// Its equation of motion.
+    pub model: FullModel,
+    /// Pad and disc; no disc where it is rigid, nothing for a system.
+    pub geometry: Vec<PartGeometry>,
+    /// The contact pairs, in the order of the rows of `model.contact`; nodes are places in `geometry[..].nodes_m`.
+    pub pairs: Vec<Pair>,
+    /// The common tables, checked.
+    pub settings: Settings,
+    /// The common tables as they are written.
+    pub common_tables: toml::Table,
+    /// Where its TOML file is.
+    pub path: PathBuf,
+    /// SHA-256 of the TOML file and everything it refers to, hexadecimal.
+    pub content_hash: String,
+    /// What it is made of, a line each, for [`FullModelFile::describe`].
+    pub contents: Vec<String>,
+}
+
+/// The node of a row that belongs to no node: an inner degree of freedom of an element.
+pub const INTERNAL: usize = usize::MAX;
+
+/// Where the rows of a part are.
+#[derive(Clone, Debug)]
+pub struct PartGeometry {
+    /// Positions of all nodes, m.
+    pub nodes_m: Vec<[f64; 3]>,
+    /// Node, or [`INTERNAL`], and direction of every row: 0 to 2 displacements along x, y, z; 3 to 5 rotations about them.
+    pub rows: Vec<(usize, usize)>,
+    /// Nodes of the contact interface, as listed.
+    pub interface: Vec<usize>,
+    /// Damping ratio of every mode of the part.
+    pub damping_ratio: Option<f64>,
+}
+
+impl FullModelFile {
+    /// Whether the TOML file at `path` has parts with matrices in files: the sign of a full model. A `[system]` may be a
+    /// rig as well.
+    pub fn is_one(path: &Path) -> bool {
+        let table = std::fs::read_to_string(path).ok().and_then(|text| text.parse::<toml::Table>().ok());
+        let has = |part: &str| {
+            let part = table.as_ref().and_then(|table| table.get(part)).and_then(toml::Value::as_table);
+            part.is_some_and(|part| {
+                part.contains_key("interface_nodes") || part.get("mass").is_some_and(|m| m.is_str())
+            })
+        };
+        has("pad") || has("disc")
+    }
+
+    /// Loads the full model whose TOML file is at `path`.
+    ///
+    /// # Errors
+    /// [`RigError`], naming file, field or line, value and limit.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let (mut files, bytes) = Files::open(path)?;
+        let (common, own) = crate::rig::raw::parse::<RawFullModel>(&files.toml, &bytes)?.split();
+        let mut common_tables: toml::Table = crate::rig::raw::parse(&files.toml, &bytes)?;
+        common_tables.retain(|key, _| COMMON.contains(&key));
+        let settings = settings::check(&files.toml, &common)?;
+        let toml = files.toml.clone();
+        let refuse_beside_system = |field: &str| RigError::Kind {
+            file: toml.clone(),
+            field: field.to_owned(),
+            value: "stands beside [system]".to_owned(),
+            limit: "either [system] or [pad] with its contact".to_owned(),
+        };
+        let missing = |field: &str, limit: &str| RigError::MissingKey {
+            file: toml.clone(),
+            field: field.to_owned(),
+            limit: limit.to_owned(),
+        };
+        let read = match (&own.system, &own.pad) {
+            (Some(_), Some(_)) => return Err(refuse_beside_system("pad")),
+            (Some(_), None) if own.disc.is_some() => return Err(refuse_beside_system("disc")),
+            (Some(_), None) if own.patches.is_some() => return Err(refuse_beside_system("contact_patch")),
+            (Some(system), None) => read_system(&mut files, system, &settings)?,
+            (None, None) => return Err(missing("pad", "[pad] with stiffness and mass, or [system]")),
+            (None, Some(pad)) => match own.patches.as_deref() {
+                None | Some([]) => return Err(missing("contact_patch", "at least one [[contact_patch]]")),
+                Some(patches) => read_parts(&mut files, pad, own.disc.as_ref(), patches, settings.contact_law)?,
+            },
+        };
+        let mut contents = read.contents;
+        contents.push(format!("files      {}", files.names().join(", ")));
+        Ok(Self {
+            name: own.name,
+            model: read.model,
+            geometry: read.geometry,
+            pairs: read.pairs,
+            settings,
+            common_tables,
+            path: path.to_owned(),
+            content_hash: files.content_hash(),
+            contents,
+        })
+    }
+
+    /// That no part has a damping ratio of its modes: the full matrices do not have them.
+    ///
+    /// # Errors
+    /// [`RigError::Kind`].
+    pub fn refuse_modal_damping(&self) -> Result<(), RigError> {
+        let damped = self.geometry.iter().zip(&self.model.parts).find_map(|(geometry, part)| {
+            geometry.damping_ratio.filter(|ratio| *ratio != 0.0).map(|ratio| (part.name.clone(), ratio))
+        });
+        match damped {
+            None => Ok(()),
+            Some((part, ratio)) => Err(RigError::Kind {
+                file: self.path.display().to_string(),
+                field: format!("{part}.damping_ratio"),
+                value: format!("is {ratio}: damping of modes is no matrix of the full model"),
+                limit: "0, or none, to solve the full model".to_owned(),
+            }),
+        }
+    }
+
+    /// What the full model is and holds, a few lines for people.
+    pub fn describe(&self) -> String {
+        let mut lines = vec![format!("full model {}", self.name)];
+        lines.extend(self.contents.iter().cloned());
+        lines.push(match self.settings.band_max_hz {
+            Some(max_hz) => format!("band       up to {max_hz} Hz"),
+            None => "band       not given".to_owned(),
+        });
+        let reference = &self.settings.reference;
+        lines.push(format!(
+            "reference  {} N, {} rad/s, friction coefficient {}",
+            reference.normal_load_n, reference.disc_speed_rad_s, reference.friction_coefficient
+        ));
+        lines.push(format!("hash       {}", self.content_hash));
+        lines.join("\n")
+    }
+}
+
+/// What each kind of full model gives.
+struct ReadModel {
+    model: FullModel,
+    geometry: Vec<PartGeometry>,
+    pairs: Vec<Pair>,
+    contents: Vec<String>,
+}
+
+/// `[pad]`, `[disc]` and their contact.
+fn read_parts(
+    files: &mut Files,
+    pad: &RawPart,
+    disc: Option<&RawPart>,
+    patches: &[RawPatch],
+    contact_law: ContactLaw,
+) -> Result<ReadModel, RigError> {
+    let pad = part::read(files, "pad", pad)?;
+    let disc = disc.map(|disc| part::read(files, "disc", disc)).transpose()?;
+    let toml = files.toml.clone();
+    let at_interface = |part: &Part| -> Vec<[f64; 3]> {
+        part.geometry.interface.iter().map(|&node| part.geometry.nodes_m[node]).collect()
+    };
+    let (pad_m, disc_m) = (at_interface(&pad), disc.as_ref().map(at_interface));
+    let (mut pairs, mut stiffness_n_per_m, mut damping_n_s_per_m) = (vec![], vec![], vec![]);
+    for (index, raw) in patches.iter().enumerate() {
+        let mut found = patch::pairs(&toml, index, raw, &pad_m, disc_m.as_deref())?;
+        for (key, values, all) in [
+            ("stiffness_n_per_m", &raw.stiffness_n_per_m, &mut stiffness_n_per_m),
+            ("damping_n_s_per_m", &raw.damping_n_s_per_m, &mut damping_n_s_per_m),
+        ] {
+            let field = format!("contact_patch[{index}].{key}");
+            for value in spread(&toml, &field, values, found.len(), "contact pairs")? {
+                all.push(within(&toml, &field, value, value >= 0.0, "at least 0")?);
+            }
+        }
+        for pair in &mut found {
+            pair.pad_node = pad.geometry.interface[pair.pad_node];
+            if let Some(disc) = &disc {
+                pair.disc.iter_mut().for_each(|(node, _)| *node = disc.geometry.interface[*node]);
+            }
+        }
+        pairs.extend(found);
+    }
+    let offset = pad.part.mass.nrows();
+    let rows = |direction: &dyn Fn(&Pair) -> [f64; 3]| -> Vec<SparseRow> {
+        pairs
+            .iter()
+            .map(|pair| {
+                let along = direction(pair);
+                let mut row = displacement(&pad.row_of, pair.pad_node, along, 1.0, 0);
+                for &(node, weight) in &pair.disc {
+                    let of_disc = disc.as_ref().map(|disc| displacement(&disc.row_of, node, along, -weight, offset));
+                    row.extend(of_disc.into_iter().flatten());
+                }
+                row
+            })
+            .collect()
+    };
+    let contact = FullContact {
+        normal: rows(&|pair| pair.normal),
+        sliding: rows(&|pair| pair.sliding),
+        lateral: rows(&|pair| pair.lateral),
+        stiffness_n_per_m,
+        damping_n_s_per_m,
+        radius_m: pairs.iter().map(|pair| pair.radius_m).collect(),
+    };
+    let mut contents = vec!["kind       pad and disc of a finite-element program".to_owned()];
+    for part in std::iter::once(&pad).chain(&disc) {
+        contents.push(format!(
+            "{:<10} {} degrees of freedom, {} nodes, {} at the interface, {} entries of stiffness",
+            part.part.name,
+            part.part.mass.nrows(),
+            part.geometry.nodes_m.len(),
+            part.geometry.interface.len(),
+            part.part.stiffness.compute_nnz()
+        ));
+    }
+    if disc.is_none() {
+        contents.push("disc       rigid".to_owned());
+    }
+    let coincident = pairs.iter().filter(|pair| pair.disc.len() <= 1).count();
+    contents.push(format!(
+        "contact    {} pairs, {:.6e} N/m in all; {coincident} of coincident nodes, {} interpolated on the disc",
+        pairs.len(),
+        contact.stiffness_n_per_m.iter().sum::<f64>(),
+        pairs.len() - coincident
+    ));
+    let (mut parts, mut geometry): (Vec<FullPart>, Vec<PartGeometry>) = (vec![], vec![]);
+    for part in std::iter::once(pad).chain(disc) {
+        parts.push(part.part);
+        geometry.push(part.geometry);
+    }
+    let model = FullModel { parts, stiffness: vec![], damping: vec![], contact: Some(contact), contact_law };
+    Ok(ReadModel { model, geometry, pairs, contents })
+}
+
+/// `weight` times the displacement of a node along a direction; what is held does not move.
+fn displacement(
+    row_of: &HashMap<(usize, usize), usize>,
+    node: usize,
+    along: [f64; 3],
+    weight: f64,
+    offset: usize,
+) -> SparseRow {
+    let row = |(axis, component): (usize, f64)| {
+        row_of.get(&(node, axis)).filter(|_| component != 0.0).map(|row| (offset + row, weight * component))
+    };
+    along.into_iter().enumerate().filter_map(row).collect()
+}
+
+/// `[system]`; which `modes` a rig keeps of it does not matter here.
+fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Result<ReadModel, RigError> {
+    let file = files.toml.clone();
+    if raw.stiffness.is_empty() {
+        let (field, limit) = ("system.stiffness".to_owned(), "at least one [[system.stiffness]]".to_owned());
+        return Err(RigError::MissingKey { file, field, limit });
+    }
+    let mass = part::symmetric(files, "system.mass", &raw.mass, true)?;
+    let n = mass.nrows();
+    let mut contents = vec![
+        "kind       system of matrices".to_owned(),
+        format!("mass       {}, {n} degrees of freedom, {} entries", raw.mass, mass.compute_nnz()),
+    ];
+    let mut terms = |key: &str, raw: &[RawTerm]| -> Result<Vec<SparseTerm>, RigError> {
+        let mut terms = vec![];
+        for (index, raw) in raw.iter().enumerate() {
+            let field = |name: &str| format!("system.{key}[{index}].{name}");
+            let (law, _) = system::checked_law(&file, &field("scale"), &raw.scale, &settings.reference)?;
+            let expected = part::Expected { rows: n, told: "system.mass", row_of: &HashMap::new() };
+            let matrix = part::matrix(files, &field("matrix"), &raw.matrix, 1.0, Some(expected))?;
+            let symmetry = if crate::reduction::is_symmetric(&matrix) { "symmetric" } else { "unsymmetric" };
+            let entries = matrix.compute_nnz();
+            contents.push(format!("{key:<10} {} times {}, {symmetry}, {entries} entries", raw.matrix, raw.scale));
+            terms.push(SparseTerm { matrix, law });
+        }
+        Ok(terms)
+    };
+    let (stiffness, damping) = (terms("stiffness", &raw.stiffness)?, terms("damping", &raw.damping)?);
+    let none = SparseMatrix::try_new_from_triplets(n, n, &[]).map_err(|error| RigError::Shape {
+        file: file.clone(),
+        field: "system.mass".to_owned(),
+        value: format!("{n}x{n} ({error:?})"),
+        limit: "one that fits into memory".to_owned(),
+    })?;
+    let part = FullPart { name: "system".to_owned(), mass, stiffness: none };
+    let contact_law = settings.contact_law;
+    let model = FullModel { parts: vec![part], stiffness, damping, contact: None, contact_law };
+    Ok(ReadModel { model, geometry: vec![], pairs: vec![], contents })
+}

@@ -1,0 +1,267 @@
+//! `[pad]` and `[disc]`: matrices, nodes and rows of a substructure.
+
+use std::collections::HashMap;
+use std::io::BufRead;
+use std::path::Path;
+
+use super::coordinates::{self, Label};
+use super::entries::{Entries, MOST_ROWS};
+use super::files::Files;
+use super::raw::RawPart;
+use super::tables::{self, Nodes};
+use super::{INTERNAL, PartGeometry};
+use crate::reduction::{FullPart, SYMMETRY_TOLERANCE, SparseMatrix};
+use crate::rig::settings::within;
+use crate::rig::{RigError, lines, matrix_market};
+
+/// A part with what its rows are.
+pub struct Part {
+    pub part: FullPart,
+    pub geometry: PartGeometry,
+    /// The row of each direction of each node.
+    pub row_of: HashMap<(usize, usize), usize>,
+}
+
+/// A matrix and where it was read.
+struct Read<'a> {
+    field: String,
+    file: &'a str,
+    matrix: SparseMatrix,
+    row_of: &'a HashMap<Label, usize>,
+}
+
+/// What is known of a matrix before it is read.
+#[derive(Clone, Copy)]
+pub struct Expected<'a> {
+    pub rows: usize,
+    /// What says so.
+    pub told: &'a str,
+    /// The row of every label.
+    pub row_of: &'a HashMap<Label, usize>,
+}
+
+/// Reads the part called `name`.
+///
+/// # Errors
+/// [`RigError`].
+pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigError> {
+    let toml = files.toml.clone();
+    let field = |key: &str| format!("{name}.{key}");
+    let scale = raw.units.of_lengths();
+    let nodes = files.read(&field("nodes"), &raw.nodes, |input| match extension(&raw.nodes).as_str() {
+        "inp" => coordinates::deck_nodes(&raw.nodes, input, scale),
+        _ => tables::nodes(&raw.nodes, input, scale),
+    })?;
+    let rows_file = raw.rows.as_deref().unwrap_or(&raw.stiffness);
+    let labels = match &raw.rows {
+        Some(file) => files.read(&field("rows"), file, |input| match extension(file).as_str() {
+            "dof" => coordinates::dof(file, input),
+            _ => tables::rows(file, input),
+        })?,
+        None => files.read(&field("stiffness"), rows_file, |input| coordinates::rows_of(rows_file, input))?,
+    };
+    let row_of_label: HashMap<Label, usize> = labels.iter().enumerate().map(|(row, label)| (*label, row)).collect();
+    let internal = extension(rows_file) == "dof";
+    let (rows, row_of) = placed(rows_file, &labels, &nodes, &raw.nodes, internal)?;
+    let mut matrix = |key: &str, file: &str| -> Result<SparseMatrix, RigError> {
+        let field = field(key);
+        let expected = Expected { rows: rows.len(), told: rows_file, row_of: &row_of_label };
+        let matrix = self::matrix(files, &field, file, raw.units.of_matrices(), Some(expected))?;
+        let read = Read { field, file, matrix, row_of: &row_of_label };
+        read.check(files, key == "mass")?;
+        Ok(read.matrix)
+    };
+    let stiffness = matrix("stiffness", &raw.stiffness)?;
+    let mass = matrix("mass", &raw.mass)?;
+    let interface = interface(&toml, &field("interface_nodes"), &raw.interface_nodes, &nodes, &raw.nodes)?;
+    let damping_ratio = raw
+        .damping_ratio
+        .map(|value| within(&toml, &field("damping_ratio"), value, value >= 0.0, "at least 0"))
+        .transpose()?;
+    Ok(Part {
+        part: FullPart { name: name.to_owned(), mass, stiffness },
+        geometry: PartGeometry { nodes_m: nodes.positions, rows, interface, damping_ratio },
+        row_of,
+    })
+}
+
+type Rows = (Vec<(usize, usize)>, HashMap<(usize, usize), usize>);
+
+/// Every row with the place of its node instead of its label.
+fn placed(
+    file: &str,
+    labels: &[(u64, usize)],
+    nodes: &Nodes,
+    nodes_file: &str,
+    internal: bool,
+) -> Result<Rows, RigError> {
+    let (mut rows, mut row_of) = (vec![], HashMap::new());
+    for (row, &(label, direction)) in labels.iter().enumerate() {
+        let refuse = |value: String, limit: String| {
+            let (file, field) = (file.to_owned(), format!("row {row}"));
+            Err(RigError::Range { file, field, value, limit })
+        };
+        let node = match nodes.place(label) {
+            Some(node) => node,
+            // CalculiX gives the incompatible modes of its bricks nodes of their own.
+            None if internal => {
+                rows.push((INTERNAL, direction));
+                continue;
+            }
+            None => return refuse(format!("at node {label}"), format!("a node of {nodes_file}")),
+        };
+        if let Some(before) = row_of.insert((node, direction), row) {
+            return refuse(format!("node {label} again, as row {before}"), "every direction of a node once".to_owned());
+        }
+        rows.push((node, direction));
+    }
+    Ok((rows, row_of))
+}
+
+/// The interface nodes, by their places.
+fn interface(toml: &str, field: &str, labels: &[u64], nodes: &Nodes, nodes_file: &str) -> Result<Vec<usize>, RigError> {
+    let refuse = |field: String, value: String, limit: String| {
+        Err(RigError::Range { file: toml.to_owned(), field, value, limit })
+    };
+    if labels.is_empty() {
+        return refuse(field.to_owned(), "empty".to_owned(), "at least one node".to_owned());
+    }
+    let (mut places, mut seen) = (vec![], HashMap::new());
+    for (index, &label) in labels.iter().enumerate() {
+        let field = format!("{field}[{index}]");
+        let Some(place) = nodes.place(label) else {
+            return refuse(field, label.to_string(), format!("a node of {nodes_file}"));
+        };
+        if seen.insert(place, index).is_some() {
+            return refuse(field, format!("{label} again"), "every node at most once".to_owned());
+        }
+        places.push(place);
+    }
+    Ok(places)
+}
+
+/// Reads a square matrix times `factor`; `expected` is how many rows it has and what says so.
+///
+/// # Errors
+/// [`RigError`].
+pub fn matrix(
+    files: &mut Files,
+    field: &str,
+    file: &str,
+    factor: f64,
+    expected: Option<Expected<'_>>,
+) -> Result<SparseMatrix, RigError> {
+    let toml = files.toml.clone();
+    files.read(field, file, |input| {
+        if !is_matrix_market(input)
+            && let Some(expected) = expected
+        {
+            let (entries, mirrored) = coordinates::read(file, input, expected.rows, expected.row_of)?;
+            return Ok(entries.compress(expected.rows, mirrored, factor));
+        }
+        let mut entries = Entries::default();
+        let size = matrix_market::read_entries(file, input, |row, column, value| {
+            if row.max(column) < MOST_ROWS {
+                entries.push(row, column, value);
+            }
+        })?;
+        let n = size.rows;
+        let limit = match expected {
+            _ if size.columns != n || n == 0 || n >= MOST_ROWS => format!("a square matrix of 1 to {MOST_ROWS} rows"),
+            Some(Expected { rows, told, .. }) if rows != n => format!("{rows}x{rows}, as {told}"),
+            // Only now is memory for n columns asked for.
+            None if entries.len() < n => "an entry on every place of the diagonal".to_owned(),
+            _ => return Ok(entries.compress(n, size.mirrored, factor)),
+        };
+        let value = format!("{n}x{} with {} entries ({file})", size.columns, entries.len());
+        Err(RigError::Shape { file: toml, field: field.to_owned(), value, limit })
+    })
+}
+
+/// Whether what is left to read begins with the banner of a Matrix Market file, or with nothing at all.
+fn is_matrix_market(input: &mut dyn BufRead) -> bool {
+    input.fill_buf().is_ok_and(|start| start.is_empty() || start.starts_with(b"%"))
+}
+
+/// A file name's extension in small letters.
+fn extension(name: &str) -> String {
+    Path::new(name).extension().map(|extension| extension.to_string_lossy().to_lowercase()).unwrap_or_default()
+}
+
+/// A symmetric matrix on its own, checked.
+///
+/// # Errors
+/// [`RigError`].
+pub fn symmetric(files: &mut Files, field: &str, file: &str, mass: bool) -> Result<SparseMatrix, RigError> {
+    let matrix = matrix(files, field, file, 1.0, None)?;
+    let read = Read { field: field.to_owned(), file, matrix, row_of: &HashMap::new() };
+    read.check(files, mass)?;
+    Ok(read.matrix)
+}
+
+impl Read<'_> {
+    /// That the matrix is symmetric and its diagonal what a definite one's can be.
+    fn check(&self, files: &mut Files, mass: bool) -> Result<(), RigError> {
+        let view = self.matrix.as_ref();
+        for row in 0..self.matrix.nrows() {
+            let value = view.get(row, row).copied().unwrap_or(0.0);
+            if value < 0.0 || (mass && value == 0.0) {
+                let limit = if mass { "more than 0 on the diagonal" } else { "at least 0 on the diagonal" };
+                let value = format!("at row {}, column {} is {value}", row + 1, row + 1);
+                return Err(self.at_line(files, (row, row), value, limit));
+            }
+        }
+        let largest = self.matrix.val().iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+        let limit = SYMMETRY_TOLERANCE * largest;
+        for column in 0..self.matrix.ncols() {
+            for (row, &value) in view.row_idx_of_col(column).zip(view.val_of_col(column)) {
+                let mirrored = view.get(column, row).copied().unwrap_or(0.0);
+                if (value - mirrored).abs() > limit {
+                    let told = format!(
+                        "at row {}, column {} is {value}, but {mirrored} at row {}, column {}",
+                        row + 1,
+                        column + 1,
+                        column + 1,
+                        row + 1
+                    );
+                    let limit = format!("a symmetric matrix; mirrored entries may differ by {limit:.3e}");
+                    return Err(self.at_line(files, (row, column), told, &limit));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// An error about an entry, with the line it stands in.
+    fn at_line(&self, files: &mut Files, place: (usize, usize), value: String, limit: &str) -> RigError {
+        let found = files.read(&self.field, self.file, |input| {
+            if is_matrix_market(input) {
+                line_of(self.file, input, place)
+            } else {
+                coordinates::line_of(self.file, input, self.row_of, place)
+            }
+        });
+        match found {
+            Ok(line) => lines::refuse(self.file, line, "entry", value, limit),
+            Err(error) => error,
+        }
+    }
+}
+
+/// The line in which an entry of a Matrix Market file stands; 1 where it is not listed at all.
+fn line_of(file: &str, input: impl BufRead, (row, column): (usize, usize)) -> Result<usize, RigError> {
+    let mut lines = lines::Lines::new(file, input);
+    let mut size_seen = false;
+    while let Some((line, content)) = lines.advance()? {
+        if content.is_empty() || content.starts_with('%') {
+            continue;
+        }
+        let mut words = content.split_whitespace().map(|word| word.parse::<usize>().ok());
+        let place = (words.next().flatten(), words.next().flatten());
+        if size_seen && place == (Some(row + 1), Some(column + 1)) {
+            return Ok(line);
+        }
+        size_seen = true;
+    }
+    Ok(1)
+}

@@ -1,0 +1,43 @@
+//! Pages that stand by themselves: one look, no request to anywhere.
+
+const STYLE: &str = include_str!("display/assets/report.css");
+
+/// A whole page; `body` is markup.
+pub fn page(title: &str, body: &str) -> String {
+    format!(
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">\n\
+         <title>{}</title>\n<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n</body>\n</html>\n",
+        escaped(title)
+    )
+}
+
+/// A section under its heading.
+pub fn section(title: &str, body: &str) -> String {
+    format!("<section>\n<h2>{title}</h2>\n{body}</section>\n")
+}
+
+/// A figure of [`crate::plot`] with a caption, which is markup.
+pub fn figure(svg: &str, caption: &str) -> String {
+    // Without the declaration a file of its own would have.
+    let svg = svg.find("<svg").map_or(svg, |start| &svg[start..]);
+    format!("<figure>{svg}<figcaption>{caption}</figcaption></figure>\n")
+}
+
+/// Text that is no markup.
+pub fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_markup_stays_none() {
+        assert_eq!(escaped("<a href=\"x\">&"), "&lt;a href=&quot;x&quot;&gt;&amp;");
+        assert!(page("a < b", "").contains("<title>a &lt; b</title>"));
+        assert!(figure("<?xml?>\n<svg></svg>", "c").starts_with("<figure><svg>"));
+    }
+}

@@ -1,0 +1,179 @@
+//! Contact stiffness from natural frequencies: the factor on the stiffness of all contact pairs that fits targets best.
+//!
+//! ```text
+//! e_i(k) = f_i(k) / f_i* - 1,   rms(k) = sqrt(Σ e_i² / m) -> min
+//! ```
+//!
+//! over the first `m` natural frequencies at rest, ascending on both sides. The curve over decades of `k` is kept: its
+//! bottom is flat where the frequencies hardly know the stiffness.
+//!
+//! Source: the paper's Figs. 12 and 13.
+
+/// Decades on both sides of the present stiffness that are searched.
+const DECADES: f64 = 4.0;
+/// Points of the curve to a decade.
+const PER_DECADE: usize = 10;
+/// Width of the last bracket of the minimiser, decades: a smooth minimum is found to half of the digits anyway.
+const BRACKET: f64 = 1e-9;
+/// `(3 - sqrt 5) / 2`.
+const GOLDEN: f64 = 0.381_966_011_250_105_1;
+
+/// Errors of the frequencies at one stiffness.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trial {
+    /// Factor on the stiffness of every pair.
+    pub factor: f64,
+    /// `f_i`, Hz, as many as there are targets.
+    pub frequencies_hz: Vec<f64>,
+    /// Root of the mean square of `e_i`.
+    pub rms_error: f64,
+    /// Mean of `|e_i|`.
+    pub mean_error: f64,
+    /// Largest `|e_i|`.
+    pub largest_error: f64,
+}
+
+/// The best stiffness and how well it is determined.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Identified {
+    pub best: Trial,
+    /// Factors between which the error stays below twice its minimum; `None` where the search ended before it rose.
+    pub doubled: [Option<f64>; 2],
+    /// Ascending in the factor.
+    pub curve: Vec<Trial>,
+}
+
+/// Why no stiffness was found.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub enum IdentificationError<E> {
+    #[error("{found} natural frequencies, expected at least the {expected} of the targets")]
+    TooFew { found: usize, expected: usize },
+    #[error("target {index} is {value} Hz, expected a finite frequency above 0, ascending")]
+    Target { index: usize, value: f64 },
+    #[error("the error still falls at {factor:e} times the present stiffness, the end of the search")]
+    AtTheEnd { factor: f64 },
+    #[error(transparent)]
+    Model(#[from] E),
+}
+
+/// Finds the factor that fits `targets_hz`; `frequencies` gives the natural frequencies at rest, Hz, ascending, for a factor.
+///
+/// # Errors
+/// [`IdentificationError`].
+pub fn identify<E>(
+    targets_hz: &[f64],
+    frequencies: &mut dyn FnMut(f64) -> Result<Vec<f64>, E>,
+) -> Result<Identified, IdentificationError<E>> {
+    let mut before = 0.0;
+    for (index, &value) in targets_hz.iter().enumerate() {
+        if !value.is_finite() || value <= 0.0 || value < before {
+            return Err(IdentificationError::Target { index, value });
+        }
+        before = value;
+    }
+    let mut trial = |exponent: f64| -> Result<Trial, IdentificationError<E>> {
+        let factor = 10.0_f64.powf(exponent);
+        let mut frequencies_hz = frequencies(factor)?;
+        if frequencies_hz.len() < targets_hz.len() || targets_hz.is_empty() {
+            let (found, expected) = (frequencies_hz.len(), targets_hz.len().max(1));
+            return Err(IdentificationError::TooFew { found, expected });
+        }
+        frequencies_hz.truncate(targets_hz.len());
+        let errors: Vec<f64> =
+            frequencies_hz.iter().zip(targets_hz).map(|(f, target)| (f / target - 1.0).abs()).collect();
+        let m = errors.len() as f64;
+        Ok(Trial {
+            factor,
+            frequencies_hz,
+            rms_error: (errors.iter().map(|e| e * e).sum::<f64>() / m).sqrt(),
+            mean_error: errors.iter().sum::<f64>() / m,
+            largest_error: errors.iter().copied().fold(0.0, f64::max),
+        })
+    };
+    let step = 1.0 / PER_DECADE as f64;
+    let count = (2.0 * DECADES / step).round() as usize;
+    let exponent = |index: usize| -DECADES + step * index as f64;
+    let curve = (0..=count).map(|index| trial(exponent(index))).collect::<Result<Vec<_>, _>>()?;
+    let lowest = (0..=count).min_by(|&a, &b| curve[a].rms_error.total_cmp(&curve[b].rms_error)).unwrap_or(0);
+    if lowest == 0 || lowest == count {
+        return Err(IdentificationError::AtTheEnd { factor: curve[lowest].factor });
+    }
+    // Golden section between the neighbours of the lowest point.
+    let (mut low, mut high) = (exponent(lowest - 1), exponent(lowest + 1));
+    let mut best = (exponent(lowest), curve[lowest].clone());
+    while high - low > BRACKET {
+        let at = if high - best.0 > best.0 - low {
+            best.0 + GOLDEN * (high - best.0)
+        } else {
+            best.0 - GOLDEN * (best.0 - low)
+        };
+        let tried = trial(at)?;
+        let end = if tried.rms_error < best.1.rms_error { std::mem::replace(&mut best, (at, tried)).0 } else { at };
+        if end < best.0 { low = end } else { high = end }
+    }
+    let (at, best) = best;
+    let limit = 2.0 * best.rms_error;
+    let mut crossing = |beyond: Option<usize>| -> Result<Option<f64>, IdentificationError<E>> {
+        let Some(beyond) = beyond else { return Ok(None) };
+        let (mut inside, mut outside) = (at, exponent(beyond));
+        while (outside - inside).abs() > 1e-4 {
+            let middle = 0.5 * (inside + outside);
+            if trial(middle)?.rms_error > limit { outside = middle } else { inside = middle }
+        }
+        Ok(Some(10.0_f64.powf(inside)))
+    };
+    let above = |index: &usize| curve[*index].rms_error > limit;
+    let doubled = [
+        crossing((0..=count).rev().filter(|&index| exponent(index) < at).find(above))?,
+        crossing((0..=count).filter(|&index| exponent(index) > at).find(above))?,
+    ];
+    Ok(Identified { best, doubled, curve })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::convert::Infallible;
+
+    /// Two masses on springs of 1 and 4 joined by one of 3 times the factor: `f²` are the eigenvalues of a 2x2 matrix.
+    fn pair(factor: f64) -> Result<Vec<f64>, Infallible> {
+        let k = 3.0 * factor;
+        let (mean, half) = (2.5 + k, (1.5_f64.powi(2) + k * k).sqrt());
+        Ok(vec![(mean - half).sqrt(), (mean + half).sqrt()])
+    }
+
+    #[test]
+    fn the_stiffness_that_made_the_targets_is_found() {
+        let targets = pair(7.3).unwrap();
+        let found = identify(&targets, &mut pair).unwrap();
+        // The error falls linearly to 0 here: the last bracket decides, and rounding of 1e-16 in the frequencies.
+        assert!((found.best.factor / 7.3 - 1.0).abs() < 1e-6, "{}", found.best.factor);
+        assert!(found.best.rms_error < 1e-7 && found.curve.len() == 81);
+    }
+
+    #[test]
+    fn a_compromise_is_the_least_of_all_and_its_range_doubles_the_error() {
+        let targets = [pair(2.0).unwrap()[0], pair(3.0).unwrap()[1]];
+        let rms = |factor: f64| {
+            let found = pair(factor).unwrap();
+            found.iter().zip(&targets).map(|(f, t)| (f / t - 1.0).powi(2) / 2.0).sum::<f64>().sqrt()
+        };
+        let found = identify(&targets, &mut pair).unwrap();
+        let best = found.best.factor;
+        assert!((2.0..3.0).contains(&best), "{best}");
+        assert!((1..4000).all(|k| rms(1e-3 * f64::from(k)) >= found.best.rms_error * (1.0 - 1e-9)));
+        for end in found.doubled.map(Option::unwrap) {
+            assert!((rms(end) / found.best.rms_error - 2.0).abs() < 0.01, "{end}");
+        }
+        assert!(found.doubled[0].unwrap() < best && best < found.doubled[1].unwrap());
+    }
+
+    #[test]
+    fn what_cannot_be_found_is_said() {
+        let stiff = [1.58, 2e4];
+        assert_eq!(identify(&stiff, &mut pair), Err(IdentificationError::AtTheEnd { factor: 1e4 }));
+        assert_eq!(identify(&[1.0; 3], &mut pair), Err(IdentificationError::TooFew { found: 2, expected: 3 }));
+        let descending = [2.0, 1.0];
+        assert_eq!(identify(&descending, &mut pair), Err(IdentificationError::Target { index: 1, value: 1.0 }));
+    }
+}

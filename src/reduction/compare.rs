@@ -1,0 +1,369 @@
+//! A reduced model against the full one: roots at operating points, windows of instability over the friction coefficient.
+//!
+//! Roots are paired off, nearest first. A full root that grows and whose partner does not is *missed*; a reduced one that
+//! grows and whose partner does not is *invented*. The windows of the full model are those of its projection on its own
+//! right and left vectors at a few friction coefficients, to which the ends of the windows are added until they stay
+//! where they are: near a merging point `λ` has half the digits, the ends of windows have all of them.
+
+use faer::{Mat, c64};
+
+use super::ReductionError;
+use super::full_model::FullModel;
+use super::full_order::{FullProgress, FullSolver, FullSpectrum, FullVectors};
+use crate::physics::{
+    MapError, MapOptions, Model, ModelError, OperatingPoint, SolveError, Solver, StabilityMap, Vectors, Window,
+};
+
+/// What of a vector the others do not hold, relative to its length, below which it adds nothing: right and left vectors
+/// together leave its square to the roots.
+const NEW: f64 = 1e-6;
+/// Roots that are damped more than this cannot become unstable by anything that their vectors would show.
+const DAMPED: f64 = 0.05;
+/// Ends of windows of the full model that move by less than this are found.
+const STILL: f64 = 1e-8;
+/// Rounds of adding vectors at the ends of windows.
+const MOST_ROUNDS: usize = 8;
+/// Roots of full and reduced model further apart than this, relative to `|λ|`, are no pair.
+const PAIRED: f64 = 0.2;
+
+/// Why nothing could be compared.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum CompareError {
+    #[error("full model: {0}")]
+    Full(#[from] ReductionError),
+    #[error("full model on its own vectors: {0}")]
+    Basis(#[from] ModelError),
+    #[error("reduced model: {0}")]
+    Reduced(#[from] SolveError),
+    #[error("windows of instability: {0}")]
+    Map(#[from] MapError),
+    #[error("ends of windows of the full model still move by {moved:.1e} after {rounds} rounds, limit {limit:.1e}")]
+    NotStill { moved: f64, rounds: usize, limit: f64 },
+}
+
+/// What is judged.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Judged {
+    /// Highest frequency, rad/s.
+    pub band_rad_s: f64,
+    /// A root is unstable when `σ` exceeds this times `|λ|`.
+    pub instability_threshold: f64,
+    /// Roots that decay faster than this are not compared, 1/s.
+    pub decay_per_s: f64,
+}
+
+/// Roots of both models at one operating point.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Comparison {
+    /// Full root and reduced root, ascending in frequency.
+    pub pairs: Vec<(c64, c64)>,
+    /// Unstable roots of the full model that the reduced one does not have.
+    pub missed: Vec<c64>,
+    /// Unstable roots of the reduced model that the full one does not have.
+    pub invented: Vec<c64>,
+    /// Roots of the full model in the band without any partner.
+    pub unpaired: usize,
+}
+
+impl Comparison {
+    /// The largest `|Δf| / f`; 0 without oscillating pairs.
+    pub fn frequency_error(&self) -> f64 {
+        let of =
+            |(full, reduced): &(c64, c64)| if full.im > 0.0 { (full.im - reduced.im).abs() / full.im } else { 0.0 };
+        self.pairs.iter().map(of).fold(0.0, f64::max)
+    }
+
+    /// The largest `|Δσ|`, 1/s.
+    pub fn growth_error_per_s(&self) -> f64 {
+        self.pairs.iter().map(|(full, reduced)| (full.re - reduced.re).abs()).fold(0.0, f64::max)
+    }
+
+    /// The largest `|Δλ| / |λ|`.
+    pub fn relative_error(&self) -> f64 {
+        let of = |(full, reduced): &(c64, c64)| (full - reduced).norm() / full.norm().max(f64::MIN_POSITIVE);
+        self.pairs.iter().map(of).fold(0.0, f64::max)
+    }
+}
+
+/// Compares the roots of a full and of a reduced model.
+pub fn compare_roots(full: &[c64], reduced: &[c64], judged: &Judged) -> Comparison {
+    let unstable = |lambda: c64| lambda.re > judged.instability_threshold * lambda.norm();
+    let mut distances = vec![];
+    for (i, a) in full.iter().enumerate().filter(|(_, lambda)| lambda.im <= judged.band_rad_s) {
+        for (j, b) in reduced.iter().enumerate() {
+            let distance = (a - b).norm();
+            if distance < PAIRED * a.norm() {
+                distances.push((distance, i, j));
+            }
+        }
+    }
+    distances.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let (mut of_full, mut of_reduced) = (vec![None; full.len()], vec![None; reduced.len()]);
+    for (_, i, j) in distances {
+        if of_full[i].is_none() && of_reduced[j].is_none() {
+            of_full[i] = Some(j);
+            of_reduced[j] = Some(i);
+        }
+    }
+    let mut comparison = Comparison::default();
+    for (i, &lambda) in full.iter().enumerate().filter(|(_, lambda)| lambda.im <= judged.band_rad_s) {
+        let partner = of_full[i].map(|j| reduced[j]);
+        if unstable(lambda) && !partner.is_some_and(unstable) {
+            comparison.missed.push(lambda);
+        }
+        if lambda.re < -judged.decay_per_s {
+            continue;
+        }
+        match partner {
+            Some(partner) => comparison.pairs.push((lambda, partner)),
+            None => comparison.unpaired += 1,
+        }
+    }
+    for (j, &lambda) in reduced.iter().enumerate() {
+        // One just above the band may belong to a full root that was not looked for.
+        let partner = of_reduced[j].map(|i| full[i]);
+        if unstable(lambda) && !partner.is_some_and(unstable) && (partner.is_some() || lambda.im <= judged.band_rad_s) {
+            comparison.invented.push(lambda);
+        }
+    }
+    comparison
+}
+
+/// Roots of a reduced model at `p`, static ones of an undamped model with both signs.
+///
+/// # Errors
+/// [`SolveError`].
+pub fn reduced_roots(model: &Model, solver: &mut Solver, p: &OperatingPoint) -> Result<Vec<c64>, SolveError> {
+    let spectrum = solver.solve(model, p, Vectors::Right)?;
+    let mut roots: Vec<c64> = spectrum.roots.iter().map(|root| root.lambda).collect();
+    if spectrum.undamped {
+        let statics: Vec<c64> = roots[spectrum.mode_count..].iter().map(|lambda| -lambda).collect();
+        roots.extend(statics.into_iter().filter(|lambda| lambda.re != 0.0));
+    }
+    Ok(roots)
+}
+
+/// Windows of instability of both models, paired off.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct WindowComparison {
+    /// Window of the full model and of the reduced one.
+    pub pairs: Vec<(Window, Window)>,
+    pub missed: Vec<Window>,
+    pub invented: Vec<Window>,
+}
+
+impl WindowComparison {
+    /// The largest difference of an end.
+    pub fn friction_error(&self) -> f64 {
+        let of = |(full, reduced): &(Window, Window)| {
+            let to = match (full.mu_to, reduced.mu_to) {
+                (Some(a), Some(b)) => (a - b).abs(),
+                _ => 0.0,
+            };
+            (full.mu_from - reduced.mu_from).abs().max(to)
+        };
+        self.pairs.iter().map(of).fold(0.0, f64::max)
+    }
+}
+
+/// Pairs off windows: the same kind, frequencies within a fifth, the nearest ends first.
+pub fn compare_windows(full: &[Window], reduced: &[Window]) -> WindowComparison {
+    let mut distances = vec![];
+    for (i, a) in full.iter().enumerate() {
+        for (j, b) in reduced.iter().enumerate() {
+            let apart = (a.frequency_hz - b.frequency_hz).abs();
+            if a.kind == b.kind && apart <= PAIRED * a.frequency_hz.max(b.frequency_hz) {
+                distances.push(((a.mu_from - b.mu_from).abs() + apart / a.frequency_hz.max(1.0), i, j));
+            }
+        }
+    }
+    distances.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let (mut of_full, mut of_reduced) = (vec![None; full.len()], vec![false; reduced.len()]);
+    for (_, i, j) in distances {
+        if of_full[i].is_none() && !of_reduced[j] {
+            of_full[i] = Some(j);
+            of_reduced[j] = true;
+        }
+    }
+    let mut comparison = WindowComparison::default();
+    for (window, partner) in full.iter().zip(&of_full) {
+        match partner {
+            Some(j) => comparison.pairs.push((window.clone(), reduced[*j].clone())),
+            None => comparison.missed.push(window.clone()),
+        }
+    }
+    let left = reduced.iter().zip(of_reduced).filter(|(_, paired)| !paired);
+    comparison.invented = left.map(|(window, _)| window.clone()).collect();
+    comparison
+}
+
+/// The windows of instability of a full model at the load and speed of `p`, from the friction coefficient 0 to
+/// `options.mu_max`; `options.band_max_hz` is the band.
+///
+/// # Errors
+/// [`CompareError`].
+pub fn full_windows(
+    model: &FullModel,
+    solver: &mut FullSolver<'_>,
+    p: &OperatingPoint,
+    band_rad_s: f64,
+    options: &MapOptions,
+    progress: &mut dyn FnMut(FullProgress),
+) -> Result<Vec<Window>, CompareError> {
+    let mut basis = Basis { columns: Mat::zeros(model.dimension(), 0) };
+    let mut sampled: Vec<f64> = vec![];
+    let mut next: Vec<f64> = [0.0, 0.5, 1.0].iter().map(|share| share * options.mu_max).collect();
+    let mut ends: Vec<f64> = vec![];
+    let mut moved = f64::INFINITY;
+    for _ in 0..MOST_ROUNDS {
+        for mu in std::mem::take(&mut next) {
+            let found = solver.roots(&p.with_friction(mu), 1.1 * band_rad_s, FullVectors::Both, progress)?;
+            basis.add(&found);
+            sampled.push(mu);
+        }
+        let reduced = model.project(basis.columns.as_ref())?.model(model.contact_law)?;
+        let map = StabilityMap::build(&reduced, &mut Solver::new(reduced.dimension()), p, options)?;
+        let found: Vec<f64> = map.windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten().collect();
+        moved = if found.len() == ends.len() {
+            found.iter().zip(&ends).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        } else {
+            f64::INFINITY
+        };
+        if moved < STILL || (found.is_empty() && !sampled.is_empty()) {
+            return Ok(map.windows);
+        }
+        let far = |mu: &f64| sampled.iter().all(|known| (known - mu).abs() > 1e-3 * STILL);
+        next = found.iter().copied().filter(far).collect();
+        ends = found;
+        if next.is_empty() {
+            return Ok(map.windows);
+        }
+    }
+    Err(CompareError::NotStill { moved, rounds: MOST_ROUNDS, limit: STILL })
+}
+
+/// Orthonormal columns that span vectors of a full model.
+struct Basis {
+    columns: Mat<f64>,
+}
+
+impl Basis {
+    /// Adds real and imaginary parts of right and left vectors, as far as they are new.
+    fn add(&mut self, found: &FullSpectrum) {
+        let n = self.columns.nrows();
+        for vectors in [&found.right, &found.left] {
+            let judged = |k: &usize| found.roots[*k].lambda.re > -DAMPED * found.roots[*k].lambda.norm();
+            for k in (0..vectors.ncols()).filter(judged) {
+                // Turned so that a vector that is real but for a factor becomes real.
+                let square: c64 = (0..n).map(|i| vectors[(i, k)] * vectors[(i, k)]).sum();
+                let turn =
+                    if square.norm() > 0.0 { (square / square.norm()).sqrt().conj() } else { c64::new(1.0, 0.0) };
+                for imaginary in [false, true] {
+                    let part = |i: usize| {
+                        let value = vectors[(i, k)] * turn;
+                        if imaginary { value.im } else { value.re }
+                    };
+                    let mut column = Mat::from_fn(n, 1, |i, _| part(i));
+                    for _ in 0..2 {
+                        let held = self.columns.transpose() * &column;
+                        column -= &self.columns * held;
+                    }
+                    let norm = column.norm_l2();
+                    // The vector itself has length 1.
+                    if norm > NEW {
+                        let last = self.columns.ncols();
+                        self.columns.resize_with(n, last + 1, |i, _| column[(i, 0)] / norm);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::full_order::tests::{point, touching};
+    use super::*;
+    use crate::physics::{ContactLaw, WindowKind};
+
+    const JUDGED: Judged = Judged { band_rad_s: 1000.0, instability_threshold: 1e-6, decay_per_s: 20.0 };
+
+    #[test]
+    fn missed_and_invented_roots_are_told_apart() {
+        let l = c64::new;
+        let full = [l(0.0, 100.0), l(5.0, 300.0), l(-5.0, 300.0), l(0.0, 500.0), l(-50.0, 700.0), l(9.0, 1500.0)];
+        let reduced = [l(0.0, 101.0), l(0.0, 298.0), l(0.0, 302.0), l(2.0, 501.0), l(-60.0, 710.0)];
+        let found = compare_roots(&full, &reduced, &JUDGED);
+        assert_eq!(found.missed, [l(5.0, 300.0)]);
+        assert_eq!(found.invented, [l(2.0, 501.0)]);
+        // What decays fast and what lies above the band is not compared.
+        assert_eq!((found.pairs.len(), found.unpaired), (4, 0));
+        assert!((found.frequency_error() - 0.01).abs() < 1e-12);
+        assert_eq!(found.growth_error_per_s(), 5.0);
+        let nothing = compare_roots(&full, &[], &JUDGED);
+        assert_eq!((nothing.missed.len(), nothing.unpaired), (1, 4));
+    }
+
+    /// Windows of a full model against those of all its degrees of freedom; a basis of its vectors at one load is good
+    /// there, and wrong at another where the contact is stiffer.
+    #[test]
+    fn a_basis_made_at_one_load_is_caught_at_another() {
+        let law = ContactLaw { exponent: 1.0, ..ContactLaw::default() };
+        let model = touching(42, 0.0, law);
+        let n = model.dimension();
+        let band = 700.0;
+        let judged = Judged { band_rad_s: band, ..JUDGED };
+        let mut solver = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
+        let at = |load: f64, mu: f64| OperatingPoint { normal_load_n: load, ..point(mu) };
+        let options = MapOptions {
+            mu_min: 0.0,
+            mu_max: 1.0,
+            band_max_hz: Some(band / std::f64::consts::TAU),
+            instability_threshold: 1e-6,
+            windows: true,
+        };
+        let mut windows =
+            |p: &OperatingPoint| full_windows(&model, &mut solver, p, band, &options, &mut |_| {}).unwrap();
+        let of_full = windows(&at(500.0, 0.0));
+        let whole = model.project(Mat::<f64>::identity(n, n).as_ref()).unwrap().model(law).unwrap();
+        let map = StabilityMap::build(&whole, &mut Solver::new(n), &at(500.0, 0.0), &options).unwrap();
+        let compared = compare_windows(&map.windows, &of_full);
+        assert!(!compared.pairs.is_empty(), "no window at all");
+        assert!(compared.missed.is_empty() && compared.invented.is_empty(), "{compared:?}");
+        // Ends are polished to 1e-10 of the map's own; those of the full model stay within 1e-8.
+        assert!(compared.friction_error() < 2.0 * STILL, "{:e}", compared.friction_error());
+
+        let mut basis = Basis { columns: Mat::zeros(n, 0) };
+        for mu in [0.0, 0.3, 0.6, 0.9] {
+            basis.add(&solver.roots(&at(500.0, mu), 1.1 * band, FullVectors::Both, &mut |_| {}).unwrap());
+        }
+        let reduced = model.project(basis.columns.as_ref()).unwrap().model(law).unwrap();
+        let mut dense = Solver::new(reduced.dimension());
+        let mut error = |load: f64| {
+            let p = at(load, 0.45);
+            let full = solver.roots(&p, band, FullVectors::None, &mut |_| {}).unwrap();
+            let full: Vec<c64> = full.roots.iter().map(|root| root.lambda).collect();
+            let compared = compare_roots(&full, &reduced_roots(&reduced, &mut dense, &p).unwrap(), &judged);
+            assert_eq!(compared.unpaired, 0);
+            compared.relative_error()
+        };
+        let (own, other) = (error(500.0), error(2000.0));
+        assert!(own < 1e-3 * other && other > 1e-4, "{own:e} {other:e}");
+    }
+
+    #[test]
+    fn windows_are_paired_by_kind_and_frequency() {
+        let window = |mu_from: f64, frequency_hz: f64| Window {
+            mode_ids: vec![],
+            mu_from,
+            mu_to: None,
+            frequency_hz,
+            kind: WindowKind::Coalescence,
+        };
+        let full = [window(0.2, 500.0), window(0.4, 1700.0)];
+        let found = compare_windows(&full, &[window(0.41, 1702.0), window(0.3, 3000.0)]);
+        assert_eq!((found.pairs.len(), found.missed.len(), found.invented.len()), (1, 1, 1));
+        assert_eq!(found.missed[0].frequency_hz, 500.0);
+        assert!((found.friction_error() - 0.01).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,242 @@
+//! Solves with a full model of two parts that touch: symmetric factors of the parts, and the contact between them.
+//!
+//! ```text
+//! Q(s) = A + Lᵀ W R,   A = diag(K + s² M) of the parts,   W = k + s c,   R and L rows of contact pairs
+//! Q⁻¹ b = A⁻¹ (b - Lᵀ y),   y = (I + W G)⁻¹ W R A⁻¹ b,   G = R A⁻¹ Lᵀ
+//! ```
+//!
+//! (Woodbury). At `s = iω`, `A` is real: `A = P L D Lᵀ Pᵀ`. The rows that the contact touches are eliminated last, so
+//! that `G` needs only the last block of the factor, and a solve one pass forward, the contact, and one pass back.
+//!
+//! Source: Hager, "Updating the inverse of a matrix", SIAM Review 31 (1989) 221-239.
+
+use faer::linalg::solvers::{PartialPivLu, Solve};
+use faer::linalg::triangular_solve::{solve_unit_lower_triangular_in_place, solve_unit_upper_triangular_in_place};
+use faer::{Mat, MatRef, Par, c64};
+
+use super::ReductionError;
+use super::full_model::{FullModel, LowRank, SparseRow};
+use super::krylov_schur::Number;
+use super::pencil::{Ldlt, Pencil};
+
+/// The parts of a full model, ordered and analysed.
+pub(super) struct Parts<'a> {
+    pencils: Vec<Pencil<'a>>,
+    /// First row of every part.
+    offsets: Vec<usize>,
+    /// Rows of every part that the contact touches.
+    touched: Vec<Vec<usize>>,
+}
+
+impl<'a> Parts<'a> {
+    /// Checks, orders and analyses every part.
+    pub(super) fn new(model: &'a FullModel) -> Result<Self, ReductionError> {
+        let (rows, offsets) = (model.contact_rows(), model.offsets());
+        let (mut pencils, mut touched) = (vec![], vec![]);
+        for (part, &offset) in model.parts.iter().zip(&offsets) {
+            let range = offset..offset + part.mass.nrows();
+            let of_part: Vec<usize> = rows.iter().filter(|row| range.contains(row)).map(|row| row - offset).collect();
+            pencils.push(Pencil::with_last(&part.name, &part.mass, &part.stiffness, &of_part)?);
+            touched.push(of_part);
+        }
+        Ok(Self { pencils, offsets, touched })
+    }
+
+    /// Bytes that factors at one shift hold, and those that everything else does.
+    pub(super) fn bytes(&self) -> (usize, usize) {
+        let dense = |rows: &Vec<usize>| 3 * size_of::<f64>() * rows.len() * rows.len();
+        let factors = self.pencils.iter().map(Pencil::factor_bytes).sum::<usize>();
+        let held = self.pencils.iter().map(Pencil::held_bytes).sum();
+        (factors + self.touched.iter().map(dense).sum::<usize>(), held)
+    }
+
+    /// The factors of `K - ω² M`.
+    pub(super) fn at(&self, square: f64) -> Result<Shifted, ReductionError> {
+        let mut parts = vec![];
+        for (index, pencil) in self.pencils.iter().enumerate() {
+            parts.push(PartFactor::new(pencil.ldlt(square)?, self.offsets[index], self.touched[index].len()));
+        }
+        Ok(Shifted { square, parts })
+    }
+}
+
+/// One part, factored.
+struct PartFactor {
+    ldlt: Ldlt,
+    offset: usize,
+    pivots: Vec<f64>,
+    /// `L` of the rows that the contact touches.
+    last: Mat<f64>,
+    /// `A⁻¹` between them.
+    flexibility: Mat<f64>,
+}
+
+impl PartFactor {
+    fn new(ldlt: Ldlt, offset: usize, touched: usize) -> Self {
+        let (pivots, last) = (ldlt.pivots(), ldlt.trailing(touched));
+        let first = pivots.len() - touched;
+        let mut inverse = Mat::<f64>::identity(touched, touched);
+        solve_unit_lower_triangular_in_place(last.as_ref(), inverse.as_mut(), Par::Seq);
+        let scaled = Mat::from_fn(touched, touched, |i, j| inverse[(i, j)] / pivots[first + i]);
+        let flexibility = inverse.transpose() * scaled;
+        Self { ldlt, offset, pivots, last, flexibility }
+    }
+
+    /// The first place that the contact touches, in the order of elimination.
+    fn first(&self) -> usize {
+        self.pivots.len() - self.last.nrows()
+    }
+}
+
+/// Factors of `K - ω² M` of every part.
+pub(super) struct Shifted {
+    /// `ω²`, rad²/s².
+    pub square: f64,
+    parts: Vec<PartFactor>,
+}
+
+/// Rows of pairs over the places that the contact touches, part by part.
+type Placed = Vec<Vec<SparseRow>>;
+
+/// `Q(s)` of a shift and an operating point, either way round.
+pub(super) struct Coupled<'a, T: Number> {
+    shifted: &'a Shifted,
+    left: Placed,
+    right: Placed,
+    weights: Vec<T>,
+    /// Of `I + W G`.
+    factor: PartialPivLu<T>,
+}
+
+impl Shifted {
+    /// Joins the parts by the pairs of `low_rank`; `weights` are `k + s c`. `transposed` gives `Q(s)ᵀ`.
+    pub(super) fn couple<T: Number>(&self, low_rank: &LowRank, weights: Vec<T>, transposed: bool) -> Coupled<'_, T>
+    where
+        PartialPivLu<T>: Solver<T>,
+    {
+        let (mut left, mut right) = (self.placed(&low_rank.left), self.placed(&low_rank.right));
+        if transposed {
+            std::mem::swap(&mut left, &mut right);
+        }
+        let rank = weights.len();
+        let mut g = Mat::<f64>::zeros(rank, rank);
+        for (part, (left, right)) in self.parts.iter().zip(left.iter().zip(&right)) {
+            let touched = part.last.nrows();
+            for (a, row) in right.iter().enumerate() {
+                let mut response = vec![0.0; touched];
+                for &(i, weight) in row {
+                    let column = part.flexibility.col_as_slice(i);
+                    response.iter_mut().zip(column).for_each(|(sum, value)| *sum += weight * value);
+                }
+                for (b, row) in left.iter().enumerate() {
+                    g[(a, b)] += row.iter().map(|&(j, weight)| weight * response[j]).sum::<f64>();
+                }
+            }
+        }
+        let real = |value: f64| T::from_complex(c64::new(value, 0.0));
+        let matrix = Mat::from_fn(rank, rank, |i, j| {
+            let coupled = weights[i] * real(g[(i, j)]);
+            if i == j { T::from_complex(coupled.complex() + 1.0) } else { coupled }
+        });
+        Coupled { shifted: self, left, right, weights, factor: <PartialPivLu<T> as Solver<T>>::of(matrix.as_ref()) }
+    }
+
+    /// Rows over all degrees of freedom as rows over what the contact touches of each part.
+    fn placed(&self, rows: &[SparseRow]) -> Placed {
+        let of_part = |part: &PartFactor| {
+            let order = &part.ldlt.order()[part.first()..];
+            let place: std::collections::HashMap<usize, usize> =
+                order.iter().enumerate().map(|(place, row)| (part.offset + row, place)).collect();
+            rows.iter()
+                .map(|row| row.iter().filter_map(|(index, weight)| Some((*place.get(index)?, *weight))).collect())
+                .collect()
+        };
+        self.parts.iter().map(of_part).collect()
+    }
+}
+
+/// A dense factor of either kind of numbers.
+pub(super) trait Solver<T: Number> {
+    fn of(matrix: MatRef<'_, T>) -> Self;
+    fn solved(&self, rhs: Mat<T>) -> Mat<T>;
+}
+
+impl Solver<f64> for PartialPivLu<f64> {
+    fn of(matrix: MatRef<'_, f64>) -> Self {
+        matrix.partial_piv_lu()
+    }
+    fn solved(&self, mut rhs: Mat<f64>) -> Mat<f64> {
+        self.solve_in_place(rhs.as_mut());
+        rhs
+    }
+}
+
+impl Solver<c64> for PartialPivLu<c64> {
+    fn of(matrix: MatRef<'_, c64>) -> Self {
+        matrix.partial_piv_lu()
+    }
+    fn solved(&self, mut rhs: Mat<c64>) -> Mat<c64> {
+        self.solve_in_place(rhs.as_mut());
+        rhs
+    }
+}
+
+impl<T: Number> Coupled<'_, T>
+where
+    PartialPivLu<T>: Solver<T>,
+{
+    /// `Q⁻¹ B`.
+    pub(super) fn solve(&self, b: MatRef<'_, T>) -> Mat<T> {
+        // Complex columns are two real ones, the imaginary parts after the real ones.
+        let (columns, real) = (b.ncols(), if T::REAL { b.ncols() } else { 2 * b.ncols() });
+        let component = |value: T, column: usize| {
+            let value = value.complex();
+            if column < columns { value.re } else { value.im }
+        };
+        let mut u = Mat::<f64>::zeros(self.weights.len(), real);
+        let mut reduced = vec![];
+        for (part, right) in self.shifted.parts.iter().zip(&self.right) {
+            let (order, n) = (part.ldlt.order(), part.pivots.len());
+            let mut z = Mat::from_fn(n, real, |i, j| component(b[(part.offset + order[i], j % columns)], j));
+            part.ldlt.forward(&mut z);
+            let touched = part.last.nrows();
+            let mut x = Mat::from_fn(touched, real, |i, j| z[(part.first() + i, j)] / part.pivots[part.first() + i]);
+            solve_unit_upper_triangular_in_place(part.last.transpose(), x.as_mut(), Par::Seq);
+            for (pair, row) in right.iter().enumerate() {
+                for &(place, weight) in row {
+                    (0..real).for_each(|j| u[(pair, j)] += weight * x[(place, j)]);
+                }
+            }
+            reduced.push(z);
+        }
+        let loads = Mat::from_fn(u.nrows(), columns, |pair, j| {
+            let im = if T::REAL { 0.0 } else { u[(pair, columns + j)] };
+            self.weights[pair] * T::from_complex(c64::new(u[(pair, j)], im))
+        });
+        let y = self.factor.solved(loads);
+        let mut x = Mat::<T>::zeros(b.nrows(), columns);
+        for ((part, left), mut z) in self.shifted.parts.iter().zip(&self.left).zip(reduced) {
+            let (order, n, first) = (part.ldlt.order(), part.pivots.len(), part.first());
+            let mut pushed = Mat::<f64>::zeros(n - first, real);
+            for (pair, row) in left.iter().enumerate() {
+                for &(place, weight) in row {
+                    (0..real).for_each(|j| pushed[(place, j)] += weight * component(y[(pair, j % columns)], j));
+                }
+            }
+            solve_unit_lower_triangular_in_place(part.last.as_ref(), pushed.as_mut(), Par::Seq);
+            let mut of_touched = z.subrows_mut(first, n - first);
+            of_touched -= pushed;
+            for j in 0..real {
+                z.col_as_slice_mut(j).iter_mut().zip(&part.pivots).for_each(|(value, pivot)| *value /= pivot);
+            }
+            part.ldlt.backward(&mut z);
+            for j in 0..columns {
+                for (i, &row) in order.iter().enumerate() {
+                    let im = if T::REAL { 0.0 } else { z[(i, columns + j)] };
+                    x[(part.offset + row, j)] = T::from_complex(c64::new(z[(i, j)], im));
+                }
+            }
+        }
+        x
+    }
+}

@@ -1,0 +1,376 @@
+//! Largest eigenpairs of an unsymmetric operator: block Arnoldi, restarted by its Schur form (Krylov-Schur).
+//!
+//! ```text
+//! C V = V H + W R E_lastᵀ,   Vᴴ V = I,   H = U T Uᴴ   =>   C (V Z) = (V Z) ZᴴHZ + W (R E_lastᵀ Z)
+//! ```
+//!
+//! `Z` spans the first columns of `U`, the eigenvalues of `T` ordered by magnitude: a space that `H` maps to itself, so
+//! that a full basis shrinks to its best part and goes on as if nothing had happened. A block catches multiple
+//! eigenvalues; vectors are kept orthogonal to all before them, twice. The basis of a real operator stays real: the
+//! space kept is closed under conjugation, and its projector `Re(U Uᴴ)` has a real basis.
+//!
+//! Source: Stewart, "A Krylov-Schur algorithm for large eigenproblems", SIAM J. Matrix Anal. Appl. 23 (2002) 601-614;
+//! Zhou, Saad, "Block Krylov-Schur method for large symmetric eigenvalue problems", Numer. Algorithms 47 (2008) 341-359.
+
+use faer::traits::ComplexField;
+use faer::{Mat, MatRef, c64};
+
+use super::ReductionError;
+use super::lanczos::random_block;
+use super::schur::Schur;
+
+/// Vectors that enter the basis together.
+pub(super) const BLOCK: usize = 4;
+/// Restarts after which no more progress is expected.
+const MOST_RESTARTS: usize = 40;
+/// Rows of the basis that are recombined at once on a restart.
+const ROWS_TOGETHER: usize = 4096;
+/// Neighbouring magnitudes this close belong together when a basis is cut.
+const TOGETHER: f64 = 1e-9;
+
+/// Numbers a basis is made of.
+pub(super) trait Number: ComplexField<Real = f64> + Copy + std::ops::Mul<Output = Self> {
+    /// As a complex number.
+    fn complex(self) -> c64;
+    /// Its first part, for a number known to be of this kind.
+    fn from_complex(value: c64) -> Self;
+    /// `Aᴴ B`.
+    fn inner(a: MatRef<'_, Self>, b: MatRef<'_, Self>) -> Mat<Self>;
+    /// `A B`.
+    fn product(a: MatRef<'_, Self>, b: MatRef<'_, Self>) -> Mat<Self>;
+    /// Whether a space must be closed under conjugation.
+    const REAL: bool;
+    /// An orthonormal basis of the span of `q`, orthonormal itself.
+    fn basis_of(q: MatRef<'_, c64>) -> Result<Mat<Self>, ReductionError>;
+}
+
+impl Number for f64 {
+    const REAL: bool = true;
+    fn complex(self) -> c64 {
+        c64::new(self, 0.0)
+    }
+    fn from_complex(value: c64) -> Self {
+        value.re
+    }
+    fn inner(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
+        a.transpose() * b
+    }
+    fn product(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
+        a * b
+    }
+    fn basis_of(q: MatRef<'_, c64>) -> Result<Mat<f64>, ReductionError> {
+        let projector = q * q.adjoint();
+        let m = q.nrows();
+        let real = Mat::from_fn(m, m, |i, j| 0.5 * (projector[(i, j)].re + projector[(j, i)].re));
+        let (_, vectors) = super::dense::symmetric_eigen("projector", real.as_ref())?;
+        // Eigenvalues 0 and 1, ascending.
+        Ok(vectors.subcols(m - q.ncols(), q.ncols()).to_owned())
+    }
+}
+
+impl Number for c64 {
+    const REAL: bool = false;
+    fn complex(self) -> c64 {
+        self
+    }
+    fn from_complex(value: c64) -> Self {
+        value
+    }
+    fn inner(a: MatRef<'_, c64>, b: MatRef<'_, c64>) -> Mat<c64> {
+        a.adjoint() * b
+    }
+    fn product(a: MatRef<'_, c64>, b: MatRef<'_, c64>) -> Mat<c64> {
+        a * b
+    }
+    fn basis_of(q: MatRef<'_, c64>) -> Result<Mat<c64>, ReductionError> {
+        Ok(q.to_owned())
+    }
+}
+
+/// Numbers in [-1, 1) of any kind, the same on every run.
+pub(super) fn random<T: Number>(n: usize, columns: usize, seed: u64) -> Mat<T> {
+    let (re, im) = (random_block(n, columns, seed), random_block(if T::REAL { 0 } else { n }, columns, seed ^ 0x5a5a));
+    Mat::from_fn(n, columns, |i, j| T::from_complex(c64::new(re[(i, j)], if T::REAL { 0.0 } else { im[(i, j)] })))
+}
+
+/// Converged eigenpairs, largest first.
+pub(super) struct Largest {
+    pub theta: Vec<c64>,
+    /// `n` by as many as `theta`, each of length 1.
+    pub vectors: Mat<c64>,
+}
+
+/// What the iteration is told.
+pub(super) struct Iteration<'a> {
+    /// How errors name the system.
+    pub what: &'a str,
+    /// `n`.
+    pub dimension: usize,
+    /// Pairs that are wanted.
+    pub count: usize,
+    /// Residual a pair may have, relative to its `θ`.
+    pub residual_limit: f64,
+    /// Which random start.
+    pub seed: u64,
+}
+
+/// Vectors that a basis for `count` pairs holds at most.
+pub(super) fn capacity(dimension: usize, count: usize) -> usize {
+    (3 * count + 4 * BLOCK).min(dimension / BLOCK * BLOCK)
+}
+
+impl Iteration<'_> {
+    /// The largest pairs of `apply`: `count` of them, or fewer where `enough` is content with the converged `θ`, or where
+    /// the whole space is at hand. `progress` is told how many vectors were built and how many pairs converged.
+    pub(super) fn run<T: Number>(
+        &self,
+        apply: &dyn Fn(Mat<T>) -> Mat<T>,
+        enough: &dyn Fn(&[c64]) -> bool,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Largest, ReductionError> {
+        let capacity = capacity(self.dimension, self.count);
+        let mut space = Space::<T>::new(self.dimension, capacity);
+        let start = apply(random::<T>(self.dimension, BLOCK, self.seed));
+        space.append(start, None, self.seed);
+        let mut next_check = (3 * self.count / 2).min(capacity);
+        let (mut restarts, mut built) = (0, BLOCK);
+        loop {
+            let mut w = apply(space.last_block());
+            let before = w.norm_l2();
+            space.project_out(&mut w);
+            let whole = space.size + BLOCK > self.dimension || w.norm_l2() < 1e-14 * before;
+            let full = space.size + BLOCK > capacity || whole;
+            if full || space.size >= next_check {
+                let remainder = T::inner(w.as_ref(), w.as_ref());
+                let ritz = space.ritz(self.what, remainder.as_ref())?;
+                let good = |k: &usize| ritz.residuals[*k] <= self.residual_limit || whole;
+                let converged = (0..space.size).take_while(good).count();
+                progress(built, converged);
+                let theta: Vec<c64> = (0..converged).map(|k| ritz.schur.value(k)).collect();
+                if converged >= self.count || whole || (converged > 0 && enough(&theta)) {
+                    return Ok(Largest { vectors: space.vectors(&ritz, converged), theta });
+                }
+                if full && restarts == MOST_RESTARTS {
+                    return Err(ReductionError::NotConverged {
+                        what: self.what.to_owned(),
+                        mode: converged,
+                        value: ritz.residuals[converged],
+                        limit: self.residual_limit,
+                        vectors: built,
+                    });
+                }
+                if full {
+                    let coupling = space.restart(&ritz, (self.count + capacity) / 2)?;
+                    restarts += 1;
+                    next_check = space.size + self.count / 2;
+                    space.append(w, Some(coupling), self.seed);
+                    built += BLOCK;
+                    continue;
+                }
+                next_check = space.size + (self.count / 2).max(BLOCK);
+            }
+            space.append(w, None, self.seed);
+            built += BLOCK;
+        }
+    }
+}
+
+/// The ordered Schur form of the projected operator and the residual of every Ritz pair, relative to its `θ`.
+struct Ritz {
+    schur: Schur,
+    residuals: Vec<f64>,
+}
+
+/// Orthonormal vectors `V` with `H = Vᴴ C V`.
+struct Space<T: Number> {
+    basis: Mat<T>,
+    projected: Mat<c64>,
+    size: usize,
+}
+
+impl<T: Number> Space<T> {
+    fn new(n: usize, capacity: usize) -> Self {
+        Self { basis: Mat::zeros(n, capacity), projected: Mat::zeros(capacity, capacity), size: 0 }
+    }
+
+    fn last_block(&self) -> Mat<T> {
+        self.basis.subcols(self.size - BLOCK, BLOCK).to_owned()
+    }
+
+    /// Takes everything the basis holds out of `w = C V_last`, twice, and notes the coefficients in `H`.
+    fn project_out(&mut self, w: &mut Mat<T>) {
+        let first = self.size - BLOCK;
+        for _ in 0..2 {
+            let held = self.basis.subcols(0, self.size);
+            let coefficients = T::inner(held, w.as_ref());
+            *w -= T::product(held, coefficients.as_ref());
+            for j in 0..BLOCK {
+                for i in 0..self.size {
+                    self.projected[(i, first + j)] += coefficients[(i, j)].complex();
+                }
+            }
+        }
+    }
+
+    /// Appends a block after making it orthonormal, `W = Q R`; `R` joins it to the block before, or `coupling` to all.
+    /// A vector that vanishes is replaced by a random one that nothing is joined to.
+    fn append(&mut self, block: Mat<T>, coupling: Option<Mat<c64>>, seed: u64) {
+        let (n, start) = (block.nrows(), self.size);
+        let mut r = Mat::<c64>::zeros(BLOCK, BLOCK);
+        let whole = block.norm_l2();
+        for column in 0..BLOCK {
+            let mut vector = block.subcols(column, 1).to_owned();
+            let within = self.make_orthogonal(&mut vector, start);
+            (0..column).for_each(|i| r[(i, column)] = within[(i, 0)].complex());
+            let mut norm = vector.norm_l2();
+            if norm > 1e-13 * whole {
+                // What little is left of a vector may lean on all before.
+                self.make_orthogonal(&mut vector, 0);
+                norm = vector.norm_l2();
+                r[(column, column)] = c64::new(norm, 0.0);
+            }
+            let mut attempt = 0;
+            while norm <= 1e-13 * whole {
+                vector = random::<T>(n, 1, seed ^ (0x9e37 + 8 * self.size as u64 + attempt));
+                self.make_orthogonal(&mut vector, 0);
+                self.make_orthogonal(&mut vector, 0);
+                norm = vector.norm_l2();
+                attempt += 1;
+                if norm > 1e-6 {
+                    break;
+                }
+            }
+            let scale = T::from_complex(c64::new(1.0 / norm, 0.0));
+            vector.col_mut(0).iter_mut().for_each(|value| *value = *value * scale);
+            self.make_orthogonal(&mut vector, 0);
+            self.basis.subcols_mut(self.size, 1).copy_from(&vector);
+            self.size += 1;
+        }
+        let joined = match coupling {
+            // `W = Q R`: the coupling of `W` to the basis becomes that of `Q`.
+            Some(of_w) => &r * of_w,
+            None => r,
+        };
+        if start >= joined.ncols() {
+            let first = start - joined.ncols();
+            self.projected.submatrix_mut(start, first, BLOCK, joined.ncols()).copy_from(&joined);
+        }
+    }
+
+    /// Takes out of a vector what the basis holds from its column `from` on; returns how much of each.
+    fn make_orthogonal(&self, vector: &mut Mat<T>, from: usize) -> Mat<T> {
+        let held = self.basis.subcols(from, self.size - from);
+        let coefficients = T::inner(held, vector.as_ref());
+        *vector -= T::product(held, coefficients.as_ref());
+        coefficients
+    }
+
+    /// The Schur form of `H` and residuals, `remainder` being the Gram matrix of the next block.
+    fn ritz(&self, what: &str, remainder: MatRef<'_, T>) -> Result<Ritz, ReductionError> {
+        let m = self.size;
+        let failed = || ReductionError::Factorisation {
+            what: what.to_owned(),
+            reason: format!("the eigenvalues of a projection on {m} vectors did not converge"),
+        };
+        let mut schur = Schur::new(self.projected.submatrix(0, 0, m, m)).ok_or_else(failed)?;
+        schur.sort();
+        let residual = |k: usize| {
+            let vector = schur.vector(k);
+            let tail = |i: usize| vector[(m - BLOCK + i, 0)];
+            let sum: c64 = (0..BLOCK)
+                .flat_map(|i| (0..BLOCK).map(move |j| (i, j)))
+                .map(|(i, j)| tail(i).conj() * remainder[(i, j)].complex() * tail(j))
+                .sum();
+            sum.re.max(0.0).sqrt() / schur.value(k).norm()
+        };
+        let residuals = (0..m).map(residual).collect();
+        Ok(Ritz { schur, residuals })
+    }
+
+    /// The first `count` Ritz vectors.
+    fn vectors(&self, ritz: &Ritz, count: usize) -> Mat<c64> {
+        let n = self.basis.nrows();
+        let mut mixed = Mat::<c64>::zeros(self.size, count);
+        for k in 0..count {
+            mixed.subcols_mut(k, 1).copy_from(ritz.schur.vector(k));
+        }
+        let mut vectors = Mat::zeros(n, count);
+        for first in (0..n).step_by(ROWS_TOGETHER) {
+            let rows = ROWS_TOGETHER.min(n - first);
+            let part = self.basis.submatrix(first, 0, rows, self.size);
+            let part = Mat::from_fn(rows, self.size, |i, j| part[(i, j)].complex());
+            vectors.subrows_mut(first, rows).copy_from(part * &mixed);
+        }
+        vectors
+    }
+
+    /// Shrinks the basis to about `keep` vectors that hold the best pairs; returns how the next block `W` is joined to
+    /// them.
+    fn restart(&mut self, ritz: &Ritz, keep: usize) -> Result<Mat<c64>, ReductionError> {
+        let m = self.size;
+        let size = |k: usize| ritz.schur.value(k).norm();
+        // A conjugate pair is not cut in two.
+        let mut keep = keep.min(m - BLOCK);
+        while keep > 1 && (size(keep - 1) - size(keep)).abs() < TOGETHER * size(keep) {
+            keep -= 1;
+        }
+        let kept = T::basis_of(ritz.schur.u.subcols(0, keep))?;
+        let z = Mat::from_fn(m, keep, |i, j| kept[(i, j)].complex());
+        for first in (0..self.basis.nrows()).step_by(ROWS_TOGETHER) {
+            let rows = ROWS_TOGETHER.min(self.basis.nrows() - first);
+            let recombined = T::product(self.basis.submatrix(first, 0, rows, m), kept.as_ref());
+            self.basis.submatrix_mut(first, 0, rows, keep).copy_from(&recombined);
+        }
+        let projected = z.adjoint() * (self.projected.submatrix(0, 0, m, m) * &z);
+        self.projected.fill(c64::new(0.0, 0.0));
+        self.projected.submatrix_mut(0, 0, keep, keep).copy_from(&projected);
+        self.size = keep;
+        Ok(z.subrows(m - BLOCK, BLOCK).to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A block diagonal real operator with eigenvalues `(a ± b i)`, each block twice, largest first; restarts are needed.
+    #[test]
+    fn double_complex_pairs_of_a_real_operator() {
+        let blocks = 400;
+        let value = |block: usize| {
+            let size = 1.0 / (1 + block / 2) as f64;
+            c64::new(0.8 * size, if (block / 2).is_multiple_of(3) { 0.0 } else { 0.5 * size })
+        };
+        let apply = |x: Mat<f64>| {
+            Mat::from_fn(2 * blocks, x.ncols(), |i, j| {
+                let (block, c) = (i / 2, value(i / 2));
+                let (p, q) = (x[(2 * block, j)], x[(2 * block + 1, j)]);
+                if i % 2 == 0 { c.re * p + 2.0 * c.im * q } else { c.re * q - 0.5 * c.im * p }
+            })
+        };
+        let iteration = Iteration { what: "test", dimension: 2 * blocks, count: 16, residual_limit: 1e-12, seed: 0 };
+        let mut most = 0;
+        let found = iteration.run::<f64>(&apply, &|_| false, &mut |built, _| most = built).unwrap();
+        assert!(most > capacity(2 * blocks, 16), "no restart was needed: {most}");
+        let mut expected: Vec<c64> = (0..blocks).flat_map(|block| [value(block), value(block).conj()]).collect();
+        expected.sort_by(|a, b| b.norm().total_cmp(&a.norm()));
+        for theta in &found.theta {
+            let nearest =
+                expected.iter().enumerate().min_by(|a, b| (a.1 - theta).norm().total_cmp(&(b.1 - theta).norm()));
+            let (index, nearest) = nearest.map(|(i, value)| (i, *value)).unwrap();
+            // Blocks are not normal by a factor 2.
+            assert!((nearest - theta).norm() < 1e-11, "{theta} {nearest}");
+            expected.remove(index);
+        }
+        // None of the largest is left over.
+        let last = found.theta.last().unwrap().norm();
+        assert!(expected[0].norm() <= last * (1.0 + 1e-9), "{} {last}", expected[0]);
+        for (k, theta) in found.theta.iter().enumerate() {
+            let x = found.vectors.subcols(k, 1);
+            let part = |im: bool| Mat::from_fn(2 * blocks, 1, |i, _| if im { x[(i, 0)].im } else { x[(i, 0)].re });
+            let (re, im) = (apply(part(false)), apply(part(true)));
+            let residual = Mat::from_fn(2 * blocks, 1, |i, _| c64::new(re[(i, 0)], im[(i, 0)]) - theta * x[(i, 0)]);
+            assert!(residual.norm_l2() < 1e-11);
+        }
+    }
+}

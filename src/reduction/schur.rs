@@ -1,0 +1,222 @@
+//! Schur form of a small complex matrix, its eigenvalues in any order.
+//!
+//! ```text
+//! A = U T Uᴴ,   Uᴴ U = I,   T upper triangular
+//! ```
+//!
+//! By Householder reflections to Hessenberg form and the QR iteration with Wilkinson's shift; neighbours on the diagonal
+//! change places by a rotation. All of it is backward stable, however near eigenvectors are to each other.
+//!
+//! Source: Golub, Van Loan, "Matrix computations" (2013), sections 7.4 to 7.6.
+
+use faer::{Mat, MatRef, c64};
+
+/// Iterations for each eigenvalue before the matrix is given up.
+const MOST_ITERATIONS: usize = 60;
+
+/// `A = U T Uᴴ`.
+pub(super) struct Schur {
+    pub t: Mat<c64>,
+    pub u: Mat<c64>,
+}
+
+const ZERO: c64 = c64::new(0.0, 0.0);
+const ONE: c64 = c64::new(1.0, 0.0);
+
+impl Schur {
+    /// The Schur form of `matrix`, `m×m`; `None` where an eigenvalue does not converge.
+    pub(super) fn new(matrix: MatRef<'_, c64>) -> Option<Self> {
+        let m = matrix.nrows();
+        let mut schur = Self { t: matrix.to_owned(), u: Mat::identity(m, m) };
+        schur.hessenberg();
+        schur.iterate().then_some(schur)
+    }
+
+    /// Makes `T` zero below its first subdiagonal.
+    fn hessenberg(&mut self) {
+        let m = self.t.nrows();
+        for k in 0..m.saturating_sub(2) {
+            let mut v: Vec<c64> = (k + 1..m).map(|i| self.t[(i, k)]).collect();
+            let norm = v.iter().map(|x| x.norm_sqr()).sum::<f64>().sqrt();
+            if norm == 0.0 {
+                continue;
+            }
+            let phase = if v[0] == ZERO { ONE } else { v[0] / v[0].norm() };
+            v[0] += phase * norm;
+            let scale = v.iter().map(|x| x.norm_sqr()).sum::<f64>();
+            for j in k..m {
+                let dot: c64 = v.iter().enumerate().map(|(i, x)| x.conj() * self.t[(k + 1 + i, j)]).sum();
+                let factor = dot * (2.0 / scale);
+                v.iter().enumerate().for_each(|(i, x)| self.t[(k + 1 + i, j)] -= factor * x);
+            }
+            for matrix in [&mut self.t, &mut self.u] {
+                for i in 0..m {
+                    let dot: c64 = v.iter().enumerate().map(|(j, x)| matrix[(i, k + 1 + j)] * x).sum();
+                    let factor = dot * (2.0 / scale);
+                    v.iter().enumerate().for_each(|(j, x)| matrix[(i, k + 1 + j)] -= factor * x.conj());
+                }
+            }
+            (k + 2..m).for_each(|i| self.t[(i, k)] = ZERO);
+        }
+    }
+
+    /// QR iterations until `T` is triangular.
+    fn iterate(&mut self) -> bool {
+        let m = self.t.nrows();
+        let size = self.t.norm_max().max(f64::MIN_POSITIVE);
+        let (mut end, mut iterations) = (m, 0);
+        while end > 1 {
+            let small = |l: usize| {
+                let near = self.t[(l, l)].norm() + self.t[(l - 1, l - 1)].norm();
+                self.t[(l, l - 1)].norm() <= f64::EPSILON * if near > 0.0 { near } else { size }
+            };
+            let start = (1..end).rev().find(|&l| small(l)).unwrap_or(0);
+            if start > 0 {
+                self.t[(start, start - 1)] = ZERO;
+            }
+            if start == end - 1 {
+                end -= 1;
+                iterations = 0;
+                continue;
+            }
+            iterations += 1;
+            if iterations > MOST_ITERATIONS {
+                return false;
+            }
+            self.sweep(start, end, self.shift(end, iterations));
+        }
+        true
+    }
+
+    /// The eigenvalue of the last block of two that is nearer to its corner; now and then something else.
+    fn shift(&self, end: usize, iterations: usize) -> c64 {
+        let (i, j) = (end - 2, end - 1);
+        let (a, b, c, d) = (self.t[(i, i)], self.t[(i, j)], self.t[(j, i)], self.t[(j, j)]);
+        if iterations.is_multiple_of(10) {
+            return d + c.norm();
+        }
+        let half = (a - d) * 0.5;
+        let root = (half * half + b * c).sqrt();
+        let (plus, minus) = (half + root, half - root);
+        d + if plus.norm() < minus.norm() { plus } else { minus }
+    }
+
+    /// One QR step of the rows from `start` to `end`.
+    fn sweep(&mut self, start: usize, end: usize, shift: c64) {
+        let m = self.t.nrows();
+        let (mut x, mut y) = (self.t[(start, start)] - shift, self.t[(start + 1, start)]);
+        for k in start..end - 1 {
+            let norm = (x.norm_sqr() + y.norm_sqr()).sqrt();
+            if norm > 0.0 {
+                let (c, s) = (x / norm, y / norm);
+                for j in k.saturating_sub(1).max(start)..m {
+                    let (p, q) = (self.t[(k, j)], self.t[(k + 1, j)]);
+                    self.t[(k, j)] = c.conj() * p + s.conj() * q;
+                    self.t[(k + 1, j)] = c * q - s * p;
+                }
+                self.mix_columns(k, [c, s], (k + 3).min(end));
+            }
+            if k + 2 < end {
+                (x, y) = (self.t[(k + 1, k)], self.t[(k + 2, k)]);
+            }
+        }
+    }
+
+    /// Columns `k` and `k + 1` of `T`, down to row `rows`, and of `U` times `[[c, -s̄], [s, c̄]]`.
+    fn mix_columns(&mut self, k: usize, [c, s]: [c64; 2], rows: usize) {
+        let m = self.u.nrows();
+        for (matrix, rows) in [(&mut self.t, rows), (&mut self.u, m)] {
+            for i in 0..rows {
+                let (p, q) = (matrix[(i, k)], matrix[(i, k + 1)]);
+                matrix[(i, k)] = p * c + q * s;
+                matrix[(i, k + 1)] = q * c.conj() - p * s.conj();
+            }
+        }
+    }
+
+    /// Lets the eigenvalues at `k` and `k + 1` change places.
+    fn swap(&mut self, k: usize) {
+        let m = self.t.nrows();
+        let (first, second, above) = (self.t[(k, k)], self.t[(k + 1, k + 1)], self.t[(k, k + 1)]);
+        let (x, y) = (above, second - first);
+        let norm = (x.norm_sqr() + y.norm_sqr()).sqrt();
+        if norm == 0.0 {
+            return;
+        }
+        let (c, s) = (x / norm, y / norm);
+        for j in k..m {
+            let (p, q) = (self.t[(k, j)], self.t[(k + 1, j)]);
+            self.t[(k, j)] = c.conj() * p + s.conj() * q;
+            self.t[(k + 1, j)] = c * q - s * p;
+        }
+        self.mix_columns(k, [c, s], k + 2);
+        self.t[(k + 1, k)] = ZERO;
+        self.t[(k, k)] = second;
+        self.t[(k + 1, k + 1)] = first;
+    }
+
+    /// Orders the eigenvalues by magnitude, largest first.
+    pub(super) fn sort(&mut self) {
+        let m = self.t.nrows();
+        for place in 0..m {
+            let size = |k: usize| self.t[(k, k)].norm();
+            let largest = (place..m).max_by(|&a, &b| size(a).total_cmp(&size(b)).then(b.cmp(&a))).unwrap_or(place);
+            (place..largest).rev().for_each(|k| self.swap(k));
+        }
+    }
+
+    /// The eigenvalue at place `k`.
+    pub(super) fn value(&self, k: usize) -> c64 {
+        self.t[(k, k)]
+    }
+
+    /// The eigenvector at place `k` of the matrix itself, of length 1.
+    pub(super) fn vector(&self, k: usize) -> Mat<c64> {
+        let tiny = f64::EPSILON * self.t.norm_max();
+        let mut y = Mat::<c64>::zeros(k + 1, 1);
+        y[(k, 0)] = ONE;
+        for i in (0..k).rev() {
+            let sum: c64 = (i + 1..=k).map(|j| self.t[(i, j)] * y[(j, 0)]).sum();
+            let gap = self.t[(i, i)] - self.t[(k, k)];
+            y[(i, 0)] = -sum / if gap.norm() > tiny { gap } else { c64::new(tiny, 0.0) };
+        }
+        let norm = y.norm_l2();
+        (self.u.subcols(0, k + 1) * y) * faer::Scale(c64::new(1.0 / norm, 0.0))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::lanczos::random_block;
+    use super::*;
+
+    /// Backward stability: `|U T Uᴴ - A|`, `|Uᴴ U - I|` and `|A x - θ x|` are a modest multiple of `ε √m` (of 60).
+    #[test]
+    fn it_gives_the_matrix_back_in_any_order() {
+        let m = 60;
+        let (re, im) = (random_block(m, m, 3), random_block(m, m, 4));
+        let mut matrix = Mat::from_fn(m, m, |i, j| c64::new(re[(i, j)], im[(i, j)]));
+        // A defective pair and a multiple eigenvalue on top.
+        for j in 0..m {
+            for i in [10, 11, 12] {
+                matrix[(i, j)] = ZERO;
+            }
+        }
+        matrix[(10, 10)] = ONE;
+        matrix[(11, 11)] = ONE;
+        matrix[(12, 12)] = ONE;
+        matrix[(10, 11)] = ONE;
+        let mut schur = Schur::new(matrix.as_ref()).unwrap();
+        schur.sort();
+        let limit = 100.0 * f64::EPSILON * (m as f64).sqrt() * matrix.norm_l2();
+        let back = &schur.u * &schur.t * schur.u.adjoint();
+        assert!((back - &matrix).norm_l2() < limit);
+        assert!((schur.u.adjoint() * &schur.u - Mat::<c64>::identity(m, m)).norm_l2() < limit);
+        for k in 0..m {
+            assert!(k == 0 || schur.value(k).norm() <= schur.value(k - 1).norm() * (1.0 + 1e-12));
+            assert!((k + 1..m).all(|i| schur.t[(i, k)].norm() < limit));
+            let x = schur.vector(k);
+            assert!((&matrix * &x - &x * faer::Scale(schur.value(k))).norm_l2() < limit, "{k}");
+        }
+    }
+}

@@ -1,0 +1,46 @@
+//! The paper's tables and figures, made again: data, figures and one page that sets ours beside the paper's numbers.
+
+mod nine_dof;
+
+use crate::html::{figure, page, section};
+
+pub use nine_dof::nine_dof;
+
+/// A table or figure of the paper, made again.
+#[derive(Clone, Debug)]
+pub struct Item {
+    /// Its files are called that.
+    pub name: &'static str,
+    /// `Table 1: …`.
+    pub title: String,
+    /// What there is to say about it, markup.
+    pub text: String,
+    /// The data.
+    pub csv: String,
+    /// The drawing, where it is a figure.
+    pub svg: Option<String>,
+}
+
+/// All of it on one page.
+pub fn index(items: &[Item]) -> String {
+    let mut body = "<h1>The paper's tables and figures, made again</h1>\n\
+         <p class=\"lead\">Every number is computed; the paper's own stand beside. Each table and figure is also a file of \
+         its own, beside this page.</p>\n"
+        .to_owned();
+    for item in items {
+        let drawn = match &item.svg {
+            Some(svg) => figure(svg, &item.text),
+            None => item.text.clone(),
+        };
+        body += &section(&item.title, &drawn);
+    }
+    page("squealcast: the paper's tables and figures", &body)
+}
+
+/// A table of text cells under its header.
+fn table(header: &[&str], rows: &[Vec<String>]) -> String {
+    let row = |cells: &mut dyn Iterator<Item = String>| format!("<tr>{}</tr>\n", cells.collect::<String>());
+    let head = row(&mut header.iter().map(|cell| format!("<th scope=\"col\">{cell}</th>")));
+    let body: String = rows.iter().map(|cells| row(&mut cells.iter().map(|cell| format!("<td>{cell}</td>")))).collect();
+    format!("<table>\n<thead>\n{head}</thead>\n<tbody>\n{body}</tbody>\n</table>\n")
+}

@@ -1,0 +1,331 @@
+//! Modes of a substructure in the Universal File Format: datasets 15 or 2411 (nodes), 55 (normal modes), 164 (units).
+//!
+//! Text in fixed columns, every dataset between two lines of `-1`. Shapes are scaled to unit modal mass, which the file
+//! must give; lengths and masses are converted to SI where the file has units. The nodes of the substructure are those
+//! for which a shape has values, in the order of the nodes' dataset; a node that a mode does not list is at rest in it.
+//! A hysteretic loss factor counts as half as much viscous damping, which is the same at resonance.
+//!
+//! Source: Structural Dynamics Research Laboratory, University of Cincinnati, "Universal File Formats for Modal Analysis
+//! Testing".
+
+use std::collections::HashMap;
+use std::f64::consts::TAU;
+
+use super::RigError;
+use super::modal_data::ModalData;
+
+/// The line before and after every dataset.
+const DELIMITER: &str = "-1";
+
+/// A mode as it is written.
+struct Mode {
+    omega_rad_s: f64,
+    modal_mass: f64,
+    damping_ratio: f64,
+    /// Displacement by node label.
+    shape: HashMap<u64, [f64; 3]>,
+}
+
+/// A node as it is written.
+struct Node {
+    label: u64,
+    position: [f64; 3],
+}
+
+/// What one unit of the file is in SI.
+struct Units {
+    length_m: f64,
+    force_n: f64,
+}
+
+/// The lines of a file and how far they were read.
+struct Lines<'a> {
+    file: &'a str,
+    lines: Vec<std::borrow::Cow<'a, str>>,
+    next: usize,
+    dataset: String,
+}
+
+/// Reads a Universal File.
+///
+/// # Errors
+/// [`RigError::Line`], naming the line, what stands there and what was expected.
+pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
+    let lines = bytes.split(|byte| *byte == b'\n').map(String::from_utf8_lossy).collect();
+    let mut lines = Lines { file, lines, next: 0, dataset: String::new() };
+    let (mut nodes, mut modes) = (Vec::<Node>::new(), Vec::<Mode>::new());
+    let mut units = Units { length_m: 1.0, force_n: 1.0 };
+    while let Some(number) = lines.next_dataset()? {
+        match number.as_str() {
+            "15" => nodes.extend(lines.nodes(1)?),
+            "2411" => nodes.extend(lines.nodes(2)?),
+            "55" => modes.extend(lines.mode()?),
+            "164" => units = lines.units()?,
+            _ => lines.skip()?,
+        }
+    }
+    let whole = |field: &str, value: &str, limit: &str| lines.refused(lines.lines.len(), field, value, limit);
+    if nodes.is_empty() {
+        return Err(whole("nodes", "are missing", "a dataset 15 or 2411"));
+    }
+    if modes.is_empty() {
+        return Err(whole("modes", "are missing", "a dataset 55 of analysis type 2, normal modes"));
+    }
+    let mut seen = HashMap::new();
+    for (index, node) in nodes.iter().enumerate() {
+        if seen.insert(node.label, index).is_some() {
+            return Err(whole(&format!("node {}", node.label), "is there twice", "every node once"));
+        }
+    }
+    let mut moving = vec![false; nodes.len()];
+    for mode in &modes {
+        for label in mode.shape.keys() {
+            match seen.get(label) {
+                Some(&index) => moving[index] = true,
+                None => {
+                    let limit = "a place for it in a dataset 15 or 2411";
+                    return Err(whole(&format!("node {label}"), "has a mode shape only", limit));
+                }
+            }
+        }
+    }
+    let nodes: Vec<&Node> = nodes.iter().zip(&moving).filter(|(_, moving)| **moving).map(|(node, _)| node).collect();
+    if nodes.is_empty() {
+        return Err(whole("mode shapes", "have no values", "values at nodes"));
+    }
+    let mass_kg = units.force_n / units.length_m;
+    let scale: Vec<f64> = modes.iter().map(|mode| 1.0 / (mode.modal_mass * mass_kg).sqrt()).collect();
+    let phi = nodes
+        .iter()
+        .flat_map(|node| (0..3).map(move |axis| (node.label, axis)))
+        .flat_map(|(label, axis)| {
+            let values = modes.iter().zip(&scale);
+            values.map(move |(mode, scale)| mode.shape.get(&label).map_or(0.0, |shape| shape[axis] * scale))
+        })
+        .collect();
+    let damped = modes.iter().any(|mode| mode.damping_ratio != 0.0);
+    Ok(ModalData {
+        omega_rad_s: modes.iter().map(|mode| mode.omega_rad_s).collect(),
+        phi,
+        nodes_m: nodes.iter().map(|node| node.position.map(|value| value * units.length_m)).collect(),
+        damping_ratio: damped.then(|| modes.iter().map(|mode| mode.damping_ratio).collect()),
+        mass_share: None,
+        residual: None,
+    })
+}
+
+impl Lines<'_> {
+    /// An error at a line, counted from 1.
+    fn refused(&self, line: usize, field: &str, value: &str, limit: &str) -> RigError {
+        let (file, field, value, limit) = (self.file.to_owned(), field.to_owned(), value.to_owned(), limit.to_owned());
+        RigError::Line { file, line, field, value, limit }
+    }
+
+    /// An error at the line read last.
+    fn refused_here(&self, field: &str, value: &str, limit: &str) -> RigError {
+        self.refused(self.next, &format!("dataset {}: {field}", self.dataset), value, limit)
+    }
+
+    /// The number of the next dataset; `None` at the end of the file.
+    fn next_dataset(&mut self) -> Result<Option<String>, RigError> {
+        while let Some(line) = self.lines.get(self.next) {
+            self.next += 1;
+            match line.trim() {
+                "" => {}
+                DELIMITER => {
+                    let number = self.lines.get(self.next).map_or("", |line| line.trim()).to_owned();
+                    self.next += 1;
+                    // A binary variant is told by a letter after the number, and by more numbers behind that.
+                    let first = number.split_whitespace().next().unwrap_or("").to_owned();
+                    if first.is_empty() || !first.starts_with(|c: char| c.is_ascii_digit()) {
+                        let value = format!("is `{}`", shown(&number));
+                        return Err(self.refused(
+                            self.next,
+                            "number of a dataset",
+                            &value,
+                            "a number after a line of -1",
+                        ));
+                    }
+                    self.dataset.clone_from(&first);
+                    return Ok(Some(first));
+                }
+                other => {
+                    let value = format!("is `{}`", shown(other));
+                    return Err(self.refused(self.next, "line between datasets", &value, "-1, as in a Universal File"));
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// The next line of a dataset; `None` after its last one.
+    fn line(&mut self) -> Result<Option<String>, RigError> {
+        match self.lines.get(self.next) {
+            Some(line) => {
+                self.next += 1;
+                let line = line.trim_end_matches('\r');
+                Ok((line.trim() != DELIMITER).then(|| line.to_owned()))
+            }
+            None => {
+                Err(self.refused(self.lines.len(), &format!("dataset {}", self.dataset), "has no end", "a line of -1"))
+            }
+        }
+    }
+
+    /// The next line of a dataset that must not end here.
+    fn required(&mut self, what: &str) -> Result<String, RigError> {
+        match self.line()? {
+            Some(line) => Ok(line),
+            None => Err(self.refused_here(what, "is missing", "a line with it before the dataset ends")),
+        }
+    }
+
+    fn skip(&mut self) -> Result<(), RigError> {
+        while self.line()?.is_some() {}
+        Ok(())
+    }
+
+    /// The columns of a line, each of its own width; where they do not parse, the words of the line.
+    fn fields(&self, line: &str, widths: &[usize]) -> Vec<String> {
+        let mut start = 0;
+        let columns: Vec<String> = widths
+            .iter()
+            .map(|width| {
+                let column = line.get(start..line.len().min(start + width)).unwrap_or("").trim().to_owned();
+                start += width;
+                column
+            })
+            .collect();
+        let rest = line.get(start..).unwrap_or("").trim();
+        if rest.is_empty() && columns.iter().all(|column| number(column).is_some()) {
+            return columns;
+        }
+        line.split_whitespace().map(str::to_owned).collect()
+    }
+
+    /// At least `least` numbers from a line.
+    fn numbers(&self, line: &str, what: &str, widths: &[usize], least: usize) -> Result<Vec<f64>, RigError> {
+        let fields = self.fields(line, widths);
+        if fields.len() < least {
+            let value = format!("has {} numbers (`{}`)", fields.len(), shown(line));
+            return Err(self.refused_here(what, &value, &format!("at least {least}")));
+        }
+        let parsed = |field: &String| match number(field) {
+            Some(value) if value.is_finite() => Ok(value),
+            _ => Err(self.refused_here(what, &format!("is `{}`", shown(field)), "a finite number")),
+        };
+        fields.iter().map(parsed).collect()
+    }
+
+    /// A whole number of at least 0.
+    fn count(&self, what: &str, value: f64) -> Result<u64, RigError> {
+        if value >= 0.0 && value.fract() == 0.0 && value < 1e15 {
+            return Ok(value as u64);
+        }
+        Err(self.refused_here(what, &format!("is {value}"), "a whole number of at least 0"))
+    }
+
+    /// An error at the line read last, unless `holds`.
+    fn must(&self, holds: bool, what: &str, value: f64, limit: &str) -> Result<(), RigError> {
+        if holds { Ok(()) } else { Err(self.refused_here(what, &format!("is {value}"), limit)) }
+    }
+
+    /// Datasets 15 (one line a node) and 2411 (two lines a node).
+    fn nodes(&mut self, lines_each: usize) -> Result<Vec<Node>, RigError> {
+        let mut nodes = vec![];
+        while let Some(line) = self.line()? {
+            let (head, position) = if lines_each == 1 {
+                let all = self.numbers(&line, "node", &[10, 10, 10, 10, 13, 13, 13], 7)?;
+                (all[..4].to_vec(), all[4..7].to_vec())
+            } else {
+                let head = self.numbers(&line, "node", &[10; 4], 4)?;
+                let line = self.required("position of a node")?;
+                (head, self.numbers(&line, "position of a node", &[25; 3], 3)?)
+            };
+            let label = self.count("label of a node", head[0])?;
+            for (what, system) in [("definition", head[1]), ("displacement", head[2])] {
+                // 0 and 1 are both in use for the global Cartesian system.
+                if system != 0.0 && system != 1.0 {
+                    let value = format!("of node {label} is {system}");
+                    return Err(self.refused_here(
+                        &format!("{what} coordinate system"),
+                        &value,
+                        "0 or 1, the global one",
+                    ));
+                }
+            }
+            nodes.push(Node { label, position: [position[0], position[1], position[2]] });
+        }
+        Ok(nodes)
+    }
+
+    /// Dataset 164: what to divide by to come to SI.
+    fn units(&mut self) -> Result<Units, RigError> {
+        self.required("units")?;
+        let line = self.required("factors of units")?;
+        let factors = self.numbers(&line, "factors of units", &[25; 3], 2)?;
+        if let Some(factor) = factors[..2].iter().find(|factor| **factor <= 0.0) {
+            return Err(self.refused_here("factors of units", &format!("are {factor}"), "more than 0"));
+        }
+        self.skip()?;
+        Ok(Units { length_m: 1.0 / factors[0], force_n: 1.0 / factors[1] })
+    }
+
+    /// Dataset 55; `None` for anything but normal modes.
+    fn mode(&mut self) -> Result<Option<Mode>, RigError> {
+        for line in 1..=5 {
+            self.required(&format!("identification line {line}"))?;
+        }
+        let line = self.required("kind of data")?;
+        let kind = self.numbers(&line, "kind of data", &[10; 6], 6)?;
+        let [_, analysis, characteristic, quantity, data_type, per_node] = kind[..] else {
+            return Err(self.refused_here("kind of data", &format!("has {} numbers", kind.len()), "6"));
+        };
+        if analysis != 2.0 {
+            self.skip()?;
+            return Ok(None);
+        }
+        self.must(data_type == 2.0, "type of data", data_type, "2, real values")?;
+        self.must(
+            [2.0, 3.0].contains(&characteristic),
+            "characteristic of data",
+            characteristic,
+            "2 or 3, translations",
+        )?;
+        self.must([0.0, 1.0, 8.0].contains(&quantity), "quantity", quantity, "8, displacements")?;
+        self.must([3.0, 6.0].contains(&per_node), "number of values per node", per_node, "3 or 6")?;
+        let line = self.required("whole numbers of the mode")?;
+        let whole = self.numbers(&line, "whole numbers of the mode", &[10; 4], 4)?;
+        self.must(whole[1] >= 2.0, "number of values of the mode", whole[1], "at least 2: frequency and modal mass")?;
+        let wanted = (whole[1] as usize).min(4);
+        let line = self.required("frequency and modal mass")?;
+        let real = self.numbers(&line, "frequency and modal mass", &vec![13; wanted], wanted)?;
+        let (frequency_hz, modal_mass) = (real[0], real[1]);
+        self.must(frequency_hz >= 0.0, "frequency", frequency_hz, "at least 0 Hz")?;
+        self.must(modal_mass > 0.0, "modal mass", modal_mass, "more than 0 (1 where shapes are mass-normalised)")?;
+        let damping_ratio = real.get(2).copied().unwrap_or(0.0) + 0.5 * real.get(3).copied().unwrap_or(0.0);
+        let mut shape = HashMap::new();
+        let per_node = per_node as usize;
+        while let Some(line) = self.line()? {
+            let label = self.numbers(&line, "node of a shape", &[10], 1)?;
+            let label = self.count("node of a shape", label[0])?;
+            let line = self.required("values at a node")?;
+            let values = self.numbers(&line, "values at a node", &vec![13; per_node], per_node)?;
+            if shape.insert(label, [values[0], values[1], values[2]]).is_some() {
+                let value = format!("is {label} again");
+                return Err(self.refused_here("node of a shape", &value, "every node at most once"));
+            }
+        }
+        Ok(Some(Mode { omega_rad_s: TAU * frequency_hz, modal_mass, damping_ratio, shape }))
+    }
+}
+
+/// A number as Fortran or C writes it.
+fn number(text: &str) -> Option<f64> {
+    text.replace(['D', 'd'], "E").parse().ok()
+}
+
+/// The beginning of a text, for errors.
+fn shown(text: &str) -> String {
+    text.chars().take(60).map(|c| if c.is_control() { '.' } else { c }).collect()
+}
