@@ -26,7 +26,8 @@ const CUTOFF: f64 = 2.5;
 ///
 /// On a basis of the full model's own vectors over a range of conditions, so that every root in the band that grows, or
 /// decays by less than 20 1/s, is within a tolerance; or, with --modes or --cutoff-hz, on the lowest modes of pad and disc,
-/// their contact interface free, and what the modes left out still do at the contact. What is left is compared with the full model at held-out operating points, which the rig file then says. The
+/// their contact interface free, and what the modes left out still do at the contact. What is left is compared with the
+/// full model at held-out operating points, which the rig file then says. The
 /// arrays are written beside the rig file under names with their hash, the rig file last.
 #[derive(Debug, Args)]
 pub struct Options {
@@ -160,7 +161,8 @@ impl Options {
             if full.geometry.iter().any(|geometry| geometry.damping_ratio.is_some_and(|ratio| ratio != 0.0)) {
                 steps.say("not compared: a damping ratio of modes has no meaning for the full model");
             } else {
-                let against = Against { points: self.points, seed: 1, band_hz: None, memory_limit_bytes: limit };
+                let against =
+                    Against { points: self.points, seed: 1, band_hz: None, memory_limit_bytes: limit, windows: true };
                 let found = verify_against(&rig, full, &against, &mut |what, step| {
                     steps.say(&format!("compared with the full model, {what}: {}", super::full::told(step)));
                 })

@@ -52,7 +52,7 @@ pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, no
 pub use operating_box::OperatingBox;
 pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
 pub use project::{project_dense, project_sparse};
-pub use residual::{Residual, residual};
+pub use residual::{InertiaBy, Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 pub use substructures::{Kept, Substructure, keep_modes};
 
