@@ -15,6 +15,7 @@ use squealcast::io::heard::{Bus, Heard};
 use squealcast::io::ros_args::RosArgs;
 use squealcast::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::io::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, ShmVibrationInput, ShmVibrationSource};
+use squealcast::wire::shm::{Form, OperatingPointForm};
 use squealcast::wire::{OperatingPoint, Prediction, RigInfo, Vibration};
 
 /// A domain of its own for each test: not 0, the default, and below 102, where ports of other programs begin.
@@ -78,6 +79,9 @@ fn shared_memory_carries_both_ways() {
 
 #[test]
 fn a_slow_shared_memory_reader_sees_what_it_lost() {
+    // Twice what may wait for it.
+    const WAITING: u64 = OperatingPointForm::WAITING_SAMPLES as u64;
+    const COUNT: u64 = 2 * WAITING;
     let options = shm("slow");
     let (sender, heard) = unbounded();
     let (gate, opened) = unbounded::<()>();
@@ -93,15 +97,15 @@ fn a_slow_shared_memory_reader_sees_what_it_lost() {
     // The reader sits in its sink by now or soon; either way it holds at most one of these.
     thread::sleep(Duration::from_millis(200));
     let publishing = Instant::now();
-    for seq in 1..1000 {
+    for seq in 1..COUNT {
         source.publish(&point(seq)).expect("published");
     }
     assert!(publishing.elapsed() < PATIENCE, "a writer does not wait for readers");
     drop(gate);
-    wait_until("the newest", || input.counts().heard + input.counts().missed == 1000);
+    wait_until("the newest", || input.counts().heard + input.counts().missed == COUNT);
     let seqs: Vec<u64> = heard.try_iter().map(|heard| heard.message.seq).collect();
-    assert_eq!(seqs.last(), Some(&999), "the oldest are lost, not the newest");
-    assert!(input.counts().missed >= 900, "{:?}", input.counts());
+    assert_eq!(seqs.last(), Some(&(COUNT - 1)), "the oldest are lost, not the newest");
+    assert!(input.counts().missed >= COUNT - WAITING - 1, "{:?}", input.counts());
 }
 
 #[test]
