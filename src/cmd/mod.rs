@@ -12,14 +12,17 @@ mod full;
 mod identify;
 mod import;
 mod live;
+mod on_basis;
 mod predict;
 mod recover;
+mod reduce;
 mod replay;
 mod report;
 mod reproduce;
 mod run;
 mod signals;
 mod simulate;
+mod steps;
 mod sweep;
 mod tribometer;
 mod verify;
@@ -60,6 +63,7 @@ enum Command {
     Identify(identify::Options),
     Bench(bench::Options),
     Tribometer(tribometer::Options),
+    Reduce(reduce::Options),
     Full(full::Options),
     Verify(verify::Options),
     Reproduce(reproduce::Options),
@@ -101,6 +105,7 @@ pub fn main() -> ExitCode {
         Command::Identify(options) => options.run(),
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),
+        Command::Reduce(options) => options.run(),
         Command::Full(options) => options.run(),
         Command::Verify(options) => options.run(),
         Command::Reproduce(options) => options.run(),

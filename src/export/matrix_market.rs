@@ -1,4 +1,4 @@
-//! Matrix Market files of symmetric matrices.
+//! Matrix Market files of symmetric sparse matrices and of dense ones.
 //!
 //! Source: Boisvert, Pozo, Remington, "The Matrix Market exchange formats", NISTIR 5935 (1996).
 
@@ -17,6 +17,22 @@ pub fn write_symmetric(matrix: &SparseMatrix, comment: &str, out: &mut impl Writ
     writeln!(out, "{} {} {}", matrix.nrows(), matrix.ncols(), lower().count())?;
     for entry in lower() {
         writeln!(out, "{} {} {:e}", entry.row + 1, entry.col + 1, entry.val)?;
+    }
+    Ok(())
+}
+
+/// Writes a dense matrix in array form, column by column, every value with the digits that give it back.
+///
+/// # Errors
+/// What the writer reports.
+pub fn write_array(matrix: &faer::Mat<f64>, comment: &str, out: &mut impl Write) -> io::Result<()> {
+    writeln!(out, "%%MatrixMarket matrix array real general")?;
+    writeln!(out, "% {comment}")?;
+    writeln!(out, "{} {}", matrix.nrows(), matrix.ncols())?;
+    for column in 0..matrix.ncols() {
+        for row in 0..matrix.nrows() {
+            writeln!(out, "{:e}", matrix[(row, column)])?;
+        }
     }
     Ok(())
 }

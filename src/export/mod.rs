@@ -1,14 +1,16 @@
 //! Finite-element models to files: matrices, the full model that names them, decks and pictures for other programs, and
 //! what a reduction leaves of them as rig files.
 
+mod basis;
 mod calculix;
 mod full_model;
 mod matrix_market;
 mod rig;
 mod vtk;
 
+pub use basis::basis_rig;
 pub use calculix::write_deck;
 pub use full_model::write_full_model;
 pub use matrix_market::write_symmetric;
-pub use rig::{ModalSide, modal_rig, write_rig};
+pub use rig::{ModalSide, modal_rig};
 pub use vtk::write_mesh;

@@ -1,20 +1,21 @@
 //! Reduced models to rig files: modal data as archives under names with their hash, then the rig file that names them.
 
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::path::Path;
 
 use anyhow::Context;
 use faer::Mat;
 use npyz::WriterBuilder;
+use npyz::zip::DateTime;
 use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
-use crate::io::whole_file::write_whole;
+use crate::certificate::Certificate;
 use crate::reduction::{Kept, Residual};
 use crate::rig::RigFile;
 
 /// Digits of a hash that a name carries.
-const HASH_DIGITS: usize = 12;
+pub(super) const HASH_DIGITS: usize = 12;
 
 /// One side of a rig of kind 2.
 #[derive(Clone, Debug)]
@@ -31,6 +32,8 @@ pub struct ModalSide<'a> {
     pub residual: Option<&'a Residual>,
     /// Of every mode.
     pub damping_ratio: Option<f64>,
+    /// This side's part of the unit mass matrix, where the columns of `phi` move the other side too.
+    pub mass_share: Option<Mat<f64>>,
 }
 
 impl<'a> ModalSide<'a> {
@@ -51,6 +54,7 @@ impl<'a> ModalSide<'a> {
             phi: Mat::from_fn(rows.len(), phi.ncols(), |i, mode| rows[i].map_or(0.0, |row| phi[(row, mode)])),
             residual: kept.residual.as_ref(),
             damping_ratio,
+            mass_share: None,
         }
     }
 
@@ -60,7 +64,9 @@ impl<'a> ModalSide<'a> {
         let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
         let mut write = |name: &str, shape: &[usize], values: &mut dyn Iterator<Item = f64>| -> std::io::Result<()> {
             let shape: Vec<u64> = shape.iter().map(|&length| length as u64).collect();
-            let array = archive.array(name, FileOptions::default()).map_err(std::io::Error::other)?;
+            // The time of writing would make the same modes another archive.
+            let options = FileOptions::default().last_modified_time(DateTime::default());
+            let array = archive.array(name, options).map_err(std::io::Error::other)?;
             let mut writer = array.default_dtype().shape(&shape).begin_nd()?;
             writer.extend(values)?;
             writer.finish()
@@ -71,6 +77,10 @@ impl<'a> ModalSide<'a> {
         let rows = (0..3 * count).flat_map(|row| (0..modes).map(move |mode| phi[(row, mode)]));
         write("phi", &[count, 3, modes], &mut { rows })?;
         write("nodes_m", &[count, 3], &mut self.nodes_m.iter().flatten().copied())?;
+        if let Some(share) = &self.mass_share {
+            let entries = (0..modes).flat_map(|row| (0..modes).map(move |column| share[(row, column)]));
+            write("mass_share", &[modes, modes], &mut { entries })?;
+        }
         if let Some(residual) = self.residual {
             let matrices = [("residual_flexibility", &residual.flexibility), ("residual_inertia", &residual.inertia)];
             for (name, matrix) in matrices {
@@ -87,7 +97,8 @@ impl<'a> ModalSide<'a> {
 /// The files of a rig of kind 2: the rig file, called `file`, first, then the archives it names.
 ///
 /// `common` are the tables that full models and rigs share; `patches` is `contact_patch` with nodes counted as in the
-/// sides; `remarks` are lines of comment at the top.
+/// sides; `reduction`, where it is known, is how far the rig is from its full model; `remarks` are lines of comment at the
+/// top.
 ///
 /// # Errors
 /// What could not be put into words of TOML or into an archive.
@@ -97,6 +108,7 @@ pub fn modal_rig(
     remarks: &[String],
     common: &toml::Table,
     patches: &toml::Value,
+    reduction: Option<&Certificate>,
     sides: &[ModalSide<'_>],
 ) -> anyhow::Result<Vec<RigFile>> {
     let stem = Path::new(file).file_stem().map_or(file.into(), |stem| stem.to_string_lossy());
@@ -117,20 +129,13 @@ pub fn modal_rig(
         archives.push(RigFile { name: archive, bytes });
     }
     table.insert("contact_patch".to_owned(), patches.clone());
+    if let Some(reduction) = reduction {
+        let known = toml::Value::try_from(reduction).context("the comparison cannot be put into words of TOML")?;
+        table.insert("reduction".to_owned(), known);
+    }
     let mut text: String = remarks.iter().map(|line| format!("# {line}\n")).collect();
     text += &toml::to_string(&table).context("the rig cannot be put into words of TOML")?;
     let mut files = vec![RigFile { name: file.to_owned(), bytes: text.into_bytes() }];
     files.extend(archives);
     Ok(files)
-}
-
-/// Writes the files of a rig into `folder`, each whole or not at all, the rig file (first of `files`) last.
-///
-/// # Errors
-/// A file that cannot be written.
-pub fn write_rig(folder: &Path, files: &[RigFile]) -> anyhow::Result<()> {
-    for file in files.iter().skip(1).chain(files.first()) {
-        write_whole(&folder.join(&file.name), |out| out.write_all(&file.bytes))?;
-    }
-    Ok(())
 }

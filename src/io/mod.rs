@@ -5,6 +5,7 @@ pub mod chart_file;
 pub mod clock;
 pub mod heard;
 pub mod import;
+pub mod memory;
 pub mod message;
 pub mod pace;
 pub mod params_file;

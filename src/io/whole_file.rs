@@ -2,17 +2,25 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+
+/// Where a file is while it is being written.
+///
+/// # Errors
+/// `path` does not end with a name.
+pub fn beside(path: &Path) -> anyhow::Result<PathBuf> {
+    let name = path.file_name().with_context(|| format!("{}: not the name of a file", path.display()))?;
+    Ok(path.with_file_name(format!(".{}.part", name.to_string_lossy())))
+}
 
 /// Writes a file beside its final name, then renames it: never half a file under the name asked for.
 ///
 /// # Errors
 /// What `write` or the file system reports, with the path; what was begun is removed.
 pub fn write_whole(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> anyhow::Result<()> {
-    let name = path.file_name().with_context(|| format!("{}: not the name of a file", path.display()))?;
-    let beside = path.with_file_name(format!(".{}.part", name.to_string_lossy()));
+    let beside = beside(path)?;
     let written = File::create(&beside).and_then(|file| {
         let mut writer = BufWriter::with_capacity(1 << 20, file);
         write(&mut writer)?;

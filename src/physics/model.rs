@@ -201,6 +201,7 @@ pub struct Model {
     pub(super) contact_law: ContactLaw,
     has_contact: bool,
     pad_modes: Option<usize>,
+    pad_mass: Option<Mat<f64>>,
 }
 
 /// What [`Model::assemble`] found out about the matrices it wrote.
@@ -226,8 +227,9 @@ impl Model {
         contact_law: ContactLaw,
         pad_modes: Option<usize>,
     ) -> Result<Self, ModelError> {
+        let (has_contact, pad_mass) = (false, None);
         let mut model =
-            Self { dimension, stiffness: vec![], damping: vec![], contact_law, has_contact: false, pad_modes };
+            Self { dimension, stiffness: vec![], damping: vec![], contact_law, has_contact, pad_modes, pad_mass };
         for (k, term) in stiffness.into_iter().enumerate() {
             model.stiffness.push(model.known(term, || format!("stiffness term {k}"))?);
         }
@@ -351,6 +353,21 @@ impl Model {
     /// How many of the first coordinates belong to the pad; `None` where pad and disc are not told apart.
     pub fn pad_modes(&self) -> Option<usize> {
         self.pad_modes
+    }
+
+    /// The model of coordinates that move pad and disc at once, `mass` being the pad's part of the unit matrix.
+    ///
+    /// # Errors
+    /// [`ModelError::Shape`], [`ModelError::NotFinite`].
+    pub fn with_pad_mass(mut self, mass: Mat<f64>) -> Result<Self, ModelError> {
+        let known = self.known(Term { matrix: mass, law: Law::Constant }, || "mass of the pad".to_owned())?;
+        self.pad_mass = Some(known.term.matrix);
+        Ok(self)
+    }
+
+    /// The pad's part of the unit mass matrix, `n×n`, where coordinates move pad and disc at once and it is known.
+    pub fn pad_mass(&self) -> Option<&Mat<f64>> {
+        self.pad_mass.as_ref()
     }
 
     /// Whether the model has contact pairs of its own, which open without load.

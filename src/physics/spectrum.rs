@@ -252,7 +252,7 @@ impl Solver {
         let mut raw = self.roots(problem, stiffness_norm, matrix_norm);
         if vectors != Vectors::None {
             self.multiply(problem, vectors);
-            self.judge(&mut raw, problem, stiffness_norm, model.pad_modes())?;
+            self.judge(&mut raw, problem, stiffness_norm, model)?;
         }
         if vectors == Vectors::Both {
             self.read_left(&mut raw, problem);
@@ -371,14 +371,9 @@ impl Solver {
     }
 
     /// Fills in residual and pad share, and refuses a root that does not satisfy the equation.
-    fn judge(
-        &self,
-        raw: &mut [Raw],
-        problem: Problem,
-        stiffness_norm: f64,
-        pad_modes: Option<usize>,
-    ) -> Result<(), SolveError> {
+    fn judge(&self, raw: &mut [Raw], problem: Problem, stiffness_norm: f64, model: &Model) -> Result<(), SolveError> {
         let n = self.stiffness.nrows();
+        let of_pad = model.pad_mass().map(|mass| mass * &self.shapes);
         let damped = problem == Problem::Damped;
         let damping_norm = if damped { self.damping.norm_l2() } else { 0.0 };
         for (j, entry) in raw.iter_mut().enumerate() {
@@ -414,8 +409,11 @@ impl Solver {
             }
             entry.root.residual = residual;
             entry.length = size.sqrt();
-            entry.root.pad_participation =
-                pad_modes.map_or(f64::NAN, |pad_modes| x.rows(..pad_modes.min(n)).norm_sqr() / size);
+            entry.root.pad_participation = match (&of_pad, model.pad_modes()) {
+                (Some(of_pad), _) => (x.dot(Packed::new(of_pad, entry.packing)).re / size).clamp(0.0, 1.0),
+                (None, Some(pad_modes)) => x.rows(..pad_modes.min(n)).norm_sqr() / size,
+                (None, None) => f64::NAN,
+            };
         }
         Ok(())
     }

@@ -141,6 +141,13 @@ impl Whitening {
         both.transpose().to_owned()
     }
 
+    /// `X L⁻ᵀ` in place: of unit length and orthogonal where `Xᵀ X`, in whatever metric, was the factored matrix.
+    pub fn right(&self, vectors: &mut Mat<f64>) {
+        let mut turned = vectors.transpose().to_owned();
+        solve_lower_triangular_in_place(self.lower.as_ref(), turned.as_mut(), Par::Seq);
+        vectors.copy_from(turned.transpose());
+    }
+
     /// `L⁻ᵀ Y` in place: from unit-mass coordinates back to degrees of freedom.
     pub fn back(&self, vectors: &mut Mat<f64>) {
         solve_upper_triangular_in_place(self.lower.transpose(), vectors.as_mut(), Par::Seq);

@@ -1,5 +1,7 @@
 //! Why a model could not be reduced.
 
+use crate::physics::SolveError;
+
 /// Bytes in a GiB.
 const GIB: f64 = (1_u64 << 30) as f64;
 
@@ -46,6 +48,14 @@ pub enum ReductionError {
         *bytes as f64 / GIB, *limit as f64 / GIB
     )]
     Memory { what: String, bytes: usize, limit: usize },
+    #[error("{what} is {low} to {high}, expected {limit}")]
+    Range { what: String, low: f64, high: f64, limit: String },
+    #[error(
+        "{what}: |dlambda|/|lambda| is {value:.1e} with {vectors} vectors from {samples} operating points, limit {limit:.1e}"
+    )]
+    Tolerance { what: String, value: f64, limit: f64, vectors: usize, samples: usize },
+    #[error("{what}: {source}")]
+    Solve { what: String, source: Box<SolveError> },
     #[error("{what}: {reason}")]
     Factorisation { what: String, reason: String },
 }

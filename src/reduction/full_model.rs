@@ -13,7 +13,7 @@ use faer::{Mat, MatRef};
 
 use super::dense::symmetric_eigen;
 use super::sparse::{SparseMatrix, entries, is_symmetric, times};
-use super::{ReductionError, project_sparse, whiten};
+use super::{ReductionError, project_dense, project_sparse, whiten};
 use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Term};
 
 /// A part of a full model: a substructure with its contact interface free, or a whole system.
@@ -108,6 +108,23 @@ impl FullModel {
                 offset
             })
             .collect()
+    }
+
+    /// Whether load and speed change anything beyond opening, stopping and reversing.
+    pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
+        let (mut load, mut speed) = (false, false);
+        for term in self.stiffness.iter().chain(&self.damping) {
+            if let Law::Custom(custom) = &term.law {
+                load |= custom.depends_on_load;
+                speed |= custom.depends_on_speed;
+            }
+        }
+        if self.contact.is_some() {
+            let law = &self.contact_law;
+            load |= law.exponent != 0.0 || law.slope_s_per_m != 0.0 || law.lateral_damping;
+            speed |= law.lateral_damping;
+        }
+        (load, speed)
     }
 
     /// What `law` is at `p`; a model without contact pairs never opens.
@@ -290,6 +307,48 @@ impl FullContact {
 }
 
 impl Projected {
+    /// The same on the span of `coefficients`, `k×r`: columns, independent, in the coordinates of this basis.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Indefinite` where the columns depend on each other, `Factorisation`.
+    pub fn restricted(&self, coefficients: MatRef<'_, f64>) -> Result<Self, ReductionError> {
+        let free = Mat::from_fn(coefficients.nrows(), coefficients.ncols(), |i, j| {
+            self.omega_squared[i] * coefficients[(i, j)]
+        });
+        let stiffness = coefficients.transpose() * &free;
+        // M is the unit matrix here.
+        let gram = coefficients.transpose() * coefficients;
+        let symmetric = |m: &Mat<f64>| Mat::from_fn(m.nrows(), m.ncols(), |i, j| m[(i.max(j), i.min(j))]);
+        let whitening = whiten("basis", symmetric(&gram).as_ref())?;
+        let (omega_squared, mut mixed) =
+            symmetric_eigen("basis", whitening.congruence(symmetric(&stiffness).as_ref(), true).as_ref())?;
+        whitening.back(&mut mixed);
+        let turn = coefficients * &mixed;
+        let terms = |terms: &[Term]| -> Vec<Term> {
+            let is_symmetric = |m: &Mat<f64>| (0..m.ncols()).all(|j| (0..j).all(|i| m[(i, j)] == m[(j, i)]));
+            terms
+                .iter()
+                .map(|term| Term {
+                    matrix: project_dense(term.matrix.as_ref(), turn.as_ref(), is_symmetric(&term.matrix)),
+                    law: term.law.clone(),
+                })
+                .collect()
+        };
+        let contact = self.contact.as_ref().map(|pairs| ContactPairs {
+            normal: &pairs.normal * &turn,
+            sliding: &pairs.sliding * &turn,
+            lateral: &pairs.lateral * &turn,
+            ..pairs.clone()
+        });
+        Ok(Self {
+            basis: &self.basis * &turn,
+            omega_squared,
+            contact,
+            stiffness: terms(&self.stiffness),
+            damping: terms(&self.damping),
+        })
+    }
+
     /// The equation of motion in the coordinates of the basis, under `contact_law`.
     ///
     /// # Errors

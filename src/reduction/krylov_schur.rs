@@ -241,7 +241,7 @@ impl<T: Number> Space<T> {
                 }
             }
             let scale = T::from_complex(c64::new(1.0 / norm, 0.0));
-            vector.col_mut(0).iter_mut().for_each(|value| *value = *value * scale);
+            vector.col_mut(0).iter_mut().for_each(|value| *value *= scale);
             self.make_orthogonal(&mut vector, 0);
             self.basis.subcols_mut(self.size, 1).copy_from(&vector);
             self.size += 1;

@@ -11,7 +11,8 @@
 //! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
 //! to the basis; [`residual()`] finds what the modes left out still do at the contact; [`keep_modes`] does both for
 //! all parts of a model.
-//! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare with.
+//! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare
+//! with and to make a [`parametric_basis`] of, on which it keeps them.
 //!
 //! [`compare_roots`] and [`full_windows`] say how far a reduced model is from it.
 //!
@@ -25,14 +26,19 @@ mod full_model;
 mod full_order;
 mod krylov_schur;
 mod lanczos;
+mod matching;
 mod normal_modes;
+mod operating_box;
 mod ordering;
+mod parametric;
 mod pencil;
 mod project;
 mod residual;
 mod schur;
 mod sparse;
 mod substructures;
+#[cfg(test)]
+mod test_models;
 
 pub use compare::{
     CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
@@ -41,9 +47,12 @@ pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::ReductionError;
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
 pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
+pub use matching::{Counted, RootMatch, match_roots};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
+pub use operating_box::OperatingBox;
+pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
 pub use project::{project_dense, project_sparse};
-pub use residual::{Residual, residual};
+pub use residual::{InertiaBy, Residual, residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 pub use substructures::{Kept, Substructure, keep_modes};
 

@@ -21,15 +21,21 @@ pub(super) type Neighbours<'a> = dyn Fn(usize, &mut Vec<usize>) + 'a;
 /// What the dissection says of a graph it cannot take.
 pub(super) fn nested_dissection(n: usize, neighbours: &Neighbours<'_>) -> Result<Perm<usize>, String> {
     let (group_of, members) = groups(n, neighbours);
+    let mut row = vec![];
+    let mut graph: Vec<Vec<i32>> = members
+        .iter()
+        .map(|group| {
+            neighbours(group[0], &mut row);
+            let mut seen: Vec<i32> = row.iter().map(|&other| group_of[other] as i32).collect();
+            seen.sort_unstable();
+            seen.dedup();
+            seen
+        })
+        .collect();
+    complete(&mut graph);
     let (mut starts, mut adjacent) = (vec![0_i32], vec![]);
-    let (mut row, mut seen) = (vec![], vec![]);
-    for group in &members {
-        neighbours(group[0], &mut row);
-        seen.clear();
-        seen.extend(row.iter().map(|&other| group_of[other] as i32));
-        seen.sort_unstable();
-        seen.dedup();
-        adjacent.extend_from_slice(&seen);
+    for seen in &graph {
+        adjacent.extend_from_slice(seen);
         starts.push(i32::try_from(adjacent.len()).map_err(|_| "its graph has more than 2^31 edges".to_owned())?);
     }
     let graph = CscPattern::new(members.len(), &starts, &adjacent).ok_or("its pattern is not symmetric")?;
@@ -40,6 +46,21 @@ pub(super) fn nested_dissection(n: usize, neighbours: &Neighbours<'_>) -> Result
         inverse[row] = position;
     }
     Ok(Perm::new_checked(forward.into(), inverse.into(), n))
+}
+
+/// Adds the edges that are there one way only. A matrix of symmetric values has such where an entry is stored that is zero;
+/// the dissection would take an unsymmetric graph and go astray.
+fn complete(graph: &mut [Vec<i32>]) {
+    let mut missing = vec![];
+    for (from, seen) in graph.iter().enumerate() {
+        let back = |to: &&i32| graph[**to as usize].binary_search(&(from as i32)).is_err();
+        missing.extend(seen.iter().filter(back).map(|&to| (to as usize, from as i32)));
+    }
+    for (from, to) in missing {
+        if let Err(at) = graph[from].binary_search(&to) {
+            graph[from].insert(at, to);
+        }
+    }
 }
 
 /// Rows with equal neighbours: the group of every row, and the rows of every group.
@@ -97,5 +118,12 @@ mod tests {
         // A line is cut in the middle: what is eliminated last lies near there, not at an end.
         let last = forward[3 * nodes - 1] % nodes;
         assert!((nodes / 3..2 * nodes / 3).contains(&last), "{last}");
+    }
+
+    #[test]
+    fn edges_that_are_there_one_way_only_are_completed() {
+        let mut graph = vec![vec![0, 2], vec![0, 1], vec![2]];
+        complete(&mut graph);
+        assert_eq!(graph, [vec![0, 1, 2], vec![0, 1], vec![0, 2]]);
     }
 }

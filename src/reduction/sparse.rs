@@ -79,6 +79,14 @@ pub(super) fn times(matrix: &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
     product
 }
 
+/// `Aᵀ`.
+pub(super) fn transposed(matrix: &SparseMatrix) -> Result<SparseMatrix, ReductionError> {
+    matrix.as_ref().transpose().to_col_major().map_err(|error| ReductionError::Factorisation {
+        what: "transposed matrix".to_owned(),
+        reason: format!("could not be stored: {error:?}"),
+    })
+}
+
 /// Largest sum of magnitudes of a column: for a symmetric matrix a bound of its 2-norm.
 pub(super) fn one_norm(matrix: &SparseMatrix) -> f64 {
     (0..matrix.ncols()).map(|j| matrix.as_ref().val_of_col(j).iter().map(|value| value.abs()).sum()).fold(0.0, f64::max)

@@ -3,7 +3,7 @@
 use std::sync::mpsc;
 
 use super::normal_modes::{Analysed, Progress, SparseModes, Wanted};
-use super::{ReductionError, Residual, SparseMatrix};
+use super::{InertiaBy, ReductionError, Residual, SparseMatrix};
 
 /// A substructure with its contact interface free.
 #[derive(Clone, Copy, Debug)]
@@ -29,7 +29,8 @@ pub struct Kept {
 }
 
 /// Modes of every part, and residuals `with_residual`: one thread for each part where all of them together stay below
-/// `memory_limit_bytes`, else one part after the other. The result does not depend on that.
+/// `memory_limit_bytes`, else one part after the other; answers to contact forces kept where there is room for them. The
+/// result depends on that by rounding alone: 1e-7 of the residual inertia.
 ///
 /// `progress` hears which part does what.
 ///
@@ -46,37 +47,45 @@ pub fn keep_modes(
         Analysed::new(part.name, part.mass, part.stiffness)
     })?;
     let held: usize = analysed.iter().map(Analysed::held_bytes).sum();
-    let work = |index: usize, wanted: Wanted| {
-        let count = match wanted {
-            Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
-            Wanted::Below(_) => 0,
-        };
-        let one = &analysed[index];
-        let residual = if with_residual { one.bytes_for_residual(count) } else { 0 };
-        // The modes of the parts that are done stay.
-        one.bytes_for(count).max(residual)
+    let work = |index: usize, wanted: Wanted, inertia_by: InertiaBy| {
+        let count = count_of(wanted);
+        let (one, loads) = (&analysed[index], parts[index].rows.iter().flatten().count());
+        one.bytes_for(count).max(if with_residual { one.bytes_for_residual(count, loads, inertia_by) } else { 0 })
     };
-    let together = |wanted: &[Wanted], progress: &mut dyn FnMut(usize, Progress)| -> Result<bool, ReductionError> {
-        let needs: Vec<usize> = wanted.iter().enumerate().map(|(index, &wanted)| work(index, wanted)).collect();
-        for (index, need) in needs.iter().enumerate() {
+    let plan = |wanted: &[Wanted], progress: &mut dyn FnMut(usize, Progress)| -> Result<Plan, ReductionError> {
+        let needs = |inertia_by: InertiaBy| -> Vec<usize> {
+            wanted.iter().enumerate().map(|(index, &wanted)| work(index, wanted, inertia_by)).collect()
+        };
+        let ways = [true, false].into_iter().flat_map(|at_once| {
+            [InertiaBy::KeptAnswers, InertiaBy::SecondSolve].map(|inertia_by| Plan { at_once, inertia_by })
+        });
+        let bytes = |way: &Plan| -> usize {
+            let needs = needs(way.inertia_by);
+            if way.at_once {
+                return held + needs.iter().sum::<usize>();
+            }
+            // The modes of a part that is done stay.
+            let modes = |index: usize| size_of::<f64>() * parts[index].mass.nrows() * count_of(wanted[index]);
+            held + needs.iter().copied().max().unwrap_or(0) + (0..parts.len()).map(modes).sum::<usize>()
+        };
+        let way = ways.into_iter().find(|way| memory_limit_bytes.is_none_or(|limit| bytes(way) <= limit));
+        let told = way.unwrap_or(Plan { at_once: false, inertia_by: InertiaBy::SecondSolve });
+        for (index, need) in needs(told.inertia_by).into_iter().enumerate() {
             let factor_entries = analysed[index].factor_entries();
             progress(index, Progress::Analysed { factor_entries, bytes: held + need });
         }
-        let Some(limit) = memory_limit_bytes else { return Ok(true) };
-        let largest = needs.iter().enumerate().max_by_key(|(_, need)| **need);
-        if let Some((index, need)) = largest
-            && held + need > limit
-        {
-            let what = parts[index].name.to_owned();
-            return Err(ReductionError::Memory { what, bytes: held + need, limit });
-        }
-        Ok(held + needs.iter().sum::<usize>() <= limit)
+        way.ok_or_else(|| {
+            let needs = needs(told.inertia_by);
+            let largest = (0..needs.len()).max_by_key(|&index| needs[index]).unwrap_or(0);
+            let what = parts[largest].name.to_owned();
+            ReductionError::Memory { what, bytes: bytes(&told), limit: memory_limit_bytes.unwrap_or(usize::MAX) }
+        })
     };
     let mut wanted: Vec<Wanted> = parts.iter().map(|part| part.wanted).collect();
-    let mut at_once = together(&wanted, progress)?;
+    let mut way = plan(&wanted, progress)?;
     if wanted.iter().any(|wanted| matches!(wanted, Wanted::Below(_))) {
         let indices: Vec<usize> = (0..parts.len()).collect();
-        wanted = side_by_side(&indices, at_once, progress, &|&index, hear| match parts[index].wanted {
+        wanted = side_by_side(&indices, way.at_once, progress, &|&index, hear| match parts[index].wanted {
             Wanted::Below(below_rad_s) => {
                 let modes = analysed[index].count_below(below_rad_s)?;
                 hear(Progress::Counted { modes, below: below_rad_s * below_rad_s });
@@ -84,22 +93,50 @@ pub fn keep_modes(
             }
             wanted => Ok(wanted),
         })?;
-        at_once = together(&wanted, progress)?;
+        way = plan(&wanted, progress)?;
     }
     let indices: Vec<usize> = (0..parts.len()).collect();
-    side_by_side(&indices, at_once, progress, &|&index, hear| {
-        let modes = analysed[index].modes(wanted[index], None, hear)?;
-        let residual = with_residual.then(|| analysed[index].residual(&modes, parts[index].rows, hear)).transpose()?;
+    side_by_side(&indices, way.at_once, progress, &|&index, hear| {
+        // What it needs has been told.
+        let mut hear = |p: Progress| {
+            if !matches!(p, Progress::Analysed { .. }) {
+                hear(p);
+            }
+        };
+        let modes = analysed[index].modes(wanted[index], None, &mut hear)?;
+        let residual = if with_residual {
+            Some(analysed[index].residual(&modes, parts[index].rows, way.inertia_by, &mut hear)?)
+        } else {
+            None
+        };
         Ok(Kept { modes, residual })
     })
 }
+
+/// How many modes are wanted, as far as it is known.
+fn count_of(wanted: Wanted) -> usize {
+    match wanted {
+        Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
+        Wanted::Below(_) => 0,
+    }
+}
+
+/// A way to go about it that memory allows.
+#[derive(Clone, Copy, Debug)]
+struct Plan {
+    at_once: bool,
+    inertia_by: InertiaBy,
+}
+
+/// What is done with an item, and who hears of it.
+type Work<'a, T, R> = dyn Fn(&T, &mut dyn FnMut(Progress)) -> Result<R, ReductionError> + Sync + 'a;
 
 /// `work` on every item, on threads of their own if `at_once`; what they report is heard here, on one thread.
 fn side_by_side<T: Sync, R: Send>(
     items: &[T],
     at_once: bool,
     progress: &mut dyn FnMut(usize, Progress),
-    work: &(dyn Fn(&T, &mut dyn FnMut(Progress)) -> Result<R, ReductionError> + Sync),
+    work: &Work<'_, T, R>,
 ) -> Result<Vec<R>, ReductionError> {
     if !at_once {
         return items.iter().enumerate().map(|(index, item)| work(item, &mut |p| progress(index, p))).collect();
@@ -111,7 +148,7 @@ fn side_by_side<T: Sync, R: Send>(
             .enumerate()
             .map(|(index, item)| {
                 let told = told.clone();
-                // Where nobody hears it any more nothing is lost with it.
+                // Nobody hears it any more: nothing is lost with it.
                 scope.spawn(move || {
                     work(item, &mut |p| {
                         let _ = told.send((index, p));
@@ -126,4 +163,68 @@ fn side_by_side<T: Sync, R: Send>(
             .map(|worker| worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
             .collect()
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use faer::sparse::Triplet;
+
+    /// A free chain of equal masses.
+    fn chain(n: usize, spring: f64) -> [SparseMatrix; 2] {
+        let mass: Vec<_> = (0..n).map(|i| Triplet::new(i, i, 2.0)).collect();
+        let stiffness: Vec<_> = (1..n)
+            .flat_map(|i| [(i, i, 1.0), (i - 1, i - 1, 1.0), (i, i - 1, -1.0), (i - 1, i, -1.0)])
+            .map(|(i, j, sign)| Triplet::new(i, j, sign * spring))
+            .collect();
+        [mass, stiffness].map(|triplets| SparseMatrix::try_new_from_triplets(n, n, &triplets).unwrap())
+    }
+
+    #[test]
+    fn side_by_side_or_one_after_the_other_is_the_same() {
+        let [pad, disc] = [chain(500, 100.0), chain(700, 300.0)];
+        let rows = [Some(0), None, Some(499)];
+        // ω = 2 sqrt(k/m) sin(p π / 2n), p from 0: 12 of the disc below the middle of p = 11 and 12.
+        let below = 2.0 * 150.0_f64.sqrt() * (11.5 * std::f64::consts::PI / 1400.0).sin();
+        let owned = [("pad", pad, Wanted::Lowest(9)), ("disc", disc, Wanted::Below(below))];
+        let parts: Vec<Substructure<'_>> = owned
+            .iter()
+            .map(|(name, [mass, stiffness], wanted)| Substructure {
+                name,
+                mass,
+                stiffness,
+                rows: &rows,
+                wanted: *wanted,
+            })
+            .collect();
+        let mut needs = vec![];
+        let together = keep_modes(&parts, true, None, &mut |_, p| {
+            if let Progress::Analysed { bytes, .. } = p {
+                needs.push(bytes);
+            }
+        })
+        .unwrap();
+        assert_eq!(together.iter().map(|kept| kept.modes.omega_squared.len()).collect::<Vec<_>>(), [9, 12]);
+        // Each fits alone, with its answers kept; both do not.
+        let limit = needs.iter().copied().max().unwrap() + 200_000;
+        let mut order = vec![];
+        let apart = keep_modes(&parts, true, Some(limit), &mut |part, p| {
+            if matches!(p, Progress::Loaded { .. }) {
+                order.push(part);
+            }
+        })
+        .unwrap();
+        assert_eq!(order, [0, 1]);
+        for (one, other) in together.iter().zip(&apart) {
+            assert_eq!(one.modes.omega_squared, other.modes.omega_squared);
+            let [one, other] = [one, other].map(|kept| kept.residual.as_ref().unwrap());
+            assert!((&one.flexibility - &other.flexibility).norm_max() < 1e-12 * one.flexibility.norm_max());
+            assert!((&one.inertia - &other.inertia).norm_max() < 1e-6 * one.inertia.norm_max());
+        }
+        let mut factored = false;
+        let refused = keep_modes(&parts, true, Some(limit / 4), &mut |_, p| {
+            factored |= matches!(p, Progress::Factored { .. });
+        });
+        assert!(matches!(refused.unwrap_err(), ReductionError::Memory { .. }) && !factored);
+    }
 }

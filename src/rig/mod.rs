@@ -5,6 +5,7 @@
 //! `system` of matrices (`matrix_market`, times a `scale`). What it refers to is read by name through `source`, so
 //! that a recording's attachments serve as well as a directory.
 
+mod basis;
 mod embedded;
 mod error;
 mod inline;
@@ -171,13 +172,19 @@ impl Rig {
         let raw: raw::RawRig = raw::parse(&rig_file.name, &rig_file.bytes)?;
         let mut source = Source::new(rig_file, read, limit);
         let settings = settings::check(&source.rig_file, &raw)?;
-        let built = match settings::kind(&source.rig_file, &raw)? {
+        let mut built = match settings::kind(&source.rig_file, &raw)? {
             settings::Kind::Inline { pad, disc, contacts } => {
                 inline::build(&source.rig_file, pad, disc, contacts, &settings)?
             }
-            settings::Kind::Modal { pad, disc, patches } => modal::build(&mut source, pad, disc, patches, &settings)?,
+            settings::Kind::Modal { pad, disc, patches } => {
+                let shared = raw.basis.as_ref().is_some_and(|basis| basis.shared);
+                modal::build(&mut source, pad, disc, patches, shared, &settings)?
+            }
             settings::Kind::System(system) => system::build(&mut source, system, &settings)?,
         };
+        if let Some(basis) = &raw.basis {
+            built.contents.extend(basis.describe(&source.rig_file)?);
+        }
         Ok(Self {
             name: raw.name,
             model: built.model,

@@ -9,18 +9,18 @@ use super::raw::{RawPatch, RawSubstructure};
 use super::residual::{self, SideResidual};
 use super::settings::{Settings, spread, within};
 use super::source::Source;
-use super::{Built, RigError};
+use super::{Built, RigError, basis};
 use crate::physics::ContactPairs;
 use crate::reduction::Modes;
 
 /// A substructure with the modes that were selected, ascending in frequency.
-struct Part {
-    data: ModalData,
-    selected: Vec<usize>,
-    side: Side,
+pub(super) struct Part {
+    pub data: ModalData,
+    pub selected: Vec<usize>,
+    pub side: Side,
 }
 
-/// Builds the model of a rig of kind 2: `n = i + j` coordinates, the pad's modes first.
+/// Builds the model of a rig of kind 2: `n = i + j` coordinates, the pad's modes first, or those that both sides share.
 ///
 /// # Errors
 /// [`RigError`].
@@ -29,6 +29,7 @@ pub(super) fn build(
     pad: &RawSubstructure,
     disc: Option<&RawSubstructure>,
     patches: &[RawPatch],
+    shared: bool,
     settings: &Settings,
 ) -> Result<Built, RigError> {
     let pad = part(source, "pad", pad)?;
@@ -48,31 +49,12 @@ pub(super) fn build(
         }
         pairs.extend(found);
     }
-    let rows = |direction: &dyn Fn(&Pair) -> [f64; 3]| relative_displacement(&pairs, direction, &pad, disc.as_ref());
-    let contact = ContactPairs {
-        normal: rows(&|pair| pair.normal),
-        sliding: rows(&|pair| pair.sliding),
-        lateral: rows(&|pair| pair.lateral),
-        stiffness_n_per_m,
-        damping_n_s_per_m,
-        radius_m: pairs.iter().map(|pair| pair.radius_m).collect(),
+    let values = [stiffness_n_per_m, damping_n_s_per_m];
+    let mut built = if shared {
+        basis::build(&file, &pad, disc.as_ref(), &pairs, values, settings)?
+    } else {
+        apart(&file, &pad, disc.as_ref(), &pairs, values, settings)?
     };
-    let pad_residual = pad.residual("pad", &file)?;
-    let disc_residual = disc.as_ref().map(|disc| disc.residual("disc", &file)).transpose()?;
-    let residual = residual::between(&pairs, &pad_residual, disc_residual.as_ref(), settings.band_max_hz);
-    let mut built = assemble(
-        &file,
-        "modal substructures (kind 2)",
-        &pad.side,
-        disc.as_ref().map(|disc| &disc.side),
-        &contact,
-        settings,
-        residual.as_ref().map(|residual| &residual.flexibility),
-    )?;
-    if let Some(residual) = residual {
-        built.contents.push(residual.told);
-        built.band_max_hz = Some(residual.band_max_hz);
-    }
     for (shapes, part) in built.shapes.iter_mut().zip(std::iter::once(&pad).chain(&disc)) {
         let rows = 3 * part.data.nodes_m.len();
         let entry = |row: usize, mode: usize| part.data.shape(row / 3, part.selected[mode])[row % 3];
@@ -89,7 +71,50 @@ pub(super) fn build(
     Ok(built)
 }
 
+/// Sides with modes of their own.
+fn apart(
+    file: &str,
+    pad: &Part,
+    disc: Option<&Part>,
+    pairs: &[Pair],
+    [stiffness_n_per_m, damping_n_s_per_m]: [Vec<f64>; 2],
+    settings: &Settings,
+) -> Result<Built, RigError> {
+    let rows = |direction: &dyn Fn(&Pair) -> [f64; 3]| relative_displacement(pairs, direction, pad, disc);
+    let contact = ContactPairs {
+        normal: rows(&|pair| pair.normal),
+        sliding: rows(&|pair| pair.sliding),
+        lateral: rows(&|pair| pair.lateral),
+        stiffness_n_per_m,
+        damping_n_s_per_m,
+        radius_m: pairs.iter().map(|pair| pair.radius_m).collect(),
+    };
+    let pad_residual = pad.residual("pad", file)?;
+    let disc_residual = disc.map(|disc| disc.residual("disc", file)).transpose()?;
+    let residual = residual::between(pairs, &pad_residual, disc_residual.as_ref(), settings.band_max_hz);
+    let mut built = assemble(
+        file,
+        "modal substructures (kind 2)",
+        &pad.side,
+        disc.map(|disc| &disc.side),
+        &contact,
+        settings,
+        residual.as_ref().map(|residual| &residual.flexibility),
+    )?;
+    if let Some(residual) = residual {
+        built.contents.push(residual.told);
+        built.band_max_hz = Some(residual.band_max_hz);
+    }
+    Ok(built)
+}
+
 impl Part {
+    /// Displacement of a node along `d` in the `mode`-th of the selected modes.
+    pub fn along(&self, node: usize, mode: usize, d: [f64; 3]) -> f64 {
+        let shape = self.data.shape(node, self.selected[mode]);
+        shape[0] * d[0] + shape[1] * d[1] + shape[2] * d[2]
+    }
+
     /// What the modes that do not take part still do at the contact.
     fn residual(&self, name: &'static str, file: &str) -> Result<SideResidual, RigError> {
         let residual = self.data.residual_beyond(&self.selected).map_err(|mode| RigError::Range {
@@ -143,18 +168,14 @@ fn relative_displacement(
 ) -> Mat<f64> {
     let pad_modes = pad.selected.len();
     let disc_modes = disc.map_or(0, |disc| disc.selected.len());
-    let along = |part: &Part, node: usize, mode: usize, d: [f64; 3]| {
-        let shape = part.data.shape(node, part.selected[mode]);
-        shape[0] * d[0] + shape[1] * d[1] + shape[2] * d[2]
-    };
     Mat::from_fn(pairs.len(), pad_modes + disc_modes, |row, column| {
         let pair = &pairs[row];
         let d = direction(pair);
         match disc {
             Some(disc) if column >= pad_modes => {
-                -pair.disc.iter().map(|&(node, weight)| weight * along(disc, node, column - pad_modes, d)).sum::<f64>()
+                -pair.disc.iter().map(|&(node, weight)| weight * disc.along(node, column - pad_modes, d)).sum::<f64>()
             }
-            _ => along(pad, pair.pad_node, column, d),
+            _ => pad.along(pair.pad_node, column, d),
         }
     })
 }

@@ -15,6 +15,8 @@ pub struct ModalData {
     pub nodes_m: Vec<[f64; 3]>,
     /// `ζ`, one for each mode, where given.
     pub damping_ratio: Option<Vec<f64>>,
+    /// `(i, i)`: this side's part of the unit mass matrix, where the columns of `phi` move other sides too and it is given.
+    pub mass_share: Option<Mat<f64>>,
     /// What the modes beyond these do at the nodes, where given.
     pub residual: Option<Residual>,
 }

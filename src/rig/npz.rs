@@ -21,8 +21,8 @@ struct Array {
     values: Vec<f64>,
 }
 
-/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and, where they are there, `damping_ratio` (i),
-/// `residual_flexibility` and `residual_inertia` (3c, 3c).
+/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and, where they are there, `damping_ratio` (i), `mass_share`
+/// (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
 ///
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
@@ -41,6 +41,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     let phi = required("phi", array("phi")?, "(c, 3, i)")?;
     let nodes = required("nodes_m", array("nodes_m")?, "(c, 3)")?;
     let damping = array("damping_ratio")?;
+    let mass_share = array("mass_share")?;
     let residuals = [array("residual_flexibility")?, array("residual_inertia")?];
 
     let wrong = |name: &str, array: &Array, limit: &str| {
@@ -62,6 +63,12 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     if let Some((mode, value)) = omega.values.iter().enumerate().find(|(_, value)| **value < 0.0) {
         return Err(refuse(file, &format!("omega_rad_s[{mode}]"), &format!("is {value}"), "at least 0"));
     }
+    let mass_share = match mass_share {
+        Some(share) if share.shape != [modes, modes] => {
+            return wrong("mass_share", &share, &format!("({modes}, {modes}), by omega_rad_s"));
+        }
+        share => share.map(|share| Mat::from_fn(modes, modes, |i, j| share.values[i * modes + j])),
+    };
     let residual = residual(file, count, residuals)?;
     let nodes_m = nodes.values.chunks_exact(3).map(|node| [node[0], node[1], node[2]]).collect();
     Ok(ModalData {
@@ -69,6 +76,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
         phi: phi.values,
         nodes_m,
         damping_ratio: damping.map(|damping| damping.values),
+        mass_share,
         residual,
     })
 }

@@ -31,6 +31,7 @@ pub struct RawRig {
     pub contact: Option<Vec<RawContact>>,
     pub contact_patch: Option<Vec<RawPatch>>,
     pub system: Option<RawSystem>,
+    pub basis: Option<RawBasis>,
     pub reduction: Option<Certificate>,
 }
 
@@ -166,6 +167,22 @@ pub struct RawSystem {
     pub damping: Vec<RawTerm>,
     #[serde(default)]
     pub stiffness: Vec<RawTerm>,
+}
+
+/// `[basis]`: the coordinates are those of a basis of a whole full model; what it was made for and found good for.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RawBasis {
+    /// Pad and disc have the same coordinates.
+    pub shared: bool,
+    pub degrees_of_freedom: Option<usize>,
+    pub friction_coefficient: Option<[f64; 2]>,
+    pub normal_load_n: Option<[f64; 2]>,
+    pub disc_speed_rad_s: Option<[f64; 2]>,
+    pub growth_floor_per_s: Option<f64>,
+    pub tolerance: Option<f64>,
+    pub held_out: Option<usize>,
+    pub largest_error: Option<f64>,
 }
 
 /// A matrix times a scale.

@@ -56,13 +56,16 @@ pub(super) fn between(
     let mut inertia = with_inertia.then(|| [Mat::zeros(c, c), Mat::zeros(c, c)]);
     for (index, side) in sides.iter().enumerate() {
         let Some(residual) = &side.residual else { continue };
-        let along = |direction: &dyn Fn(&Pair) -> [f64; 3]| weights(pairs, index == 1, residual, direction);
+        let along = |direction: &dyn Fn(&Pair) -> [f64; 3]| weights(pairs, index == 1, direction);
         let (n, t) = (along(&|pair| pair.normal), along(&|pair| pair.sliding));
+        let entry = |matrix: &Mat<f64>, left: &[(usize, f64)], right: &[(usize, f64)]| -> f64 {
+            let row = |i: usize| right.iter().map(|&(j, weight)| weight * matrix[(i, j)]).sum::<f64>();
+            left.iter().map(|&(i, weight)| weight * row(i)).sum()
+        };
         let seen = |matrix: &Mat<f64>| {
-            let from = &n * matrix;
-            let nn = &from * n.transpose();
             // Symmetric by construction: the solver looks for it.
-            (Mat::from_fn(c, c, |i, j| nn[(i.max(j), i.min(j))]), from * t.transpose())
+            let nn = Mat::from_fn(c, c, |i, j| entry(matrix, &n[i.max(j)], &n[i.min(j)]));
+            (nn, Mat::from_fn(c, c, |i, j| entry(matrix, &n[i], &t[j])))
         };
         let (nn, nt) = seen(&residual.flexibility);
         normal += nn;
@@ -86,18 +89,17 @@ pub(super) fn between(
     Some(PairResidual { flexibility, band_max_hz: asked_hz.min(cutoff_hz), told })
 }
 
-/// `W`, `c×3c'`: what a direction of every pair sees of the displacements of a side's nodes.
-fn weights(pairs: &[Pair], disc: bool, residual: &Residual, direction: &dyn Fn(&Pair) -> [f64; 3]) -> Mat<f64> {
-    let mut weights = Mat::zeros(pairs.len(), residual.flexibility.nrows());
-    for (row, pair) in pairs.iter().enumerate() {
-        let along = direction(pair);
-        let pad = [(pair.pad_node, 1.0)];
-        let nodes: &[(usize, f64)] = if disc { &pair.disc } else { &pad };
-        for &(node, weight) in nodes {
-            for (axis, value) in along.iter().enumerate() {
-                weights[(row, 3 * node + axis)] += weight * value;
-            }
-        }
-    }
-    weights
+/// The rows of `W`, `c×3c'`: what a direction of every pair sees of the displacements of a side's nodes.
+fn weights(pairs: &[Pair], disc: bool, direction: &dyn Fn(&Pair) -> [f64; 3]) -> Vec<Vec<(usize, f64)>> {
+    pairs
+        .iter()
+        .map(|pair| {
+            let along = direction(pair);
+            let pad = [(pair.pad_node, 1.0)];
+            let nodes: &[(usize, f64)] = if disc { &pair.disc } else { &pad };
+            let of_node =
+                |&(node, weight): &(usize, f64)| [0, 1, 2].map(|axis| (3 * node + axis, weight * along[axis]));
+            nodes.iter().flat_map(of_node).filter(|(_, weight)| *weight != 0.0).collect()
+        })
+        .collect()
 }

@@ -137,12 +137,18 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
         if let Some((field, _)) = friction_or_load.iter().find(|(_, set)| *set) {
             return mixed(field, "has nothing to act on beside [system]", "a scale of a matrix instead");
         }
+        if raw.basis.as_ref().is_some_and(|basis| basis.shared) {
+            return mixed("basis.shared", "is true beside [system]", "[pad] and [disc] with modal");
+        }
         return Ok(Kind::System(system));
     }
     let Some(pad) = &raw.pad else {
         return missing("pad", "[pad] with mass and stiffness, [pad] with modal, or [system]");
     };
     let modal = pad.modal.is_some();
+    if !modal && raw.basis.is_some() {
+        return mixed("basis", "stands beside inline substructures", "[pad] and [disc] with modal, or [system]");
+    }
     for (side, substructure) in [("pad", Some(pad)), ("disc", raw.disc.as_ref())] {
         let Some(substructure) = substructure else { continue };
         let inline = substructure.mass.is_some() || substructure.stiffness.is_some();

@@ -51,6 +51,7 @@ struct Lines<'a> {
 /// # Errors
 /// [`RigError::Line`], naming the line, what stands there and what was expected.
 pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
+    let bytes = bytes.strip_suffix(b"\n").unwrap_or(bytes);
     let lines = bytes.split(|byte| *byte == b'\n').map(String::from_utf8_lossy).collect();
     let mut lines = Lines { file, lines, next: 0, dataset: String::new() };
     let (mut nodes, mut modes) = (Vec::<Node>::new(), Vec::<Mode>::new());
@@ -109,6 +110,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
         phi,
         nodes_m: nodes.iter().map(|node| node.position.map(|value| value * units.length_m)).collect(),
         damping_ratio: damped.then(|| modes.iter().map(|mode| mode.damping_ratio).collect()),
+        mass_share: None,
         residual: None,
     })
 }

@@ -1,0 +1,156 @@
+//! Reducing a full model on a parametric basis: what is asked for, by words, and what is being done, in words.
+
+use std::f64::consts::TAU;
+
+use anyhow::bail;
+
+use crate::full_model::FullModelFile;
+use crate::reduction::{
+    Counted, FullSolver, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
+};
+
+/// Largest `|Δλ|/|λ|` where nothing else is asked for.
+pub const TOLERANCE: f64 = 1e-6;
+/// Roots that grow faster than this are held, 1/s.
+const GROWTH_FLOOR_PER_S: f64 = -20.0;
+/// Operating points beside corners and middle at which the error is estimated, for each condition that matters.
+const TRAINING: usize = 8;
+/// Operating points held out, for each condition that matters.
+const HELD_OUT: usize = 3;
+/// Operating points of the full model after which it is given up.
+const MOST_SAMPLES: usize = 40;
+/// Vectors after which it is given up: beyond, modes of the parts are as good.
+const MOST_VECTORS: usize = 500;
+
+/// Ranges as they were asked for.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Ranges {
+    friction_coefficient: Option<[f64; 2]>,
+    normal_load_n: Option<[f64; 2]>,
+    disc_speed_rad_s: Option<[f64; 2]>,
+}
+
+/// `mu=0:1,speed=6:60,load=50:2000`, for clap.
+pub fn ranges(text: &str) -> Result<Ranges, String> {
+    let mut ranges = Ranges::default();
+    for item in text.split(',') {
+        let wrong = |reason: String| Err(format!("`{item}`: {reason}; expected ranges such as mu=0:1,load=50:2000"));
+        let Some((name, range)) = item.split_once('=') else { return wrong("no `=`".to_owned()) };
+        let ends: Vec<f64> = match range.split(':').map(|end| end.trim().parse::<f64>()).collect() {
+            Ok(ends) => ends,
+            Err(error) => return wrong(format!("{error}")),
+        };
+        let (low, high) = match *ends.as_slice() {
+            [only] => (only, only),
+            [low, high] => (low, high),
+            _ => return wrong(format!("{} numbers", ends.len())),
+        };
+        let slot = match name.trim() {
+            "mu" => &mut ranges.friction_coefficient,
+            "load" => &mut ranges.normal_load_n,
+            "speed" => &mut ranges.disc_speed_rad_s,
+            other => return wrong(format!("`{other}` is none of mu, load and speed")),
+        };
+        if slot.replace([low, high]).is_some() {
+            return wrong(format!("`{}` twice", name.trim()));
+        }
+    }
+    Ok(ranges)
+}
+
+/// What is asked of a basis of `full`, and the basis; `say` hears what is being done.
+///
+/// # Errors
+/// A full model that is no case for it, a tolerance that cannot be held.
+pub fn basis_of(
+    full: &FullModelFile,
+    tolerance: f64,
+    ranges: Ranges,
+    memory_limit_bytes: Option<usize>,
+    say: &mut dyn FnMut(&str),
+) -> anyhow::Result<(ParametricRequest, ParametricBasis)> {
+    let path = full.path.display();
+    let Some(band_hz) = full.settings.band_max_hz else {
+        bail!("{path}: `band.max_hz` is missing; expected it: a basis holds the roots of a band");
+    };
+    for (part, geometry) in full.model.parts.iter().zip(&full.geometry) {
+        if let Some(ratio) = geometry.damping_ratio {
+            let name = &part.name;
+            bail!(
+                "{path}: `{name}.damping_ratio` is {ratio}; expected none: only modes of a part have one, see --modes"
+            );
+        }
+    }
+    let settings = &full.settings;
+    let friction = [settings.limits.friction_coefficient[0].max(0.0), settings.limits.friction_coefficient[1]];
+    let default = OperatingBox {
+        friction_coefficient: [friction[0], friction[1].min(settings.mu_max)],
+        normal_load_n: settings.chart.normal_load_n,
+        disc_speed_rad_s: settings.chart.disc_speed_rad_s,
+    };
+    let asked = OperatingBox {
+        friction_coefficient: ranges.friction_coefficient.unwrap_or(default.friction_coefficient),
+        normal_load_n: ranges.normal_load_n.unwrap_or(default.normal_load_n),
+        disc_speed_rad_s: ranges.disc_speed_rad_s.unwrap_or(default.disc_speed_rad_s),
+    };
+    asked.check()?;
+    let (load, speed) = full.model.depends_on_load_and_speed();
+    let matters = 1 + usize::from(load) + usize::from(speed);
+    let request = ParametricRequest {
+        range: asked.without(!load, !speed),
+        counted: Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: GROWTH_FLOOR_PER_S },
+        tolerance,
+        training: TRAINING * matters,
+        held_out: HELD_OUT * matters,
+        most_samples: MOST_SAMPLES,
+        most_vectors: MOST_VECTORS,
+        split: false,
+    };
+    say("ordering and analysing");
+    let mut solver = FullSolver::new(&full.name, &full.model, memory_limit_bytes, &mut |_| {})?;
+    let basis = parametric_basis(&full.model, &mut solver, &request, &mut |step| say(&told(step)))?;
+    // What does not matter holds over all of the range that was asked for.
+    Ok((ParametricRequest { range: asked, ..request }, basis))
+}
+
+fn told(step: ParametricStep) -> String {
+    let at = |point: crate::physics::OperatingPoint| {
+        format!(
+            "{:.4} N, {:.4} rad/s, friction coefficient {:.4}",
+            point.normal_load_n, point.disc_speed_rad_s, point.friction_coefficient
+        )
+    };
+    match step {
+        ParametricStep::Sampling { point, sample } => {
+            format!("sample {sample}: solving the full model at {}", at(point))
+        }
+        ParametricStep::Sampled { roots, vectors, .. } => format!("{roots} roots there, {vectors} vectors in all"),
+        ParametricStep::Estimated { worst, vectors } => {
+            format!("worst estimate of |dlambda|/|lambda| with {vectors} vectors: {worst:.1e}")
+        }
+        ParametricStep::Cut { vectors, worst } => format!("cut to {vectors} vectors: {worst:.1e}"),
+        ParametricStep::HeldOut { point, worst } => format!("held out {}: {worst:.1e}", at(point)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_in_words() {
+        let all = ranges("mu=0:1, speed=6:60,load=500").unwrap();
+        assert_eq!(all.friction_coefficient, Some([0.0, 1.0]));
+        assert_eq!(all.disc_speed_rad_s, Some([6.0, 60.0]));
+        assert_eq!(all.normal_load_n, Some([500.0, 500.0]));
+        for (text, told) in [
+            ("mu", "no `=`"),
+            ("mu=a", "invalid float"),
+            ("mu=0:1:2", "3 numbers"),
+            ("mass=1", "none of mu, load and speed"),
+            ("mu=0,mu=1", "`mu` twice"),
+        ] {
+            assert!(ranges(text).unwrap_err().contains(told), "{text}: {}", ranges(text).unwrap_err());
+        }
+    }
+}

@@ -1,0 +1,318 @@
+use std::f64::consts::TAU;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use anyhow::{Context, bail};
+use clap::Args;
+
+use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
+use super::signals::on_stop;
+use super::steps::{GIB, Steps};
+use super::{Outcome, positive, print};
+use crate::certificate::{Against, Certificate, verify_against};
+use crate::export::{ModalSide, basis_rig, modal_rig};
+use crate::full_model::{FullModelFile, PartGeometry};
+use crate::io::memory::available_bytes;
+use crate::io::whole_file::{beside, write_whole};
+use crate::reduction::{Kept, Progress, Substructure, Wanted, keep_modes};
+use crate::rig::{Rig, RigFile};
+
+/// Remarks on where the full model is from, before those on what was kept of it.
+const REMARKS_OF_SOURCE: usize = 2;
+/// The cut-off of the modes kept, relative to the band, where nothing else is asked for.
+const CUTOFF: f64 = 2.5;
+
+/// Reduce a full model to a rig file the node can run
+///
+/// On a basis of the full model's own vectors over a range of conditions, so that every root in the band that grows, or
+/// decays by less than 20 1/s, is within a tolerance; or, with --modes or --cutoff-hz, on the lowest modes of pad and disc,
+/// their contact interface free, and what the modes left out still do at the contact. What is left is compared with the
+/// full model at held-out operating points, which the rig file then says. The
+/// arrays are written beside the rig file under names with their hash, the rig file last.
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Full model
+    full: PathBuf,
+    /// Largest relative error of a root on the basis, over the range [default: 1e-6]
+    #[arg(long, value_name = "ERROR", value_parser = positive, conflicts_with_all = ["modes", "cutoff_hz"])]
+    tolerance: Option<f64>,
+    /// Conditions the basis holds for [default: those of [search] and [chart]]
+    #[arg(long, value_name = "mu=A:B,speed=A:B,load=A:B", value_parser = ranges,
+          conflicts_with_all = ["modes", "cutoff_hz"])]
+    range: Option<Ranges>,
+    /// Modes of pad and disc to keep
+    #[arg(long, value_name = "I+J", value_parser = mode_counts, conflicts_with = "cutoff_hz")]
+    modes: Option<ModeCounts>,
+    /// Keep the modes of pad and disc below this frequency; 2.5 times the band is a good choice
+    #[arg(long, value_name = "HZ", value_parser = positive)]
+    cutoff_hz: Option<f64>,
+    /// Leave out what the modes left out do at the contact
+    #[arg(long)]
+    no_residual: bool,
+    /// Held-out operating points at which the rig is compared with the full model; 0 leaves the comparison out
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    points: usize,
+    /// Memory that may be used [default: what the machine has to spare]
+    #[arg(long, value_name = "GIB", value_parser = positive)]
+    memory_gib: Option<f64>,
+    /// Rig file to write
+    #[arg(short, long, value_name = "RIG.toml")]
+    output: PathBuf,
+}
+
+/// How many modes of each part.
+#[derive(Clone, Debug)]
+struct ModeCounts(Vec<usize>);
+
+/// `80+80`, or `80` before a rigid disc, for clap.
+fn mode_counts(text: &str) -> Result<ModeCounts, String> {
+    let counts: Result<Vec<usize>, String> = text
+        .split('+')
+        .map(|count| match count.trim().parse::<usize>() {
+            Ok(count) if count > 0 => Ok(count),
+            Ok(_) => Err("0 modes asked for, expected at least 1 of each part".to_owned()),
+            Err(error) => Err(format!("`{count}`: {error}; expected counts such as 80+80")),
+        })
+        .collect();
+    counts.map(ModeCounts)
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let unfinished = Unfinished::default();
+        let to_remove = unfinished.clone();
+        on_stop(move || {
+            to_remove.remove();
+            eprintln!("\nstopped: nothing was written");
+            std::process::exit(130);
+        })?;
+        let file = self.output.file_name().with_context(|| format!("{}: not a file", self.output.display()))?;
+        let file = file.to_string_lossy().into_owned();
+        let mut steps = Steps::new(2);
+        steps.say(&format!("reading {}", self.full.display()));
+        let full = FullModelFile::load(&self.full)?;
+        steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
+        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
+        if self.modes.is_none() && self.cutoff_hz.is_none() && !self.no_residual {
+            let (tolerance, range) = (self.tolerance.unwrap_or(TOLERANCE), self.range.unwrap_or_default());
+            let (request, basis) = basis_of(&full, tolerance, range, limit, &mut |text| steps.say(text))?;
+            let method = format!("{} vectors of the full model", basis.projected.omega_squared.len());
+            let make = |known: Option<&Certificate>| basis_rig(&file, &full, &request, &basis, known);
+            return self.finish(steps, &unfinished, &full, limit, method, &make);
+        }
+        if full.geometry.is_empty() {
+            bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
+        }
+        let wanted = self.wanted(&full)?;
+        let rows: Vec<Vec<Option<usize>>> = full.geometry.iter().map(interface_rows).collect();
+        let parts: Vec<Substructure<'_>> = full
+            .model
+            .parts
+            .iter()
+            .zip(&rows)
+            .zip(&wanted)
+            .map(|((part, rows), &wanted)| Substructure {
+                name: &part.name,
+                mass: &part.mass,
+                stiffness: &part.stiffness,
+                rows,
+                wanted,
+            })
+            .collect();
+        let names: Vec<&str> = parts.iter().map(|part| part.name).collect();
+        let kept =
+            keep_modes(&parts, !self.no_residual, limit, &mut |part, what| tell(&mut steps, part, names[part], what))?;
+        let sides: Vec<ModalSide<'_>> = full
+            .geometry
+            .iter()
+            .zip(&kept)
+            .zip(&rows)
+            .zip(&names)
+            .map(|(((geometry, kept), rows), name)| {
+                let nodes_m = geometry.interface.iter().map(|&node| geometry.nodes_m[node]).collect();
+                ModalSide::new(name, kept, nodes_m, rows, geometry.damping_ratio)
+            })
+            .collect();
+        let patches = contact_patches(&full.path)?;
+        let remarks = remarks(&full, &names, &kept);
+        let make = |known: Option<&Certificate>| {
+            modal_rig(&file, &full.name, &remarks, &full.common_tables, &patches, known, &sides)
+        };
+        self.finish(steps, &unfinished, &full, limit, remarks[REMARKS_OF_SOURCE..].join("; "), &make)
+    }
+
+    /// Compares what is left with the full model, and writes the files of the rig with what was found.
+    fn finish(
+        &self,
+        mut steps: Steps,
+        unfinished: &Unfinished,
+        full: &FullModelFile,
+        limit: Option<usize>,
+        method: String,
+        files_of: &dyn Fn(Option<&Certificate>) -> anyhow::Result<Vec<RigFile>>,
+    ) -> anyhow::Result<Outcome> {
+        let make = |known: Option<&Certificate>| -> anyhow::Result<(Vec<RigFile>, Rig)> {
+            let files = files_of(known)?;
+            let rig = Rig::from_files(&files).context("what is left of the full model is not a rig")?;
+            Ok((files, rig))
+        };
+        let (mut files, mut rig) = make(None)?;
+        if self.points > 0 {
+            if full.geometry.iter().any(|geometry| geometry.damping_ratio.is_some_and(|ratio| ratio != 0.0)) {
+                steps.say("not compared: a damping ratio of modes has no meaning for the full model");
+            } else {
+                let against =
+                    Against { points: self.points, seed: 1, band_hz: None, memory_limit_bytes: limit, windows: true };
+                let found = verify_against(&rig, full, &against, &mut |what, step| {
+                    steps.say(&format!("compared with the full model, {what}: {}", super::full::told(step)));
+                })
+                .context("the comparison with the full model failed; --points 0 leaves it out")?;
+                (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?;
+            }
+        }
+        unfinished.write(self.output.parent().unwrap_or(Path::new("")), &files)?;
+        steps.say(&format!("{} written", self.output.display()));
+        drop(steps);
+        print(&format!("{}\n", rig.describe()))?;
+        Ok(Outcome::Done)
+    }
+
+    /// Which modes of each part.
+    fn wanted(&self, full: &FullModelFile) -> anyhow::Result<Vec<Wanted>> {
+        let parts = full.geometry.len();
+        if let Some(ModeCounts(counts)) = &self.modes {
+            if counts.len() != parts {
+                bail!("--modes has {} counts, expected one for each of {parts} parts", counts.len());
+            }
+            return Ok(counts.iter().map(|&count| Wanted::Lowest(count)).collect());
+        }
+        let band = full.settings.band_max_hz.map(|band_hz| CUTOFF * band_hz);
+        let Some(cutoff_hz) = self.cutoff_hz.or(band) else {
+            let field = "band.max_hz";
+            bail!("{}: `{field}` is missing; expected it, --cutoff-hz or --modes", self.full.display());
+        };
+        Ok(vec![Wanted::Below(TAU * cutoff_hz); parts])
+    }
+}
+
+/// The rows of x, y and z of every interface node; `None` where a direction is held.
+pub fn interface_rows(geometry: &PartGeometry) -> Vec<Option<usize>> {
+    let row_of: std::collections::HashMap<(usize, usize), usize> =
+        geometry.rows.iter().enumerate().map(|(row, &place)| (place, row)).collect();
+    let places = geometry.interface.iter().flat_map(|&node| (0..3).map(move |direction| (node, direction)));
+    places.map(|place| row_of.get(&place).copied()).collect()
+}
+
+/// The contact patches of a full model as they are written; their nodes are counted as a rig's are.
+fn contact_patches(path: &Path) -> anyhow::Result<toml::Value> {
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let table: toml::Table = text.parse().with_context(|| path.display().to_string())?;
+    table.get("contact_patch").cloned().with_context(|| format!("{}: `contact_patch` is gone", path.display()))
+}
+
+/// What the rig was made of, for its head.
+fn remarks(full: &FullModelFile, names: &[&str], kept: &[Kept]) -> Vec<String> {
+    let mut lines = vec![
+        format!(
+            "Reduced by squealcast {} from {}: {} degrees of freedom, SHA-256",
+            env!("CARGO_PKG_VERSION"),
+            full.path.file_name().unwrap_or_default().to_string_lossy(),
+            full.model.dimension()
+        ),
+        full.content_hash.clone(),
+    ];
+    for (name, kept) in names.iter().zip(kept) {
+        let highest = kept.modes.omega_squared.last().map_or(0.0, |square| square.max(0.0).sqrt() / TAU);
+        lines.push(format!(
+            "{name}: {} modes up to {highest:.1} Hz, {}",
+            kept.modes.omega_squared.len(),
+            if kept.residual.is_some() { "with the residual of all others" } else { "nothing of the others" }
+        ));
+    }
+    lines
+}
+
+/// What a part is doing, in words.
+fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
+    match what {
+        Progress::Analysing => steps.say(&format!("{name}: ordering and analysing")),
+        Progress::Analysed { factor_entries, bytes } => steps.say(&format!(
+            "{name}: {:.1} million numbers in the factor, {:.2} GiB needed in all for this part",
+            factor_entries as f64 / 1e6,
+            bytes as f64 / GIB
+        )),
+        Progress::Factored { .. } => steps.say(&format!("{name}: factored")),
+        Progress::Iterated { converged, wanted, .. } => {
+            steps.at(part, &format!("{name}: modes"), converged.min(wanted), wanted);
+        }
+        Progress::Counted { modes, below } => {
+            steps.done(part);
+            let below_hz = below.max(0.0).sqrt() / TAU;
+            steps.say(&format!("{name}: {modes} modes below {below_hz:.1} Hz, counted by the inertia of K - shift M"));
+        }
+        Progress::Loaded { solved, loads } => steps.at(part, &format!("{name}: residual"), solved, loads),
+    }
+}
+
+/// Files that are not there in full yet, or not of use without the last one.
+#[derive(Clone, Debug, Default)]
+struct Unfinished(Arc<Mutex<Vec<PathBuf>>>);
+
+impl Unfinished {
+    fn list(&self) -> std::sync::MutexGuard<'_, Vec<PathBuf>> {
+        // A list of paths is never half changed.
+        self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
+    /// Writes every file whole or not at all, the first one last; if that does not come about, none is left.
+    fn write(&self, folder: &Path, files: &[RigFile]) -> anyhow::Result<()> {
+        for file in files.iter().skip(1).chain(files.first()) {
+            let path = folder.join(&file.name);
+            // A name with the hash of its content that is there already belongs to another rig too.
+            if !path.exists() {
+                self.list().push(path.clone());
+            }
+            self.list().push(beside(&path)?);
+            let written = write_whole(&path, |out| std::io::Write::write_all(out, &file.bytes));
+            if written.is_err() {
+                self.remove();
+                return written;
+            }
+        }
+        self.list().clear();
+        Ok(())
+    }
+
+    /// Removes what is there of them.
+    fn remove(&self) {
+        // One that cannot be removed, or was never begun, must not keep the others.
+        self.list().drain(..).for_each(|path| drop(std::fs::remove_file(path)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_of_modes() {
+        assert_eq!(mode_counts("80+75").unwrap().0, [80, 75]);
+        assert_eq!(mode_counts("12").unwrap().0, [12]);
+        for (text, told) in [("80+", "expected counts such as 80+80"), ("0+3", "at least 1"), ("a", "`a`")] {
+            assert!(mode_counts(text).unwrap_err().contains(told), "{text}");
+        }
+    }
+
+    #[test]
+    fn files_that_were_not_finished_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |name: &str| RigFile { name: name.to_owned(), bytes: b"x".to_vec() };
+        let unfinished = Unfinished::default();
+        // The rig file cannot be written: its folder is not there. The archive is removed again.
+        unfinished.write(folder.path(), &[file("none/rig.toml"), file("a.npz")]).unwrap_err();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        unfinished.write(folder.path(), &[file("rig.toml"), file("a.npz")]).unwrap();
+        unfinished.remove();
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
+    }
+}

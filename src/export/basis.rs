@@ -1,0 +1,196 @@
+//! A full model on a parametric basis to a rig file: pad and disc on shared coordinates, or a system of small matrices.
+
+use std::collections::HashMap;
+
+use anyhow::Context;
+use faer::Mat;
+use sha2::{Digest, Sha256};
+
+use super::matrix_market::write_array;
+use super::rig::{HASH_DIGITS, ModalSide, modal_rig};
+use crate::certificate::Certificate;
+use crate::full_model::{FullModelFile, PartGeometry};
+use crate::physics::{Law, Term};
+use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
+use crate::rig::RigFile;
+
+/// The files of a rig on `basis`: the rig file, called `file`, first, then what it names.
+///
+/// # Errors
+/// A full model that cannot be read again, what cannot be put into words of TOML.
+pub fn basis_rig(
+    file: &str,
+    full: &FullModelFile,
+    request: &ParametricRequest,
+    basis: &ParametricBasis,
+    known: Option<&Certificate>,
+) -> anyhow::Result<Vec<RigFile>> {
+    let remarks = remarks(full, request, basis);
+    let mut common = within(&full.common_tables, request);
+    let mut record = record(full, request, basis);
+    if full.geometry.is_empty() {
+        common.insert("basis".to_owned(), record.into());
+        if let Some(known) = known {
+            let known = toml::Value::try_from(known).context("the comparison cannot be put into words of TOML")?;
+            common.insert("reduction".to_owned(), known);
+        }
+        return system_rig(file, full, basis, &remarks, &common);
+    }
+    record.insert("shared".to_owned(), true.into());
+    common.insert("basis".to_owned(), record.into());
+    let text = std::fs::read_to_string(&full.path).with_context(|| full.path.display().to_string())?;
+    let table: toml::Table = text.parse().with_context(|| full.path.display().to_string())?;
+    let patches =
+        table.get("contact_patch").with_context(|| format!("{}: `contact_patch` is gone", full.path.display()))?;
+    let projected = &basis.projected;
+    let sides: Vec<ModalSide<'_>> = full
+        .model
+        .parts
+        .iter()
+        .zip(full.model.offsets())
+        .zip(&full.geometry)
+        .map(|((part, offset), geometry)| {
+            let rows = interface_rows(geometry);
+            ModalSide {
+                name: &part.name,
+                nodes_m: geometry.interface.iter().map(|&node| geometry.nodes_m[node]).collect(),
+                // A rigid-body motion is found a rounding above or below zero.
+                omega_rad_s: projected.omega_squared.iter().map(|square| square.max(0.0).sqrt()).collect(),
+                phi: Mat::from_fn(rows.len(), projected.omega_squared.len(), |i, k| {
+                    rows[i].map_or(0.0, |row| projected.basis[(offset + row, k)])
+                }),
+                residual: None,
+                damping_ratio: None,
+                mass_share: (part.name == "pad").then(|| {
+                    let rows = projected.basis.subrows(offset, part.mass.nrows());
+                    project_sparse(&part.mass, rows, true)
+                }),
+            }
+        })
+        .collect();
+    modal_rig(file, &full.name, &remarks, &common, patches, known, &sides)
+}
+
+/// The common tables of the full model, what a rig searches and prepares cut down to what the basis was made for.
+fn within(common: &toml::Table, request: &ParametricRequest) -> toml::Table {
+    let mut tables = common.clone();
+    let mut set = |table: &str, key: &str, value: toml::Value| {
+        let table = tables.entry(table.to_owned()).or_insert_with(|| toml::Table::new().into());
+        if let Some(table) = table.as_table_mut() {
+            table.insert(key.to_owned(), value);
+        }
+    };
+    let range = request.range;
+    if range.friction_coefficient[1] > 0.0 {
+        set("search", "mu_max", range.friction_coefficient[1].into());
+    }
+    for (key, [low, high]) in [("normal_load_n", range.normal_load_n), ("disc_speed_rad_s", range.disc_speed_rad_s)] {
+        // A chart wants a range, of positive numbers.
+        if 0.0 < low && low < high {
+            set("chart", key, vec![low, high].into());
+        }
+    }
+    tables
+}
+
+/// The rows of x, y and z of every interface node; `None` where a direction is held.
+fn interface_rows(geometry: &PartGeometry) -> Vec<Option<usize>> {
+    let row_of: HashMap<(usize, usize), usize> =
+        geometry.rows.iter().enumerate().map(|(row, &place)| (place, row)).collect();
+    let places = geometry.interface.iter().flat_map(|&node| (0..3).map(move |direction| (node, direction)));
+    places.map(|place| row_of.get(&place).copied()).collect()
+}
+
+/// `[system]` of dense matrices in array form; the mass matrix is the unit matrix.
+fn system_rig(
+    file: &str,
+    full: &FullModelFile,
+    basis: &ParametricBasis,
+    remarks: &[String],
+    common: &toml::Table,
+) -> anyhow::Result<Vec<RigFile>> {
+    let stem = std::path::Path::new(file).file_stem().map_or(file.into(), |stem| stem.to_string_lossy());
+    let mut files = vec![];
+    let mut write = |what: &str, matrix: &Mat<f64>| -> anyhow::Result<toml::Value> {
+        let mut bytes = vec![];
+        write_array(matrix, &format!("{what} of {stem} on its basis"), &mut bytes).context(what.to_owned())?;
+        let hash: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        let name = format!("{stem}-{what}-{}.mtx", &hash[..HASH_DIGITS]);
+        files.push(RigFile { name: name.clone(), bytes });
+        Ok(name.into())
+    };
+    let projected = &basis.projected;
+    let k = projected.omega_squared.len();
+    let diagonal = |value: &dyn Fn(usize) -> f64| Mat::from_fn(k, k, |i, j| if i == j { value(i) } else { 0.0 });
+    let mut system = toml::Table::new();
+    system.insert("mass".to_owned(), write("mass", &diagonal(&|_| 1.0))?);
+    let free = Term { matrix: diagonal(&|i| projected.omega_squared[i]), law: Law::Constant };
+    let stiffness: Vec<&Term> = std::iter::once(&free).chain(&projected.stiffness).collect();
+    for (key, terms) in [("stiffness", stiffness), ("damping", projected.damping.iter().collect())] {
+        let mut list = vec![];
+        for (index, term) in terms.into_iter().enumerate().filter(|(_, term)| term.matrix.norm_max() != 0.0) {
+            let mut keys = toml::Table::new();
+            keys.insert("matrix".to_owned(), write(&format!("{key}-{index}"), &term.matrix)?);
+            if let Law::Custom(law) = &term.law {
+                keys.insert("scale".to_owned(), law.text.as_str().into());
+            }
+            list.push(toml::Value::from(keys));
+        }
+        if !list.is_empty() {
+            system.insert(key.to_owned(), list.into());
+        }
+    }
+    let mut table = toml::Table::new();
+    table.insert("name".to_owned(), full.name.as_str().into());
+    table.extend(common.clone());
+    table.insert("system".to_owned(), system.into());
+    let mut text: String = remarks.iter().map(|line| format!("# {line}\n")).collect();
+    text += &toml::to_string(&table).context("the rig cannot be put into words of TOML")?;
+    files.insert(0, RigFile { name: file.to_owned(), bytes: text.into_bytes() });
+    Ok(files)
+}
+
+/// What the basis was made for and how good it was found, as `[basis]`.
+fn record(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricBasis) -> toml::Table {
+    let range = |[low, high]: [f64; 2]| toml::Value::from(vec![low, high]);
+    let mut table = toml::Table::new();
+    table.insert("degrees_of_freedom".to_owned(), (full.model.dimension() as i64).into());
+    table.insert("friction_coefficient".to_owned(), range(request.range.friction_coefficient));
+    table.insert("normal_load_n".to_owned(), range(request.range.normal_load_n));
+    table.insert("disc_speed_rad_s".to_owned(), range(request.range.disc_speed_rad_s));
+    table.insert("growth_floor_per_s".to_owned(), request.counted.growth_floor_per_s.into());
+    table.insert("tolerance".to_owned(), request.tolerance.into());
+    table.insert("held_out".to_owned(), (basis.held_out.len() as i64).into());
+    table.insert("largest_error".to_owned(), basis.worst().into());
+    table
+}
+
+/// What the rig was made of, for its head.
+fn remarks(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricBasis) -> Vec<String> {
+    let mut lines = vec![
+        format!(
+            "Reduced by squealcast {} from {}: {} degrees of freedom, SHA-256",
+            env!("CARGO_PKG_VERSION"),
+            full.path.file_name().unwrap_or_default().to_string_lossy(),
+            full.model.dimension()
+        ),
+        full.content_hash.clone(),
+        format!(
+            "{} vectors, of right and left vectors of the full model at {} operating points; tolerance {:e}, held out:",
+            basis.projected.omega_squared.len(),
+            basis.sampled.len(),
+            request.tolerance
+        ),
+    ];
+    lines.extend(basis.held_out.iter().map(|held| {
+        format!(
+            "  {} N, {} rad/s, friction coefficient {}: {} roots, largest |dlambda|/|lambda| {:.1e}",
+            held.point.normal_load_n,
+            held.point.disc_speed_rad_s,
+            held.point.friction_coefficient,
+            held.comparison.errors.len(),
+            held.comparison.worst()
+        )
+    }));
+    lines
+}

@@ -1,0 +1,97 @@
+//! Roots of a reduced model beside those of the full one: errors, and which were missed or invented.
+
+use faer::c64;
+
+/// Roots further apart than this, relative to `|λ|`, are not the same root.
+const SAME: f64 = 1e-2;
+
+/// Which roots count.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Counted {
+    /// Largest frequency, rad/s.
+    pub band_rad_s: f64,
+    /// Smallest growth rate, 1/s.
+    pub growth_floor_per_s: f64,
+}
+
+impl Counted {
+    /// Whether a root oscillates within the band and grows, or decays slowly enough.
+    pub fn counts(&self, lambda: c64) -> bool {
+        lambda.im > 0.0 && lambda.im <= self.band_rad_s && lambda.re > self.growth_floor_per_s
+    }
+}
+
+/// What a comparison found.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RootMatch {
+    /// Roots of the full model that count, with `|Δλ|/|λ|` of each.
+    pub errors: Vec<(c64, f64)>,
+    /// Roots of the full model that count and that the reduced one does not have.
+    pub missed: Vec<c64>,
+    /// Roots of the reduced model that count and that the full one does not have.
+    pub invented: Vec<c64>,
+}
+
+impl RootMatch {
+    /// The largest error; infinite where a root was missed or invented.
+    pub fn worst(&self) -> f64 {
+        if !self.missed.is_empty() || !self.invented.is_empty() {
+            return f64::INFINITY;
+        }
+        self.errors.iter().map(|(_, error)| *error).fold(0.0, f64::max)
+    }
+}
+
+/// Compares roots one to one, nearest first.
+///
+/// `full`, `reduced`: all roots with `ω > 0` of each; those of the full model a little beyond the band too, so that one
+/// near its end is found again on the other side.
+pub fn match_roots(full: &[c64], reduced: &[c64], counted: Counted) -> RootMatch {
+    let distance = |i: usize, j: usize| (full[i] - reduced[j]).norm() / full[i].norm();
+    let mut near: Vec<(usize, usize, f64)> = (0..full.len())
+        .flat_map(|i| (0..reduced.len()).map(move |j| (i, j, distance(i, j))))
+        .filter(|(_, _, error)| *error <= SAME)
+        .collect();
+    near.sort_by(|a, b| a.2.total_cmp(&b.2));
+    let mut partner: Vec<Option<f64>> = vec![None; full.len()];
+    let mut taken = vec![false; reduced.len()];
+    for (i, j, error) in near {
+        if partner[i].is_none() && !taken[j] {
+            (partner[i], taken[j]) = (Some(error), true);
+        }
+    }
+    let mut comparison = RootMatch::default();
+    for (&lambda, partner) in full.iter().zip(partner) {
+        match partner {
+            _ if !counted.counts(lambda) => {}
+            Some(error) => comparison.errors.push((lambda, error)),
+            None => comparison.missed.push(lambda),
+        }
+    }
+    let alone = reduced.iter().zip(taken).filter(|(lambda, taken)| counted.counts(**lambda) && !taken);
+    comparison.invented.extend(alone.map(|(lambda, _)| *lambda));
+    comparison
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_missed_and_invented_roots_are_told_apart() {
+        let root = |sigma: f64, omega: f64| c64::new(sigma, omega);
+        let full = [root(1.0, 100.0), root(-3.0, 100.0), root(-500.0, 900.0), root(0.0, 2000.0), root(2.0, 1000.0)];
+        let reduced =
+            [root(-3.0, 100.001), root(1.0, 100.0), root(5.0, 700.0), root(-19.0, 2020.0), root(-1.0, 3000.0)];
+        let counted = Counted { band_rad_s: 2010.0, growth_floor_per_s: -20.0 };
+        let found = match_roots(&full, &reduced, counted);
+        // The root at 2000 and the one at 2020 are 0.0138 apart: not the same root.
+        assert_eq!(found.missed, [root(0.0, 2000.0), root(2.0, 1000.0)]);
+        assert_eq!(found.invented, [root(5.0, 700.0)]);
+        assert_eq!(found.errors.len(), 2);
+        assert!((found.errors[1].1 - 0.001 / full[1].norm()).abs() < 1e-12 && found.errors[0].1 == 0.0);
+        assert_eq!(found.worst(), f64::INFINITY);
+        let found = match_roots(&full[..2], &reduced[..2], counted);
+        assert!((found.worst() - 0.001 / full[1].norm()).abs() < 1e-12);
+    }
+}
