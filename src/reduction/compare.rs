@@ -312,7 +312,6 @@ mod tests {
         let model = touching(42, 0.0, law);
         let n = model.dimension();
         let band = 700.0;
-        let judged = Judged { band_rad_s: band, ..JUDGED };
         let mut solver = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
         let at = |load: f64, mu: f64| OperatingPoint { normal_load_n: load, ..point(mu) };
         let options = MapOptions {
@@ -334,21 +333,23 @@ mod tests {
         assert!(compared.friction_error() < 2.0 * STILL, "{:e}", compared.friction_error());
 
         let mut basis = Basis { columns: Mat::zeros(n, 0) };
-        for mu in [0.0, 0.3, 0.6, 0.9] {
-            basis.add(&solver.roots(&at(500.0, mu), 1.1 * band, FullVectors::Both, &mut |_| {}).unwrap());
-        }
+        // A narrow band, so that the basis stays far from complete.
+        let judged = Judged { band_rad_s: 250.0, ..JUDGED };
+        basis.add(&solver.roots(&at(500.0, 0.45), judged.band_rad_s, FullVectors::Both, &mut |_| {}).unwrap());
+        assert!(basis.columns.ncols() < n / 3, "{} columns", basis.columns.ncols());
         let reduced = model.project(basis.columns.as_ref()).unwrap().model(law).unwrap();
         let mut dense = Solver::new(reduced.dimension());
         let mut error = |load: f64| {
             let p = at(load, 0.45);
-            let full = solver.roots(&p, band, FullVectors::None, &mut |_| {}).unwrap();
+            let full = solver.roots(&p, judged.band_rad_s, FullVectors::None, &mut |_| {}).unwrap();
             let full: Vec<c64> = full.roots.iter().map(|root| root.lambda).collect();
             let compared = compare_roots(&full, &reduced_roots(&reduced, &mut dense, &p).unwrap(), &judged);
             assert_eq!(compared.unpaired, 0);
             compared.relative_error()
         };
         let (own, other) = (error(500.0), error(2000.0));
-        assert!(own < 1e-3 * other && other > 1e-4, "{own:e} {other:e}");
+        // At its own load the basis holds the roots themselves.
+        assert!(own < 1e-9 && other > 1e-6, "{own:e} {other:e}");
     }
 
     #[test]
