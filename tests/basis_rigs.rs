@@ -157,7 +157,10 @@ fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
     let path = folder.join("tribometer.toml");
     let banded = folder.join("banded.toml");
     let band_hz = 2700.0;
-    fs::write(&banded, fs::read_to_string(&path).unwrap() + &format!("\n[band]\nmax_hz = {band_hz}\n")).unwrap();
+    let written = fs::read_to_string(&path).unwrap();
+    let narrower = written.replace("max_hz = 4000.0", &format!("max_hz = {band_hz}"));
+    assert_ne!(narrower, written);
+    fs::write(&banded, narrower).unwrap();
     let to = temp.path().join("rig.toml");
     // Compared with the full model below, at points of this test.
     let told = run(["reduce", &text(&banded), "--range", "mu=0:1", "--points", "0", "-o", &text(&to)]).exits(0);

@@ -15,14 +15,15 @@ use squealcast::rig::Rig;
 
 /// The band that is judged, Hz.
 const BAND_HZ: f64 = 4000.0;
+const BAND: &str = "[band]\nmax_hz = 4000.0\n";
 
-/// A tribometer of at least `dof` degrees of freedom with a band, and where its full model is.
+/// A tribometer of at least `dof` degrees of freedom: its full model.
 fn tribometer(folder: &Path, dof: usize) -> String {
     run(["tribometer", "--dof", &dof.to_string(), "-o", &text(folder)]).exits(0);
     let path = folder.join("tribometer.toml");
     let written = std::fs::read_to_string(&path).unwrap();
-    assert!(!written.contains("[band]"), "the tribometer has a band of its own now");
-    write(folder, "banded.toml", &format!("{written}\n[band]\nmax_hz = {BAND_HZ}\n[search]\nmu_max = 1.0\n"))
+    assert!(written.contains(BAND), "{written}");
+    text(&path)
 }
 
 fn reduced(full: &str, modes: &str, to: &Path) -> Rig {
@@ -186,7 +187,8 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     run(["reduce", &path, "--modes", "40+x", "-o", &to]).exits(2).complains("expected counts such as 80+80");
     run(["reduce", &path, "--modes", "0+4", "-o", &to]).exits(2).complains("expected at least 1 of each part");
     run(["reduce", &path, "--cutoff-hz", "10", "-o", &to]).exits(1).complains("there is none");
-    let bandless = text(&folder.path().join("tribometer.toml"));
+    let bandless = std::fs::read_to_string(&path).unwrap().replace(BAND, "");
+    let bandless = write(folder.path(), "bandless.toml", &bandless);
     run(["reduce", &bandless, "-o", &to])
         .exits(1)
         .complains("`band.max_hz` is missing; expected it, --cutoff-hz or --modes");

@@ -9,6 +9,10 @@ use super::{write_deck, write_mesh, write_symmetric};
 use crate::fem::tribometer::{CONTACT_STIFFNESS_N_PER_M, Part, Tribometer};
 use crate::io::whole_file::write_whole;
 
+/// The band holds the paper's first 18 modes, up to 3256 Hz, and a margin.
+const BAND_HZ: f64 = 4000.0;
+/// Friction coefficients of interest: the paper's go to 1.
+const MU_MAX: f64 = 1.0;
 /// Frequencies that a deck asks for.
 const DECK_MODES: usize = 20;
 
@@ -22,7 +26,7 @@ pub fn write_full_model(tribometer: &Tribometer, folder: &Path, mut say: impl Fn
     std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot make the folder", folder.display()))?;
     let mut toml = format!(
         "# A pad-on-disc tribometer of the paper's kind, with dimensions of this project: {} degrees of freedom.\n\
-         name = \"tribometer\"\n",
+         name = \"tribometer\"\n\n[band]\nmax_hz = {BAND_HZ:?}\n\n[search]\nmu_max = {MU_MAX:?}\n",
         tribometer.dof()
     );
     for (name, part) in [("pad", &tribometer.pad), ("disc", &tribometer.disc)] {
