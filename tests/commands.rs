@@ -771,7 +771,13 @@ fn help_states_units() {
         ),
         ("import", &["normal_load_n", "disc_speed_rad_s", "friction_coefficient", "time_s", "units in their names"]),
         ("recover", &["Repair an interrupted recording"]),
-        ("check", &["Rig file, or the name of an embedded rig"]),
+        ("check", &["Rig file, full model, or the name of an embedded rig"]),
+        ("identify", &["--targets <FREQ.csv>", "`frequency_hz`", "--load <N> Normal load in N"]),
+        ("full", &["--load <N> Normal load in N", "--speed <RAD_S> Disc speed in rad/s", "--band-hz <HZ>"]),
+        ("verify", &["--against <FULL>", "Highest frequency in Hz"]),
+        ("reduce", &["--modes <I+J>", "--cutoff-hz <HZ>", "--range <mu=A:B,speed=A:B,load=A:B>"]),
+        ("tribometer", &["--dof <N> Degrees of freedom"]),
+        ("reproduce", &["--output <DIR>"]),
         ("completions", &["bash", "fish", "zsh"]),
     ] {
         let help = flat(command);
