@@ -2,6 +2,7 @@
 
 use super::ReductionError;
 use crate::physics::OperatingPoint;
+use crate::physics::chart::radical_inverse;
 
 /// A range whose ends have a ratio above this is sampled evenly in the logarithm.
 const GEOMETRIC_ABOVE: f64 = 3.0;
@@ -94,17 +95,6 @@ impl OperatingBox {
     pub fn spread(&self, first: usize, count: usize) -> Vec<OperatingPoint> {
         (first..first + count).map(|index| self.at([2, 3, 5].map(|base| radical_inverse(index + 1, base)))).collect()
     }
-}
-
-/// The digits of `index` in `base`, mirrored at the point.
-fn radical_inverse(mut index: usize, base: usize) -> f64 {
-    let (mut value, mut digit) = (0.0, 1.0 / base as f64);
-    while index > 0 {
-        value += digit * (index % base) as f64;
-        index /= base;
-        digit /= base as f64;
-    }
-    value
 }
 
 #[cfg(test)]

@@ -23,7 +23,7 @@ pub struct HoldOut {
     pub incomplete: usize,
     /// Roots that differ from dense ones by more than the bounds of both.
     pub violations: usize,
-    /// Largest relative error of `λ²` outside merging points ([`MERGING`]).
+    /// Largest relative error of `λ²` outside merging points: neighbours closer than `MERGING`, relative.
     pub largest_error: f64,
     /// The 99th percentile of those.
     pub p99_error: f64,

@@ -24,6 +24,7 @@ use channels::Channels;
 use chebyshev::Basis;
 use cluster::MAX_SIZE;
 
+pub(crate) use samples::radical_inverse;
 pub use words::FORMAT;
 
 /// A condition that a chart depends on; its coordinate inside a box.

@@ -173,7 +173,7 @@ pub fn spread(axes: usize, taken: &[[f64; MAX_AXES]], count: usize) -> Vec<[f64;
 }
 
 /// The digits of `index` in `base`, mirrored at the point (van der Corput 1935; Halton 1960).
-fn radical_inverse(mut index: usize, base: usize) -> f64 {
+pub(crate) fn radical_inverse(mut index: usize, base: usize) -> f64 {
     let (mut value, mut digit) = (0.0, 1.0 / base as f64);
     while index > 0 {
         value += digit * (index % base) as f64;
