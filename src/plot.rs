@@ -374,12 +374,12 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
         let [from, to] = found.doubled;
         let (from, to) = (from.map_or(x.0, &at), to.map_or(x.1, &at));
         chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
-        for (name, colour, of) in [
-            ("rms", COLOURS[0], (|trial| trial.rms_error) as fn(&Trial) -> f64),
-            ("largest", COLOURS[1], |trial| trial.largest_error),
+        for (name, colour, side, of) in [
+            ("rms", COLOURS[0], VPos::Top, (|trial| trial.rms_error) as fn(&Trial) -> f64),
+            ("largest", COLOURS[1], VPos::Bottom, |trial| trial.largest_error),
         ] {
             let line: Vec<_> = trials.iter().map(|trial| (at(trial.factor), height(of(trial)))).collect();
-            let beside = Pos::new(HPos::Left, VPos::Bottom);
+            let beside = Pos::new(HPos::Left, side);
             let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(beside).color(&colour);
             chart.draw_series([Text::new(format!(" {name}"), line[0], text)]).map_err(failed)?;
             chart.draw_series(LineSeries::new(line, colour.stroke_width(2 * FINE))).map_err(failed)?;

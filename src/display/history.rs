@@ -139,7 +139,8 @@ impl History {
             bin_s: f64,
             bins: &'a VecDeque<Bin>,
         }
-        let mut text = Vec::with_capacity(64 + BIN_JSON * self.bins.len());
+        // As much as a full history takes, from the first time on: what the allocator keeps of it does not grow.
+        let mut text = Vec::with_capacity(64 + BIN_JSON * self.capacity);
         // Numbers only: nothing that JSON cannot hold.
         let whole = Whole { bin_s: seconds(self.bin_ns), bins: &self.bins };
         serde_json::to_writer(&mut text, &whole).ok().and_then(|()| String::from_utf8(text).ok()).unwrap_or_default()
