@@ -1,14 +1,17 @@
 //! Rigs of kind 2: what the modes left out do at the contact, and modes from Universal Files.
 #![cfg(feature = "node")]
 
+mod program;
+
 use std::io::Cursor;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 
 use faer::Mat;
 use faer::linalg::solvers::Solve;
 use npyz::WriterBuilder;
 use npyz::zip::write::FileOptions;
+use program::python;
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::chart::build::build;
 use squealcast::physics::{OperatingPoint, Solver, StabilityMap, Traces, Vectors, sensitivity};
@@ -504,16 +507,6 @@ fn wrong_universal_files_are_refused_with_line_and_value() {
     }
     for garbage in [&b"\xff\xfe\x00"[..], b"", b"-1", b"-1\n55\n-1", b"-1\n164\n1\n0 0 0\n-1", b"PK\x03\x04"] {
         uff::read("a.unv", garbage).unwrap_err();
-    }
-}
-
-/// The Python that has pyuff: as the environment says, the peers' own, or the machine's.
-fn python() -> PathBuf {
-    let peers = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/peers/bin/python");
-    match std::env::var_os("SQUEALCAST_PEERS_PYTHON") {
-        Some(path) => path.into(),
-        None if peers.exists() => peers,
-        None => "python3".into(),
     }
 }
 

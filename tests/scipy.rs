@@ -5,22 +5,12 @@
 mod program;
 
 use std::f64::consts::TAU;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 
 use faer::c64;
-use program::{json, number};
+use program::{json, number, python};
 use serde_json::Value;
-
-/// The Python that has numpy and scipy: as the environment says, the peers' own, or the machine's.
-fn python() -> PathBuf {
-    let peers = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/peers/bin/python");
-    match std::env::var_os("SQUEALCAST_PEERS_PYTHON") {
-        Some(path) => path.into(),
-        None if peers.exists() => peers,
-        None => "python3".into(),
-    }
-}
 
 #[test]
 fn scipy_predicts_the_same() {

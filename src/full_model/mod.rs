@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use crate::physics::ContactLaw;
 use crate::reduction::{FullContact, FullModel, FullPart, SparseMatrix, SparseRow, SparseTerm};
 use crate::rig::raw::{RawPatch, RawSystem, RawTerm};
-use crate::rig::settings::{Settings, spread, within};
+use crate::rig::settings::Settings;
 use crate::rig::{Pair, RigError, patch, settings, system};
 
 use files::Files;
@@ -188,25 +188,13 @@ fn read_parts(
         part.geometry.interface.iter().map(|&node| part.geometry.nodes_m[node]).collect()
     };
     let (pad_m, disc_m) = (at_interface(&pad), disc.as_ref().map(at_interface));
-    let (mut pairs, mut stiffness_n_per_m, mut damping_n_s_per_m) = (vec![], vec![], vec![]);
-    for (index, raw) in patches.iter().enumerate() {
-        let mut found = patch::pairs(&toml, index, raw, &pad_m, disc_m.as_deref())?;
-        for (key, values, all) in [
-            ("stiffness_n_per_m", &raw.stiffness_n_per_m, &mut stiffness_n_per_m),
-            ("damping_n_s_per_m", &raw.damping_n_s_per_m, &mut damping_n_s_per_m),
-        ] {
-            let field = format!("contact_patch[{index}].{key}");
-            for value in spread(&toml, &field, values, found.len(), "contact pairs")? {
-                all.push(within(&toml, &field, value, value >= 0.0, "at least 0")?);
-            }
+    let patch::Contacts { mut pairs, stiffness_n_per_m, damping_n_s_per_m } =
+        patch::contacts(&toml, patches, &pad_m, disc_m.as_deref())?;
+    for pair in &mut pairs {
+        pair.pad_node = pad.geometry.interface[pair.pad_node];
+        if let Some(disc) = &disc {
+            pair.disc.iter_mut().for_each(|(node, _)| *node = disc.geometry.interface[*node]);
         }
-        for pair in &mut found {
-            pair.pad_node = pad.geometry.interface[pair.pad_node];
-            if let Some(disc) = &disc {
-                pair.disc.iter_mut().for_each(|(node, _)| *node = disc.geometry.interface[*node]);
-            }
-        }
-        pairs.extend(found);
     }
     let offset = pad.part.mass.nrows();
     let rows = |direction: &dyn Fn(&Pair) -> [f64; 3]| -> Vec<SparseRow> {

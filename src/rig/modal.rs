@@ -7,7 +7,7 @@ use super::modal_data::ModalData;
 use super::patch::{self, Pair};
 use super::raw::{RawPatch, RawSubstructure};
 use super::residual::{self, SideResidual};
-use super::settings::{Settings, spread, within};
+use super::settings::{Settings, spread};
 use super::source::Source;
 use super::{Built, RigError, basis};
 use crate::physics::ContactPairs;
@@ -35,20 +35,8 @@ pub(super) fn build(
     let pad = part(source, "pad", pad)?;
     let disc = disc.map(|disc| part(source, "disc", disc)).transpose()?;
     let file = source.rig_file.clone();
-    let (mut pairs, mut stiffness_n_per_m, mut damping_n_s_per_m) = (vec![], vec![], vec![]);
-    for (index, raw) in patches.iter().enumerate() {
-        let found = patch::pairs(&file, index, raw, &pad.data.nodes_m, disc.as_ref().map(|disc| &*disc.data.nodes_m))?;
-        for (key, values, all) in [
-            ("stiffness_n_per_m", &raw.stiffness_n_per_m, &mut stiffness_n_per_m),
-            ("damping_n_s_per_m", &raw.damping_n_s_per_m, &mut damping_n_s_per_m),
-        ] {
-            let field = format!("contact_patch[{index}].{key}");
-            for value in spread(&file, &field, values, found.len(), "contact pairs")? {
-                all.push(within(&file, &field, value, value >= 0.0, "at least 0")?);
-            }
-        }
-        pairs.extend(found);
-    }
+    let patch::Contacts { pairs, stiffness_n_per_m, damping_n_s_per_m } =
+        patch::contacts(&file, patches, &pad.data.nodes_m, disc.as_ref().map(|disc| &*disc.data.nodes_m))?;
     let values = [stiffness_n_per_m, damping_n_s_per_m];
     let mut built = if shared {
         basis::build(&file, &pad, disc.as_ref(), &pairs, values, settings)?

@@ -14,7 +14,7 @@
 use super::RigError;
 use super::interpolation::{Interpolation, Plane};
 use super::raw::RawPatch;
-use super::settings::within;
+use super::settings::{spread, within};
 
 /// Nodes closer than this times the size of the patch coincide.
 const COINCIDENT: f64 = 1e-6;
@@ -53,11 +53,47 @@ fn scaled(a: [f64; 3], factor: f64) -> [f64; 3] {
     a.map(|value| value * factor)
 }
 
+/// The pairs of all patches, one after the other.
+pub struct Contacts {
+    pub pairs: Vec<Pair>,
+    /// One for each pair.
+    pub stiffness_n_per_m: Vec<f64>,
+    /// One for each pair.
+    pub damping_n_s_per_m: Vec<f64>,
+}
+
+/// The contact pairs of all patches with their springs and dampers; `disc_m` is `None` for a rigid disc.
+///
+/// # Errors
+/// As [`pairs`]; [`RigError::Range`] for a stiffness or damping that is negative or not one for each pair.
+pub fn contacts(
+    file: &str,
+    patches: &[RawPatch],
+    pad_m: &[[f64; 3]],
+    disc_m: Option<&[[f64; 3]]>,
+) -> Result<Contacts, RigError> {
+    let mut contacts = Contacts { pairs: vec![], stiffness_n_per_m: vec![], damping_n_s_per_m: vec![] };
+    for (index, raw) in patches.iter().enumerate() {
+        let found = pairs(file, index, raw, pad_m, disc_m)?;
+        for (key, values, all) in [
+            ("stiffness_n_per_m", &raw.stiffness_n_per_m, &mut contacts.stiffness_n_per_m),
+            ("damping_n_s_per_m", &raw.damping_n_s_per_m, &mut contacts.damping_n_s_per_m),
+        ] {
+            let field = format!("contact_patch[{index}].{key}");
+            for value in spread(file, &field, values, found.len(), "contact pairs")? {
+                all.push(within(file, &field, value, value >= 0.0, "at least 0")?);
+            }
+        }
+        contacts.pairs.extend(found);
+    }
+    Ok(contacts)
+}
+
 /// The contact pairs of the `index`-th patch, one for each selected pad node; `disc_m` is `None` for a rigid disc.
 ///
 /// # Errors
 /// [`RigError::NotFinite`], [`RigError::Range`], [`RigError::NoPartner`], [`RigError::NoTriad`].
-pub fn pairs(
+fn pairs(
     file: &str,
     index: usize,
     raw: &RawPatch,

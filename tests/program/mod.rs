@@ -101,6 +101,16 @@ pub fn launch(name: &str) -> String {
     format!("{}/launch/rigs/{name}", env!("CARGO_MANIFEST_DIR"))
 }
 
+/// The Python of the peers: as the environment says, the one set up here, or the machine's.
+pub fn python() -> PathBuf {
+    let peers = Path::new(env!("CARGO_MANIFEST_DIR")).join("target/peers/bin/python");
+    match std::env::var_os("SQUEALCAST_PEERS_PYTHON") {
+        Some(path) => path.into(),
+        None if peers.exists() => peers,
+        None => "python3".into(),
+    }
+}
+
 /// A path as an argument.
 pub fn text(path: &Path) -> String {
     path.to_str().expect("a path of a test is UTF-8").to_owned()
