@@ -63,6 +63,8 @@ pub struct Counters {
     pub faults: u64,
     /// Matrices that were not added in dense solves, their coefficients being zero.
     pub zero_terms: u64,
+    /// Modes that nothing couples, which dense solves did without.
+    pub decoupled_modes: u64,
     /// Roots beyond the band that predictions off the chart did without.
     pub roots_beyond_band: u64,
 }
@@ -385,6 +387,7 @@ impl Session {
         }));
         self.counters.solved += 1;
         self.counters.zero_terms += self.rig.model.zero_terms(point) as u64;
+        self.counters.decoupled_modes += self.rig.model.decoupled_count() as u64;
         match solved {
             Ok(solved) => solved.map_err(|error| format!("prediction failed: {error}")),
             Err(_) => {

@@ -93,6 +93,7 @@ impl Statistics {
             pair("stability_map_pending", map_pending),
             // What the situation did not need. A prediction off the chart is a dense solve and its vectors saved.
             pair("skipped_zero_terms", counters.zero_terms),
+            pair("skipped_decoupled_modes", counters.decoupled_modes),
             pair("skipped_roots_beyond_band", counters.roots_beyond_band),
             pair("skipped_encodings", outputs.encodings_skipped),
             pair("publish_failures", outputs.failures),

@@ -9,7 +9,8 @@ use std::collections::BTreeMap;
 use faer::c64;
 
 use super::model::Model;
-use super::spectrum::{Root, Solver, Spectrum, Vectors};
+use super::solver::Solver;
+use super::spectrum::{Root, Spectrum, Vectors};
 use super::stability_map::{MapError, MapOptions, Node, StabilityMap, mirror};
 use super::tracking::{Continuation, tracked};
 

@@ -8,7 +8,8 @@ use super::critical::{Window, WindowKind};
 use super::model::{Model, Parameter};
 use super::operating_point::OperatingPoint;
 use super::sensitivity::{of_pair, of_roots};
-use super::spectrum::{Solver, Spectrum, Vectors};
+use super::solver::Solver;
+use super::spectrum::{Spectrum, Vectors};
 use super::stability_map::{MapError, StabilityMap};
 
 /// How far load and speed may be, relative, from where ends are known for these to be extrapolated with a bound.

@@ -4,6 +4,7 @@
 
 pub mod chart;
 pub mod critical;
+mod decoupled;
 mod dense_eigen;
 pub mod ends;
 mod flexible_contact;
@@ -12,6 +13,7 @@ pub mod model;
 pub mod operating_point;
 pub mod reference;
 pub mod sensitivity;
+mod solver;
 pub mod spectrum;
 pub mod stability_map;
 pub mod stress;
@@ -27,6 +29,7 @@ pub use ends::{Bounded, End, Ends};
 pub use flexible_contact::ResidualFlexibility;
 pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Parameter, Term, Traces};
 pub use operating_point::{ContactState, OperatingPoint};
-pub use spectrum::{Root, RootError, SolveError, Solver, Spectrum, Vectors};
+pub use solver::Solver;
+pub use spectrum::{Root, RootError, SolveError, Spectrum, Vectors};
 pub use stability_map::{MapError, MapOptions, StabilityMap};
 pub use summary::{Mode, Summary};

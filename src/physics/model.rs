@@ -4,11 +4,12 @@
 //! matrices by a Cholesky factor of `M` or by a projection on modes. A term is a constant matrix times a scalar
 //! [`Law`] of the operating point; a [`ContactPairs`] becomes such terms when the model is built.
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use faer::{Mat, MatRef};
 
 use super::chart::chebyshev;
+use super::decoupled::Parts;
 use super::operating_point::{ContactState, OperatingPoint};
 
 /// A matrix times a scalar law of the operating point.
@@ -189,7 +190,27 @@ pub enum ModelError {
 #[derive(Clone, Debug)]
 pub(super) struct KnownTerm {
     pub(super) term: Term,
-    symmetric: bool,
+    pub(super) symmetric: bool,
+}
+
+impl KnownTerm {
+    /// `coefficient` of its law, a finite number.
+    pub(super) fn factor(&self, coefficient: impl Fn(&Law) -> f64, p: &OperatingPoint) -> Result<f64, ModelError> {
+        let value = coefficient(&self.term.law);
+        if value.is_finite() {
+            return Ok(value);
+        }
+        Err(ModelError::LawNotFinite {
+            what: match &self.term.law {
+                Law::Custom(custom) => format!("scale `{}`", custom.text),
+                law => format!("{law:?}"),
+            },
+            value,
+            normal_load_n: p.normal_load_n,
+            disc_speed_rad_s: p.disc_speed_rad_s,
+            friction_coefficient: p.friction_coefficient,
+        })
+    }
 }
 
 /// The equation of motion of a rig in `n` mass-normalised coordinates.
@@ -199,9 +220,11 @@ pub struct Model {
     pub(super) stiffness: Vec<KnownTerm>,
     pub(super) damping: Vec<KnownTerm>,
     pub(super) contact_law: ContactLaw,
-    has_contact: bool,
-    pad_modes: Option<usize>,
-    pad_mass: Option<Mat<f64>>,
+    pub(super) has_contact: bool,
+    pub(super) pad_modes: Option<usize>,
+    pub(super) pad_mass: Option<Mat<f64>>,
+    /// What is coupled and what is not, once it was asked for; none where everything is.
+    pub(super) parts: OnceLock<Option<Box<Parts>>>,
 }
 
 /// What [`Model::assemble`] found out about the matrices it wrote.
@@ -227,13 +250,15 @@ impl Model {
         contact_law: ContactLaw,
         pad_modes: Option<usize>,
     ) -> Result<Self, ModelError> {
-        let (has_contact, pad_mass) = (false, None);
-        let mut model =
-            Self { dimension, stiffness: vec![], damping: vec![], contact_law, has_contact, pad_modes, pad_mass };
-        for (k, term) in stiffness.into_iter().enumerate() {
-            model.stiffness.push(model.known(term, || format!("stiffness term {k}"))?);
+        let (has_contact, pad_mass, parts) = (false, None, OnceLock::new());
+        let (stiffness_terms, damping_terms) = (stiffness, damping);
+        let (stiffness, damping) = (vec![], vec![]);
+        let mut model = Self { dimension, stiffness, damping, contact_law, has_contact, pad_modes, pad_mass, parts };
+        for (k, term) in stiffness_terms.into_iter().enumerate() {
+            let known = model.known(term, || format!("stiffness term {k}"))?;
+            model.stiffness.push(known);
         }
-        for (k, term) in damping.into_iter().enumerate() {
+        for (k, term) in damping_terms.into_iter().enumerate() {
             let known = model.known(term, || format!("damping term {k}"))?;
             model.damping.push(known);
         }
@@ -320,7 +345,8 @@ impl Model {
         Ok(())
     }
 
-    fn known(&self, term: Term, what: impl Fn() -> String) -> Result<KnownTerm, ModelError> {
+    fn known(&mut self, term: Term, what: impl Fn() -> String) -> Result<KnownTerm, ModelError> {
+        self.parts = OnceLock::new(); // what is known of the model before may not hold with it
         let (rows, columns) = term.matrix.shape();
         if rows != self.dimension || columns != self.dimension {
             return Err(ModelError::Shape { what: what(), rows, columns, expected: self.dimension });
@@ -339,7 +365,7 @@ impl Model {
     }
 
     /// A matrix of zeros is no term: it would only cost time.
-    fn drop_zero_terms(&mut self) {
+    pub(super) fn drop_zero_terms(&mut self) {
         let is_zero = |known: &KnownTerm| known.term.matrix.norm_max() == 0.0;
         self.stiffness.retain(|known| !is_zero(known));
         self.damping.retain(|known| !is_zero(known));
@@ -388,7 +414,7 @@ impl Model {
     }
 
     /// Value of `law` at `p`.
-    fn coefficient(&self, law: &Law, p: &OperatingPoint) -> f64 {
+    pub(super) fn coefficient(&self, law: &Law, p: &OperatingPoint) -> f64 {
         law.value(&self.contact_law, self.contact_state(p), p)
     }
 
@@ -434,7 +460,7 @@ impl Model {
     }
 
     /// Derivative of the value of `law` at `p`.
-    fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
+    pub(super) fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
         use Parameter::{ContactDamping, ContactStiffness, Friction, Load, Speed};
         if let Law::Custom(custom) = law {
             return self.custom_derivative(custom, law, p, parameter);
@@ -483,6 +509,11 @@ impl Model {
         let (up, down) = (self.coefficient(law, &moved(at + step)), self.coefficient(law, &moved(at - step)));
         // A law need not exist for negative friction coefficients.
         if down.is_finite() { (up - down) / (2.0 * step) } else { (up - self.coefficient(law, p)) / step }
+    }
+
+    /// Whether any damping takes part at `p`.
+    pub fn is_damped(&self, p: &OperatingPoint) -> bool {
+        self.damping.iter().any(|known| self.coefficient(&known.term.law, p) != 0.0)
     }
 
     /// How many terms have a coefficient of zero at `p`: matrices that need not be added.
@@ -582,7 +613,7 @@ impl Traces {
             (0..terms.len()).map(|i| weight(i) * row(i)).sum()
         };
         let trace_k = weighted(&model.stiffness, &self.stiffness);
-        if model.damping.iter().all(|known| model.coefficient(&known.term.law, p) == 0.0) {
+        if !model.is_damped(p) {
             return [-trace_k, squared(&model.stiffness, &self.stiffness_products)];
         }
         let trace_c = weighted(&model.damping, &self.damping);
@@ -600,19 +631,7 @@ fn sum(
     out.fill(0.0);
     let (mut any, mut symmetric) = (false, true);
     for known in terms {
-        let factor = coefficient(&known.term.law);
-        if !factor.is_finite() {
-            return Err(ModelError::LawNotFinite {
-                what: match &known.term.law {
-                    Law::Custom(custom) => format!("scale `{}`", custom.text),
-                    law => format!("{law:?}"),
-                },
-                value: factor,
-                normal_load_n: p.normal_load_n,
-                disc_speed_rad_s: p.disc_speed_rad_s,
-                friction_coefficient: p.friction_coefficient,
-            });
-        }
+        let factor = known.factor(&coefficient, p)?;
         if factor != 0.0 {
             faer::zip!(out.as_mut(), known.term.matrix.as_ref()).for_each(|faer::unzip!(o, m)| *o += factor * *m);
             any = true;

@@ -423,7 +423,8 @@ mod tests {
 
     use super::super::model::{ContactLaw, Law, Model, Term};
     use super::super::operating_point::OperatingPoint;
-    use super::super::spectrum::{Solver, Vectors};
+    use super::super::solver::Solver;
+    use super::super::spectrum::Vectors;
     use super::super::synthetic::{Synthetic, rig};
     use super::super::test_models::{REFERENCE, nine_dof, random_rig};
     use super::*;

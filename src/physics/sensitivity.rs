@@ -19,7 +19,8 @@ use faer::prelude::Solve;
 use faer::{Mat, MatRef, c64};
 
 use super::model::{Model, ModelError, Parameter};
-use super::spectrum::{ROUNDING, Spectrum, displacement_scale};
+use super::solver::{ROUNDING, displacement_scale};
+use super::spectrum::Spectrum;
 
 /// Of two roots further apart than this, relative to their size, each is taken by itself.
 const APART: f64 = 0.05;
@@ -422,7 +423,8 @@ mod tests {
 
     use super::super::model::{ContactLaw, ContactPairs, Law, Term};
     use super::super::operating_point::OperatingPoint;
-    use super::super::spectrum::{Solver, Vectors};
+    use super::super::solver::Solver;
+    use super::super::spectrum::Vectors;
     use super::super::synthetic::{Synthetic, rig};
     use super::super::test_models::{REFERENCE, hulten, nine_dof};
     use super::*;

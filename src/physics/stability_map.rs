@@ -7,7 +7,8 @@ use super::critical::{self, Window};
 use super::ends::Ends;
 use super::model::Model;
 use super::operating_point::OperatingPoint;
-use super::spectrum::{SolveError, Solver, Spectrum, Vectors};
+use super::solver::Solver;
+use super::spectrum::{SolveError, Spectrum, Vectors};
 use super::tracking::{Continuation, continue_roots, tracked};
 
 /// Intervals the range of friction coefficients is cut into before refinement.

@@ -23,7 +23,8 @@ use super::critical::Window;
 use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
 use super::operating_point::OperatingPoint;
 use super::reference::{self, MAX_TOGETHER};
-use super::spectrum::{Solver, Spectrum, Vectors};
+use super::solver::Solver;
+use super::spectrum::{Spectrum, Vectors};
 use super::stability_map::{MapOptions, StabilityMap};
 use super::synthetic::{Synthetic, Uniform, rig};
 

@@ -13,7 +13,8 @@ use super::samples::{Sample, Sampler, follow, spread};
 use super::{Axis, Branch, Chart, Leaf, MAX_AXES, Scratch};
 use crate::physics::model::{Model, Traces};
 use crate::physics::operating_point::OperatingPoint;
-use crate::physics::spectrum::{SolveError, Solver, Spectrum};
+use crate::physics::solver::Solver;
+use crate::physics::spectrum::{SolveError, Spectrum};
 use crate::physics::stability_map::{MapOptions, StabilityMap};
 use crate::physics::tracking::tracked;
 

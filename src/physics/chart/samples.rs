@@ -5,7 +5,8 @@ use faer::{Mat, c64};
 use super::{Axis, MAX_AXES};
 use crate::physics::model::{Model, Traces};
 use crate::physics::operating_point::OperatingPoint;
-use crate::physics::spectrum::{ROUNDING, SolveError, Solver, Spectrum, Vectors};
+use crate::physics::solver::{ROUNDING, Solver};
+use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
 use crate::physics::tracking::{continue_roots, tracked};
 
 /// Condition of a root above which its slope has lost too many digits.
