@@ -1,62 +1,94 @@
-//! Time of one prediction by a dense solve and off a chart, answers checked first: `cargo bench --bench predict`.
+//! Time of a prediction by each route, answers checked first: `cargo bench --bench predict`.
 //!
-//! Synthetic undamped rigs over the friction coefficient, 48 contact pairs, band 5 kHz. One thread; medians.
+//! Synthetic undamped rigs over the friction coefficient, 48 contact pairs, band 5 kHz, one thread. 490 modes take minutes more:
+//! they are measured with SQUEALCAST_MEASURE=1. Against error and beside LAPACK the same routes stand in `squealcast bench`.
 
-use std::time::Instant;
+use std::hint::black_box;
 
+use criterion::{Criterion, criterion_group, criterion_main};
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::chart::build::{ChartOptions, build};
 use squealcast::physics::synthetic::{Synthetic, Uniform, rig};
-use squealcast::physics::{ContactLaw, OperatingPoint, Solver, Traces, Vectors};
+use squealcast::physics::{Chart, ContactLaw, Mode, Model, OperatingPoint, Root, Solver, Summary, Traces, Vectors};
 
-const CONDITIONS: usize = 200;
+const BAND_MAX_HZ: f64 = 5000.0;
+/// More than caches keep of one condition for the next.
+const CONDITIONS: usize = 64;
 
-fn main() {
-    println!("{:>4}  {:>14}  {:>17}  {:>9}  {:>7}", "n", "dense, us", "chart, us", "ratio", "leaves");
-    for modes in [20, 80, 160] {
+fn point(friction_coefficient: f64) -> OperatingPoint {
+    OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient }
+}
+
+fn charted(model: &Model) -> Chart {
+    let options = ChartOptions {
+        low: point(0.0),
+        high: point(1.0),
+        band_max_hz: Some(BAND_MAX_HZ),
+        tolerance: 1e-8,
+        smallest_share: 1e-4,
+        max_solves: 100_000,
+        threads: 1,
+    };
+    build(model, &options, &|_| true).expect("the rig can be charted")
+}
+
+/// Every charted root has a dense one within its bound.
+fn check(model: &Model, chart: &Chart, traces: &Traces, points: &[OperatingPoint]) {
+    let (mut solver, mut scratch, mut modes) = (Solver::new(model.dimension()), Scratch::default(), vec![]);
+    for p in points {
+        let spectrum = solver.solve(model, p, Vectors::Both).expect("it solves");
+        modes.clear();
+        chart.evaluate(p, traces.at(model, p), &mut scratch, &mut modes).expect("it is charted");
+        for mode in &modes {
+            let off = |root: &Root| (root.square - mode.root.square).norm();
+            let nearest = spectrum.roots.iter().min_by(|a, b| off(a).total_cmp(&off(b))).expect("there are roots");
+            assert!(off(nearest) <= mode.root.error.square + nearest.error.square, "{mode:?} is not {nearest:?}");
+        }
+    }
+}
+
+fn routes(criterion: &mut Criterion) {
+    let mut sizes = vec![20, 80, 160];
+    sizes.extend(std::env::var_os("SQUEALCAST_MEASURE").map(|_| 490));
+    for modes in sizes {
         let contact_law = ContactLaw::default();
         let synthetic = Synthetic { modes, pairs: 48, damping_ratio: 0.0, contact_law, seed: 1 };
         let model = rig(&synthetic).expect("the rig is well formed");
-        let point = |friction_coefficient| OperatingPoint {
-            normal_load_n: 500.0,
-            disc_speed_rad_s: 13.0,
-            friction_coefficient,
-        };
-        let options = ChartOptions {
-            low: point(0.0),
-            high: point(1.0),
-            band_max_hz: Some(5000.0),
-            tolerance: 1e-8,
-            smallest_share: 1e-4,
-            max_solves: 100_000,
-            threads: 1,
-        };
-        let chart = build(&model, &options, &|_| true).expect("the rig can be charted");
-        let traces = Traces::new(&model);
-        let mut solver = Solver::new(modes);
-        let (mut scratch, mut charted) = (Scratch::default(), vec![]);
-        let (mut dense, mut fast) = (vec![], vec![]);
+        let (chart, traces) = (charted(&model), Traces::new(&model));
         let mut uniform = Uniform::new(3);
-        for _ in 0..CONDITIONS {
-            let p = point(0.5 * (uniform.draw() + 1.0));
-            let begun = Instant::now();
-            let spectrum = solver.solve(&model, &p, Vectors::Both).expect("it solves");
-            dense.push(begun.elapsed().as_secs_f64() * 1e6);
-            charted.clear();
-            let begun = Instant::now();
-            chart.evaluate(&p, traces.at(&model, &p), &mut scratch, &mut charted).expect("it is charted");
-            fast.push(begun.elapsed().as_secs_f64() * 1e6);
-            for mode in &charted {
-                let off = |root: &squealcast::physics::Root| (root.square - mode.root.square).norm();
-                let nearest = spectrum.roots.iter().map(off).fold(f64::INFINITY, f64::min);
-                assert!(nearest <= 2.0 * mode.root.error.square, "n {modes}: {mode:?} is off by {nearest:e}");
-            }
+        let points: Vec<OperatingPoint> = (0..CONDITIONS).map(|_| point(0.5 * (uniform.draw() + 1.0))).collect();
+        check(&model, &chart, &traces, &points[..8]);
+
+        let mut group = criterion.benchmark_group(format!("{modes} modes"));
+        let mut solver = Solver::new(modes);
+        for (route, vectors) in [("dense values", Vectors::None), ("dense both vectors", Vectors::Both)] {
+            let mut next = points.iter().cycle();
+            group.sample_size(10).bench_function(route, |bencher| {
+                bencher.iter(|| next.next().map(|p| black_box(solver.solve(&model, p, vectors))));
+            });
         }
-        let median = |times: &mut Vec<f64>| {
-            times.sort_by(f64::total_cmp);
-            times[times.len() / 2]
-        };
-        let (dense, fast) = (median(&mut dense), median(&mut fast));
-        println!("{modes:>4}  {dense:>14.1}  {fast:>17.2}  {:>9.0}  {:>7}", dense / fast, chart.leaf_count());
+        let (mut scratch, mut values, mut roots): (_, _, Vec<Mode>) = (Scratch::default(), vec![], vec![]);
+        let mut next = points.iter().cycle();
+        group.sample_size(100).bench_function("chart values", |bencher| {
+            bencher.iter(|| {
+                values.clear();
+                next.next().map(|p| black_box(chart.values(p, &mut scratch, &mut values)))
+            });
+        });
+        let mut summary = Summary::default();
+        let mut next = points.iter().cycle();
+        group.bench_function("chart + certificate", |bencher| {
+            bencher.iter(|| {
+                let Some(p) = next.next() else { return };
+                roots.clear();
+                let answer = chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut roots);
+                summary.take_chart(&roots, Some(BAND_MAX_HZ), 1e-6);
+                let _ = black_box((answer, &summary));
+            });
+        });
+        group.finish();
     }
 }
+
+criterion_group!(benches, routes);
+criterion_main!(benches);

@@ -1,6 +1,8 @@
 //! Predicts friction-induced instability of a pad-on-disc tribometer from its operating conditions.
 
 #[cfg(feature = "node")]
+mod ahead;
+#[cfg(feature = "node")]
 pub mod bench;
 #[cfg(feature = "node")]
 pub mod certificate;

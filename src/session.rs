@@ -10,8 +10,8 @@ use std::sync::Arc;
 use crate::physics::chart::build::ChartOptions;
 use crate::physics::chart::{Chart, Scratch};
 use crate::physics::{
-    ContactState, Ends, MapOptions, Mode, Model, OperatingPoint, SolveError, Solver, StabilityMap, Summary, Traces,
-    Vectors,
+    ContactState, Ends, MapOptions, Mode, Model, OperatingPoint, SolveError, Solver, Spectrum, StabilityMap, Summary,
+    Traces, Vectors,
 };
 use crate::rig::{Limits, Rig};
 use crate::settings::{SettingError, Settings};
@@ -89,6 +89,8 @@ pub struct Session {
     traces: Traces,
     scratch: Scratch,
     charted: Vec<Mode>,
+    /// Spectra that were worked out beforehand.
+    beforehand: Vec<Spectrum>,
     summary: Summary,
     /// Room for the choice of the modes to publish.
     order: Vec<usize>,
@@ -156,6 +158,7 @@ impl Session {
             solver,
             scratch: Scratch::default(),
             charted: vec![],
+            beforehand: vec![],
             summary: Summary::default(),
             order: vec![],
             chart: None,
@@ -205,6 +208,31 @@ impl Session {
     /// Whether the prediction for `point` takes no dense solve, unless the chart's own check fails there.
     pub fn answers_at_once(&self, point: &OperatingPoint) -> bool {
         self.reuses(point) || self.usable_chart(point).is_some_and(|chart| chart.covers(point))
+    }
+
+    /// Takes spectra of conditions that it may come to, solved with both vectors; those of before are dropped. Where it comes to
+    /// them it does not solve again: what it predicts is the same.
+    pub fn hand_in(&mut self, spectra: Vec<Spectrum>) {
+        self.beforehand = spectra;
+    }
+
+    /// Whether the prediction for `point`, if it came next, would be solved.
+    pub fn would_solve(&self, point: &OperatingPoint) -> bool {
+        let at_hand = self.beforehand.iter().any(|spectrum| same(&spectrum.point, point));
+        !at_hand && !self.answers_at_once(point) && check_limits(point, &self.rig.limits).is_ok()
+    }
+
+    /// Which of `points` would be solved if they came one after another.
+    pub fn would_solve_among<'a>(&self, points: impl Iterator<Item = &'a OperatingPoint>) -> Vec<OperatingPoint> {
+        let mut last = self.last;
+        let wanted = points.filter(|point| {
+            let reused = last.is_some_and(|last| within_dead_band(&last, point, &self.settings));
+            if !reused {
+                last = Some(**point);
+            }
+            !reused && self.would_solve(point)
+        });
+        wanted.copied().collect()
     }
 
     /// One step. After the first of its kind a step allocates nothing on the chart's route.
@@ -375,9 +403,14 @@ impl Session {
 
     /// Takes a dense solve at `point`; the error is the reason of a FAULT.
     fn solved_at(&mut self, point: &OperatingPoint, map: Option<&StabilityMap>) -> Result<(), String> {
+        let at_hand = self.beforehand.iter().position(|spectrum| same(&spectrum.point, point));
+        let at_hand = at_hand.map(|k| self.beforehand.swap_remove(k));
         let (rig, solver, summary) = (&self.rig, &mut self.solver, &mut self.summary);
         let solved = catch_unwind(AssertUnwindSafe(|| -> Result<(), SolveError> {
-            let spectrum = solver.solve(&rig.model, point, Vectors::Both)?;
+            let spectrum = match at_hand {
+                Some(spectrum) => spectrum,
+                None => solver.solve(&rig.model, point, Vectors::Both)?,
+            };
             let ids = match map {
                 Some(map) => map.identify(&spectrum),
                 None => vec![], // in the order of the spectrum
@@ -461,6 +494,12 @@ fn within_dead_band(from: &OperatingPoint, to: &OperatingPoint, settings: &Setti
     (from.normal_load_n - to.normal_load_n).abs() <= settings.dead_band_load_n
         && (from.disc_speed_rad_s - to.disc_speed_rad_s).abs() <= settings.dead_band_speed_rad_s
         && (from.friction_coefficient - to.friction_coefficient).abs() <= settings.dead_band_friction
+}
+
+/// Whether two points are the same to the last bit.
+fn same(a: &OperatingPoint, b: &OperatingPoint) -> bool {
+    let bits = |p: &OperatingPoint| [p.normal_load_n, p.disc_speed_rad_s, p.friction_coefficient].map(f64::to_bits);
+    bits(a) == bits(b)
 }
 
 fn check_limits(point: &OperatingPoint, limits: &Limits) -> Result<(), String> {

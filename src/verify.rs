@@ -2,11 +2,13 @@
 //!
 //! Exactly the inputs that were predicted are predicted again, in the recorded order, with the recorded session events
 //! between them; stability maps and ends of windows are computed anew at the load and speed their events name.
-//! Sensitivities are left out: nothing depends on them.
+//! Sensitivities are left out: nothing depends on them. Dense spectra of inputs to come are solved side by side, ahead of the
+//! session ([`crate::ahead`]).
 
 use std::collections::{HashSet, VecDeque};
 use std::sync::Arc;
 
+use crate::ahead::Ahead;
 use crate::io::chart_file::ChartFile;
 use crate::io::message::Payload;
 use crate::io::recording::{Recorded, Recording, RecordingError};
@@ -101,12 +103,21 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, Ver
         let effects = session.step(event).unwrap_or_default();
         computed.extend(effects.publish.cloned());
     };
+    let predicted = recording.messages().filter_map(|entry| match entry.message {
+        Recorded::Known(Payload::OperatingPoint(input)) => {
+            answered.contains(&(input.header.stamp, input.seq)).then(|| input.point())
+        }
+        _ => None,
+    });
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut ahead = Ahead::new(predicted, &rig.model, threads);
     for entry in recording.messages() {
         match entry.message {
             Recorded::Known(Payload::OperatingPoint(input)) => {
                 found.inputs += 1;
                 if answered.contains(&(input.header.stamp, input.seq)) {
                     found.predicted += 1;
+                    ahead.step(&mut session, &rig.model);
                     step(&mut session, &mut computed, Event::Input(input));
                 }
             }

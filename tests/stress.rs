@@ -2,7 +2,8 @@
 
 use faer::{Mat, c64};
 use proptest::prelude::*;
-use squealcast::physics::stress::{Checked, cases};
+use squealcast::physics::stress::{Checked, cases, follow, scan};
+use squealcast::physics::synthetic::{Synthetic, rig};
 use squealcast::physics::{ContactLaw, Law, Model, OperatingPoint, Solver, Term, Vectors};
 
 #[test]
@@ -20,12 +21,40 @@ fn every_extreme_comes_out_as_it_should() {
 /// The paper's nine-degree-of-freedom models, friction coefficients 0 to 20.
 #[cfg(feature = "node")]
 #[test]
-fn every_window_of_the_nine_dof_models_is_found() {
+fn every_window_of_the_nine_dof_models_is_found_and_no_mode_changes_its_name() {
     for name in ["nine-dof", "nine-dof-case-2"] {
         let rig = squealcast::rig::Rig::load(name).expect("it is embedded");
-        let said = squealcast::physics::stress::scan(&rig.model, &rig.reference, 20.0, 100_000);
-        eprintln!("{name}: {}", said.unwrap_or_else(|said| panic!("{name}: {said}")));
+        scan_and_follow(name, &rig.model, &rig.reference, 20.0, 2000);
     }
+}
+
+/// A synthetic rig of a tribometer's structure that squeals, half of its modes the pad's.
+fn synthetic(modes: usize, pairs: usize, seed: u64) -> Model {
+    let contact_law = ContactLaw::default();
+    rig(&Synthetic { modes, pairs, damping_ratio: 0.0, contact_law, seed }).expect("the rig is well formed")
+}
+
+const AT: OperatingPoint = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.0 };
+
+fn scan_and_follow(name: &str, model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) {
+    let said = scan(model, at, mu_max, 100_000).and_then(|windows| Ok((windows, follow(model, at, mu_max, steps)?)));
+    let (windows, modes) = said.unwrap_or_else(|said| panic!("{name}: {said}"));
+    eprintln!("{name}: {windows}; {modes}");
+}
+
+#[test]
+fn no_mode_of_40_changes_its_name() {
+    let said = follow(&synthetic(40, 48, 7), &AT, 1.0, 500);
+    eprintln!("{}", said.unwrap_or_else(|said| panic!("{said}")));
+}
+
+/// 80 modes of the pad and 80 of the disc, 100 000 friction coefficients from 0 to 1: ten minutes.
+#[test]
+fn every_window_of_an_80_80_rig_is_found_and_no_mode_changes_its_name() {
+    if std::env::var_os("SQUEALCAST_MEASURE").is_none() {
+        return eprintln!("skipped: takes ten minutes, with SQUEALCAST_MEASURE=1");
+    }
+    scan_and_follow("synthetic, 80 + 80", &synthetic(160, 294, 1), &AT, 1.0, 500);
 }
 
 /// `Σ zᵢ^m = tr(A^m)` for `m` up to the dimension determines every eigenvalue (Newton's identities), and powers of a matrix need no

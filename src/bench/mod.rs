@@ -82,8 +82,11 @@ pub struct Offline {
     pub modes: usize,
     /// Of the rig.
     pub seed: u64,
-    /// None: no condition is near a merging point.
+    /// Where pairs merge in friction, or growth rates pass zero where there is damping; and conditions within 1e-6 of one.
     pub merging_points: usize,
+    pub near_merging: usize,
+    /// Modes that nothing couples, which every dense solve does without.
+    pub decoupled_modes: usize,
     pub map_s: f64,
     pub chart_s: f64,
     /// False where the chart took longer than it was given.
@@ -112,6 +115,8 @@ pub struct HeldOut {
     pub incomplete: usize,
     /// Roots off by more than the bounds of both.
     pub bounds_broken: usize,
+    /// The largest error as a share of its bound.
+    pub largest_share: f64,
     /// Relative error of `λ²` outside merging points, and of the mean of merging pairs.
     pub largest_error: f64,
     pub largest_pair_mean_error: f64,
@@ -291,6 +296,7 @@ pub fn measure(
                 not_converged: found.not_converged,
                 incomplete: found.incomplete,
                 bounds_broken: found.violations,
+                largest_share: found.largest_share,
                 largest_error: found.largest_error,
                 largest_pair_mean_error: found.largest_mean_error,
             })
@@ -391,6 +397,8 @@ pub fn measure(
         modes,
         seed,
         merging_points: merging.len(),
+        near_merging: if merging.is_empty() { 0 } else { points.len() / 10 },
+        decoupled_modes: model.decoupled_count(),
         map_s,
         chart_s,
         chart_built: chart.is_some(),
@@ -429,7 +437,7 @@ fn chart_options(plan: &Plan) -> ChartOptions {
 fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str)) -> anyhow::Result<Option<Chart>> {
     let begun = Instant::now();
     let go_on = |done: f64| {
-        say(&format!("chart {:.0} %", 100.0 * done));
+        say(&format!("chart {:.0} %", 100.0 * done.max(0.0)));
         begun.elapsed() < plan.chart_limit
     };
     match build(model, options, &go_on) {

@@ -183,9 +183,13 @@ fn table(report: &Report) -> String {
     let _ =
         writeln!(text, "\nerrors: relative, of the squared eigenvalue; pairs near merging by mean and discriminant");
     for offline in &report.offline {
-        let Offline { modes, seed, merging_points, map_s, chart_s, chart_solves, chart_leaves, chart_bytes, .. } =
-            offline;
-        let _ = write!(text, "n = {modes}, seed {seed}: {merging_points} merging points mapped in {map_s:.1} s; ");
+        let Offline { modes, seed, merging_points, near_merging, decoupled_modes, .. } = offline;
+        let Offline { map_s, chart_s, chart_solves, chart_leaves, chart_bytes, .. } = offline;
+        let _ = write!(
+            text,
+            "n = {modes}, seed {seed}: {merging_points} merging points mapped in {map_s:.1} s, {near_merging} of {} conditions within 1e-6 of one; {decoupled_modes} decoupled modes left out; ",
+            offline.conditions
+        );
         let _ = if offline.chart_built {
             writeln!(
                 text,
@@ -198,11 +202,11 @@ fn table(report: &Report) -> String {
         let (pairs, lost) = (offline.pairs_compared, offline.not_refined);
         let _ = writeln!(text, "         {pairs} merging pairs compared, {lost} roots without a reference");
         if let Some(held_out) = &offline.held_out {
-            let HeldOut { charted, not_converged, incomplete, bounds_broken, largest_error, largest_pair_mean_error } =
-                held_out;
+            let HeldOut { charted, not_converged, incomplete, bounds_broken, .. } = held_out;
+            let HeldOut { largest_share, largest_error, largest_pair_mean_error, .. } = held_out;
             let _ = writeln!(
                 text,
-                "         held out: {charted} conditions charted, {not_converged} dense; {bounds_broken} bounds broken, {incomplete} incomplete; largest error {largest_error:.1e}, of pair means {largest_pair_mean_error:.1e}"
+                "         held out: {charted} conditions charted, {not_converged} dense; {bounds_broken} bounds broken, errors up to {largest_share:.2} of them, {incomplete} incomplete; largest error {largest_error:.1e}, of pair means {largest_pair_mean_error:.1e}"
             );
         }
     }

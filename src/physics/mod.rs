@@ -27,7 +27,7 @@ pub use chart::{Chart, NotCharted};
 pub use critical::{Window, WindowKind};
 pub use ends::{Bounded, End, Ends};
 pub use flexible_contact::ResidualFlexibility;
-pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Parameter, Term, Traces};
+pub use model::{ContactLaw, ContactPairs, CustomLaw, Exact, Law, Model, ModelError, Parameter, Term, Traces};
 pub use operating_point::{ContactState, OperatingPoint};
 pub use solver::Solver;
 pub use spectrum::{Root, RootError, SolveError, Spectrum, Vectors};

@@ -580,6 +580,19 @@ pub struct Traces {
     /// `tr(A B)` for every pair of terms, of the stiffness and of the damping.
     stiffness_products: Mat<f64>,
     damping_products: Mat<f64>,
+    /// `tr(Aᵀ B)`, likewise.
+    stiffness_norms: Mat<f64>,
+    damping_norms: Mat<f64>,
+}
+
+/// What is known of the roots and the matrices at an operating point without solving anything.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Exact {
+    /// Sums over the roots, first and second power: of `λ²` where no damping takes part, `-tr K` and `tr K²`; else of `λ`,
+    /// conjugates and static roots included, `-tr C` and `tr C² - 2 tr K`.
+    pub powers: [f64; 2],
+    /// Frobenius norms of `I`, `C` and `K`.
+    pub norms: [f64; 3],
 }
 
 impl Traces {
@@ -590,20 +603,24 @@ impl Traces {
             (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(j, i)] * b[(i, j)]).sum::<f64>()).sum()
         };
         let all = |terms: &[KnownTerm]| terms.iter().map(|k| trace(&k.term.matrix)).collect::<Vec<f64>>();
-        let products = |terms: &[KnownTerm]| {
-            Mat::from_fn(terms.len(), terms.len(), |i, j| product(&terms[i].term.matrix, &terms[j].term.matrix))
+        let inner = |a: &Mat<f64>, b: &Mat<f64>| -> f64 {
+            (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(i, j)] * b[(i, j)]).sum::<f64>()).sum()
+        };
+        let pairs = |terms: &[KnownTerm], of: &dyn Fn(&Mat<f64>, &Mat<f64>) -> f64| {
+            Mat::from_fn(terms.len(), terms.len(), |i, j| of(&terms[i].term.matrix, &terms[j].term.matrix))
         };
         Self {
             stiffness: all(&model.stiffness),
             damping: all(&model.damping),
-            stiffness_products: products(&model.stiffness),
-            damping_products: products(&model.damping),
+            stiffness_products: pairs(&model.stiffness, &product),
+            damping_products: pairs(&model.damping, &product),
+            stiffness_norms: pairs(&model.stiffness, &inner),
+            damping_norms: pairs(&model.damping, &inner),
         }
     }
 
-    /// Sums over the roots at `p`, first and second power: of `λ²` where no damping takes part, `-tr K` and `tr K²`;
-    /// else of `λ`, conjugates and static roots included, `-tr C` and `tr C² - 2 tr K`.
-    pub fn at(&self, model: &Model, p: &OperatingPoint) -> [f64; 2] {
+    /// What they say at `p`.
+    pub fn at(&self, model: &Model, p: &OperatingPoint) -> Exact {
         let weighted = |terms: &[KnownTerm], traces: &[f64]| -> f64 {
             terms.iter().zip(traces).map(|(known, trace)| model.coefficient(&known.term.law, p) * trace).sum()
         };
@@ -612,12 +629,20 @@ impl Traces {
             let row = |i: usize| (0..terms.len()).map(|j| weight(j) * products[(i, j)]).sum::<f64>();
             (0..terms.len()).map(|i| weight(i) * row(i)).sum()
         };
+        let norm = |terms: &[KnownTerm], norms: &Mat<f64>| squared(terms, norms).max(0.0).sqrt();
         let trace_k = weighted(&model.stiffness, &self.stiffness);
-        if !model.is_damped(p) {
-            return [-trace_k, squared(&model.stiffness, &self.stiffness_products)];
-        }
-        let trace_c = weighted(&model.damping, &self.damping);
-        [-trace_c, squared(&model.damping, &self.damping_products) - 2.0 * trace_k]
+        let powers = if model.is_damped(p) {
+            let trace_c = weighted(&model.damping, &self.damping);
+            [-trace_c, squared(&model.damping, &self.damping_products) - 2.0 * trace_k]
+        } else {
+            [-trace_k, squared(&model.stiffness, &self.stiffness_products)]
+        };
+        let norms = [
+            (model.dimension as f64).sqrt(),
+            norm(&model.damping, &self.damping_norms),
+            norm(&model.stiffness, &self.stiffness_norms),
+        ];
+        Exact { powers, norms }
     }
 }
 

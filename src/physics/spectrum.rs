@@ -12,9 +12,11 @@ pub struct Root {
     pub lambda: c64,
     /// `λ²`, 1/s²: analytic in the operating point where `λ` itself is not.
     pub square: c64,
-    /// `‖(λ²I + λC + K)x‖ / ((|λ|²‖I‖ + |λ|‖C‖ + ‖K‖)‖x‖)`, Frobenius norms.
+    /// `‖(λ²I + λC + K)x‖ / ((|λ|²‖I‖ + |λ|‖C‖ + ‖K‖)‖x‖)`, Frobenius norms; of a charted root, whose shape is not known, a bound
+    /// of the residual with the exact shape.
     pub residual: f64,
-    /// The pad's share of `Σ|q|²`, 0 to 1; NaN where pad and disc are not told apart.
+    /// The pad's share of `Σ|q|²`, 0 to 1; NaN where pad and disc are not told apart, or on a chart where the root belongs to a
+    /// cluster: shares are no analytic functions where roots merge, and neither are means of them.
     pub pad_participation: f64,
     /// Bounds of what rounding can have done to it; NaN unless asked for.
     pub error: RootError,
@@ -72,6 +74,14 @@ impl Root {
         // Adding zero turns the -0 of an undamped mode into 0.
         let size = magnitude(self.lambda);
         if size > 0.0 { -self.lambda.re / size + 0.0 } else { 0.0 }
+    }
+
+    /// Bound of its residual with the exact shape `x̂` of the root `λ̂` it stands for, from the bounds of its error and the Frobenius
+    /// `norms` of `I`, `C` and `K`: `(λ² - λ̂²) x̂ + (λ - λ̂) C x̂` is what is left there.
+    pub fn residual_bound(&self, norms: [f64; 3]) -> f64 {
+        let [unit, damping, stiffness] = norms;
+        let size = magnitude(self.lambda);
+        (self.error.square + self.error.omega * damping) / (size * size * unit + size * damping + stiffness)
     }
 
     /// Whether it grows: `σ > threshold · |λ|`. At the origin, within rounding, nothing grows.

@@ -25,8 +25,9 @@ use super::operating_point::OperatingPoint;
 use super::reference::{self, MAX_TOGETHER};
 use super::solver::Solver;
 use super::spectrum::{Spectrum, Vectors};
-use super::stability_map::{MapOptions, StabilityMap};
+use super::stability_map::{MapOptions, StabilityMap, mirror};
 use super::synthetic::{Synthetic, Uniform, rig};
+use super::tracking::tracked;
 
 /// One extreme.
 pub struct Case {
@@ -421,8 +422,12 @@ fn scanned() -> Result<String, String> {
     scan(&model, &REFERENCE, 2.0, 100_000)
 }
 
-/// Every one of `points` friction coefficients up to `mu_max` at which something grows must lie in a window of the map, and well
-/// inside a window something must grow.
+/// Ends of windows by the map and by bisection of a scan agree to this, relative.
+const ENDS_AGREE: f64 = 1e-10;
+
+/// `points` friction coefficients up to `mu_max`, solved without the map: each at which something grows must lie in a window of it,
+/// well inside a window something must grow, and where the number of growing roots changes from one to the next, bisected, an end
+/// of a window must be.
 ///
 /// # Errors
 /// The first point that disagrees.
@@ -430,10 +435,13 @@ pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> R
     let mut solver = Solver::new(model.dimension());
     let options = MapOptions { mu_min: 0.0, mu_max, band_max_hz: None, instability_threshold: 1e-6, windows: true };
     let map = StabilityMap::build(model, &mut solver, at, &options).map_err(text)?;
-    let mut growing = 0;
+    let ends: Vec<f64> = map.windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten().collect();
+    let mut solve = |mu: f64| solver.solve(model, &at.with_friction(mu), Vectors::None).map_err(text);
+    let (mut growing, mut bisected, mut off) = (0, 0, 0.0f64);
+    let mut before = None;
     for k in 0..points {
         let mu = mu_max * (k as f64 + 0.5) / points as f64;
-        let spectrum = solver.solve(model, &at.with_friction(mu), Vectors::None).map_err(text)?;
+        let spectrum = solve(mu)?;
         let grows = |threshold: f64| spectrum.roots.iter().any(|root| root.is_unstable(threshold));
         let inside =
             |slack: f64| map.windows.iter().any(|w| mu > w.mu_from + slack && w.mu_to.is_none_or(|to| mu < to - slack));
@@ -444,6 +452,138 @@ pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> R
             return Err(format!("{mu} does not grow in {:?}", map.windows));
         }
         growing += usize::from(grows(1e-6));
+        let count = growing_roots(&spectrum);
+        if let Some((left, below)) = before.replace((mu, count)).filter(|(_, below)| *below != count) {
+            let end = change((left, below), mu, |mu| Ok(growing_roots(&solve(mu)?)))?;
+            let nearest = ends.iter().map(|other| (other - end).abs()).fold(f64::INFINITY, f64::min);
+            if nearest > ENDS_AGREE * end {
+                return Err(format!("{below} roots grow below {end}, {count} above; no window ends there: {ends:?}"));
+            }
+            bisected += 1;
+            off = off.max(nearest / end);
+        }
     }
-    Ok(format!("{} windows, {growing} of {points} points grow, all of them inside", map.windows.len()))
+    Ok(format!(
+        "{} windows, {growing} of {points} points grow, all of them inside; {bisected} ends within {off:.1e} of bisected ones",
+        map.windows.len()
+    ))
+}
+
+/// How many roots grow, for bisection. Of an undamped pair `σ/|λ|` rises like a square root from rounding, which takes half the
+/// digits: 1e-7 is above it, and reached within 1e-14 of `(λ₁² - λ₂²)²`, relative, from the merging point.
+fn growing_roots(spectrum: &Spectrum) -> usize {
+    let threshold = if spectrum.undamped { 1e-7 } else { 0.0 };
+    spectrum.roots.iter().filter(|root| root.is_unstable(threshold)).count()
+}
+
+/// Where a count that is `below` at `left` and another at `right` changes, by bisection to the last digit.
+fn change(
+    (mut left, below): (f64, usize),
+    mut right: f64,
+    mut count: impl FnMut(f64) -> Result<usize, String>,
+) -> Result<f64, String> {
+    loop {
+        let middle = 0.5 * (left + right);
+        if middle <= left || middle >= right || right - left <= 1e-15 * right {
+            return Ok(right);
+        }
+        if count(middle)? == below { left = middle } else { right = middle }
+    }
+}
+
+/// Friction coefficients between two neighbouring ones are halved at most this often to see which mode becomes which.
+const HALVED: usize = 24;
+
+/// Follows the modes of an undamped or damped rig from 0 to `mu_max` in `steps` steps by the overlap of their shapes alone, in as
+/// small parts of a step as that takes, and compares with the identities of the map: two modes that change places are a swap.
+/// Through a merging point a pair keeps its two identities, whichever of them goes to which. How many modes were compared.
+///
+/// # Errors
+/// The first swap, or a step whose shapes cannot be told apart.
+pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> Result<String, String> {
+    let mut solver = Solver::new(model.dimension());
+    let options = MapOptions { mu_min: 0.0, mu_max, band_max_hz: None, instability_threshold: 1e-6, windows: true };
+    let map = StabilityMap::build(model, &mut solver, at, &options).map_err(text)?;
+    let mut solve = |mu: f64| solver.solve(model, &at.with_friction(mu), Vectors::Right).map_err(text);
+    let mut here = solve(0.0)?;
+    let mut ids: Vec<u32> =
+        map.identify(&here).into_iter().take(tracked(&here)).map(Option::unwrap_or_default).collect();
+    let (mut compared, mut halvings) = (0, 0);
+    for step in 1..=steps {
+        let target = mu_max * step as f64 / steps as f64;
+        while here.point.friction_coefficient < target {
+            let mut to = target;
+            let (next, carried) = loop {
+                let next = solve(to)?;
+                if let Some(carried) = carried(&here, &ids, &next) {
+                    break (next, carried);
+                }
+                halvings += 1;
+                let from = here.point.friction_coefficient;
+                to = 0.5 * (from + to);
+                if to - from <= (target - from).max(mu_max / steps as f64) * 0.5f64.powi(HALVED as i32) {
+                    return Err(format!("{from}: shapes cannot be followed"));
+                }
+            };
+            (here, ids) = (next, carried);
+        }
+        let found = map.identify(&here);
+        for k in 0..ids.len() {
+            let partner = mirror(&here, k);
+            let same = |j: usize| found[k] == Some(ids[j]);
+            if !same(k) && !partner.is_some_and(same) {
+                // Two that have parted again.
+                let other = (0..ids.len()).find(|&j| same(j));
+                let swapped = other.is_none_or(|j| found[j] != Some(ids[k]) || !was_pair(&map, ids[k], ids[j], target));
+                if swapped {
+                    let hz = here.roots[k].frequency_hz();
+                    return Err(format!("{target}: mode {} at {hz} Hz is called {:?}", ids[k], found[k]));
+                }
+            }
+            compared += 1;
+        }
+        // Within a pair the map's word is taken from here on.
+        ids = found.into_iter().take(ids.len()).map(Option::unwrap_or_default).collect();
+    }
+    Ok(format!("{compared} modes at {steps} steps, {halvings} of them halved, no swap"))
+}
+
+/// Identities of `next` by the overlap of its shapes with those of `here`; `None` unless each shape has one counterpart that is
+/// clearly its own, or is one of two that merge or part, whose shapes are nearly one: these keep the order of their frequencies.
+fn carried(here: &Spectrum, ids: &[u32], next: &Spectrum) -> Option<Vec<u32>> {
+    let count = tracked(next);
+    if count != ids.len() {
+        return None;
+    }
+    let overlap = here.shapes.get(.., ..count).adjoint() * next.shapes.get(.., ..count);
+    let mut of: Vec<Option<u32>> = vec![None; count];
+    let mut taken = vec![false; count];
+    for j in 0..count {
+        let mut best: Vec<usize> = (0..count).collect();
+        best.sort_by(|&a, &b| overlap[(b, j)].norm().total_cmp(&overlap[(a, j)].norm()));
+        let [first, second] = [best[0], *best.get(1)?].map(|k| overlap[(k, j)].norm_sqr());
+        // Shapes need not be orthogonal: how far it has moved is held against how far the next one is.
+        let clear = 1.0 - first < 0.1 * (1.0 - second);
+        let merging = mirror(next, j).is_some() || nearly_merged(here, best[0], best[1]);
+        if !(clear || merging && first > 0.9) {
+            return None;
+        }
+        best.truncate(if clear { 1 } else { 2 });
+        best.sort_unstable(); // as roots are: by frequency
+        let source = best.into_iter().find(|&k| !taken[k])?;
+        taken[source] = true;
+        of[j] = Some(ids[source]);
+    }
+    of.into_iter().collect()
+}
+
+/// Whether two roots are so close that their shapes cannot be told apart.
+fn nearly_merged(spectrum: &Spectrum, a: usize, b: usize) -> bool {
+    let (a, b) = (spectrum.roots[a].square, spectrum.roots[b].square);
+    (a - b).norm() < 1e-2 * a.norm()
+}
+
+/// Whether the map knows two identities to have merged below `mu`.
+fn was_pair(map: &StabilityMap, a: u32, b: u32, mu: f64) -> bool {
+    map.windows.iter().any(|w| w.mu_from <= mu && w.mode_ids.contains(&a) && w.mode_ids.contains(&b))
 }

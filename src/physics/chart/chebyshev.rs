@@ -172,8 +172,9 @@ pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
 pub struct Fitted {
     /// Coefficients of the basis.
     pub coefficients: Vec<f64>,
-    /// What the expansion leaves out, estimated: the largest misfit of a value, and what the highest total degree amounts to
-    /// at most, over the points.
+    /// What the expansion leaves out, estimated: the largest misfit of a value, or of a slope as it is weighted, and what the
+    /// highest total degree amounts to at most, over the points. A slope in `θ` over the degree is as large as the value that
+    /// is left out, and tells of it where the value happens to be met.
     pub missing: f64,
     /// The axis along which it converges worst.
     pub worst_axis: usize,
@@ -234,8 +235,8 @@ impl Fit {
         let values = || (0..data.nrows()).step_by(1 + self.basis.axes);
         (0..data.ncols())
             .map(|column| {
-                let misfit =
-                    values().map(|row| (fitted[(row, column)] - data[(row, column)]).abs()).fold(0.0, f64::max);
+                let off = |row: usize| (fitted[(row, column)] - data[(row, column)]).abs();
+                let misfit = (0..data.nrows()).map(off).fold(0.0, f64::max);
                 let tail = values().map(|row| last[(row, column)].abs()).fold(0.0, f64::max);
                 let coefficients: Vec<f64> = (0..self.basis.len()).map(|row| coefficients[(row, column)]).collect();
                 // NaN, of data that are not numbers, must not be lost in a maximum.

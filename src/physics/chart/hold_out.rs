@@ -24,6 +24,8 @@ pub struct HoldOut {
     pub incomplete: usize,
     /// Roots that differ from dense ones by more than the bounds of both.
     pub violations: usize,
+    /// The largest difference from a dense root, as a share of the bounds of both.
+    pub largest_share: f64,
     /// Largest relative error of `λ²` outside merging points: neighbours closer than `MERGING`, relative.
     pub largest_error: f64,
     /// The 99th percentile of those.
@@ -86,12 +88,13 @@ impl HoldOut {
         let partners = partners(modes, spectrum);
         let mut charted: Vec<Option<c64>> = vec![None; dense.len()];
         for (mode, partner) in modes.iter().zip(&partners) {
-            let Some((k, within)) = *partner else {
+            let Some((k, share)) = *partner else {
                 self.violations += 1;
                 continue;
             };
             charted[k] = Some(mode.root.square);
-            self.violations += usize::from(!within);
+            self.violations += usize::from(!within(share));
+            self.largest_share = self.largest_share.max(share);
         }
         for (mode, partner) in modes.iter().zip(&partners) {
             let Some((k, _)) = *partner else { continue };
@@ -114,8 +117,8 @@ impl HoldOut {
     }
 }
 
-/// The dense root nearest to each charted one, each taken once, and whether it lies within the bounds of both.
-fn partners(modes: &[Mode], spectrum: &Spectrum) -> Vec<Option<(usize, bool)>> {
+/// The dense root nearest to each charted one, each taken once, and how far off it is as a share of the bounds of both.
+fn partners(modes: &[Mode], spectrum: &Spectrum) -> Vec<Option<(usize, f64)>> {
     let rounding = ROUNDING * f64::EPSILON * spectrum.matrix_norm;
     let mut left: Vec<usize> = (0..tracked(spectrum)).collect();
     let partner = |mode: &Mode| {
@@ -126,12 +129,17 @@ fn partners(modes: &[Mode], spectrum: &Spectrum) -> Vec<Option<(usize, bool)>> {
         let dense = spectrum.roots[nearest].error.square;
         let slack = if spectrum.undamped { rounding } else { 2.0 * root.lambda.norm() * rounding };
         let limit = root.error.square + if dense.is_finite() { dense } else { slack };
-        Some((nearest, off(nearest) <= limit))
+        Some((nearest, if off(nearest) == 0.0 { 0.0 } else { off(nearest) / limit }))
     };
     modes.iter().map(partner).collect()
 }
 
+/// Whether a share is that of an error within its bound; NaN is none.
+fn within(share: f64) -> bool {
+    share <= 1.0
+}
+
 /// Whether every charted root has a dense root within the bounds of both, each dense root taken once.
 pub(super) fn within_bounds(modes: &[Mode], spectrum: &Spectrum) -> bool {
-    partners(modes, spectrum).iter().all(|partner| partner.is_some_and(|(_, within)| within))
+    partners(modes, spectrum).iter().all(|partner| partner.is_some_and(|(_, share)| within(share)))
 }

@@ -183,8 +183,8 @@ impl Builder<'_> {
         for (node, sample) in branches.samples.iter().enumerate() {
             let row = node * (1 + axes);
             for k in 0..2 {
-                largest[k] = largest[k].max(sample.totals[k].abs());
-                rest[(row, k)] = sample.totals[k];
+                largest[k] = largest[k].max(sample.totals.powers[k].abs());
+                rest[(row, k)] = sample.totals.powers[k];
                 for axis in 0..axes {
                     rest[(row + 1 + axis, k)] = sample.total_slopes[axis][k] * branches.half[axis];
                 }

@@ -17,6 +17,7 @@ mod words;
 
 use faer::c64;
 
+use super::model::Exact;
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, magnitude, square_root};
 use super::summary::Mode;
@@ -64,7 +65,6 @@ impl Axis {
         match self {
             Self::Friction => coordinate,
             Self::Load => coordinate.exp(),
-            // At a given load, evenly spread speeds.
             Self::Speed | Self::LoadOverSpeed => -1.0 / coordinate,
         }
     }
@@ -174,7 +174,8 @@ impl Chart {
         self.leaves.iter().map(|leaf| 8 * numbers(leaf)).sum()
     }
 
-    /// Share of the conditions, evenly spread over friction coefficient, load and speed, that have no leaf.
+    /// Share of the conditions, evenly spread over friction coefficient, load and speed, that have no leaf; where load and speed
+    /// matter by their ratio alone, evenly spread over the speeds at any one load.
     pub fn dense_share(&self) -> f64 {
         1.0 - self.leaves.iter().map(|leaf| self.share(&leaf.low, &leaf.high)).sum::<f64>()
     }
@@ -225,15 +226,15 @@ impl Chart {
         !self.branches.iter().any(|branch| matches!(branch, Branch::Pending))
     }
 
-    /// The charted roots at `p`, appended to `out` in no particular order, without residuals, with shares of the
-    /// pad where they are charted, and checked against `traces` (see [`Traces`](super::Traces)).
+    /// The charted roots at `p`, appended to `out` in no particular order, with bounds of their residuals, with shares of the
+    /// pad where they are charted, and checked against what is `known` there (see [`Traces`](super::Traces)).
     ///
     /// # Errors
     /// [`NotCharted`]; `out` is then as it was.
     pub fn evaluate(
         &self,
         p: &OperatingPoint,
-        traces: [f64; 2],
+        known: Exact,
         scratch: &mut Scratch,
         out: &mut Vec<Mode>,
     ) -> Result<(), NotCharted> {
@@ -252,6 +253,7 @@ impl Chart {
             let gap = if size == 2 { magnitude(roots[0].0 - roots[1].0) } else { f64::INFINITY };
             for (&id, &(z, error)) in cluster.ids.iter().zip(&roots[..size]) {
                 let mut root = self.charted(z, error, size <= 2 && z.im == 0.0 && 2.0 * error < gap);
+                root.residual = root.residual_bound(known.norms);
                 root.pad_participation = cluster.share.map_or(f64::NAN, |share| beside[share].clamp(0.0, 1.0));
                 let weight = if self.undamped { 1.0 } else { 2.0 };
                 found[0] += weight * z.re;
@@ -263,7 +265,7 @@ impl Chart {
         }
         for moment in 0..2 {
             let rest = beside[moment];
-            let difference = (found[moment] + rest - traces[moment]).abs();
+            let difference = (found[moment] + rest - known.powers[moment]).abs();
             let limit = limit[moment] + leaf.remainder_errors[moment];
             if difference.is_nan() || difference > limit {
                 out.truncate(before);

@@ -3,7 +3,7 @@
 use faer::{Mat, c64};
 
 use super::{Axis, MAX_AXES};
-use crate::physics::model::{Model, Traces};
+use crate::physics::model::{Exact, Model, Traces};
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::{ROUNDING, Solver};
 use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
@@ -26,8 +26,8 @@ pub struct Sample {
     pub slopes: Vec<[c64; MAX_AXES]>,
     /// Their condition numbers.
     pub conditions: Vec<f64>,
-    /// The sums of first and second powers of all roots, and their slopes.
-    pub totals: [f64; 2],
+    /// The sums of first and second powers of all roots and what else is known exactly; the slopes of the sums.
+    pub totals: Exact,
     pub total_slopes: [[f64; 2]; MAX_AXES],
     /// What rounding can do to a well-conditioned root.
     pub rounding: f64,
@@ -87,7 +87,7 @@ impl Sampler<'_> {
             let (below, above) = (self.point(&below), self.point(&above));
             let changes = self.model.assemble_difference(&below, &above, per, &mut stiffness, &mut damping)?;
             let (before, after) = (self.traces.at(self.model, &below), self.traces.at(self.model, &above));
-            total_slopes[axis] = [0, 1].map(|k| (after[k] - before[k]) * per);
+            total_slopes[axis] = [0, 1].map(|k| (after.powers[k] - before.powers[k]) * per);
             for (matrix, is_damping) in [(&stiffness, false), (&damping, true)] {
                 if !changes[usize::from(is_damping)] {
                     continue;
@@ -147,16 +147,16 @@ impl Sampler<'_> {
 }
 
 /// `count` points of `[-1, 1]^axes`, far from each other and from `taken` in the angles `θ`, `x = cos θ`: there the points
-/// that serve polynomials are evenly spread.
+/// that serve polynomials are evenly spread. Corners are among them: there an expansion is farthest from what it was fitted to,
+/// and what it leaves out is largest.
 pub fn spread(axes: usize, taken: &[[f64; MAX_AXES]], count: usize) -> Vec<[f64; MAX_AXES]> {
     let angle = |unit: f64| unit.clamp(-1.0, 1.0).acos();
-    let candidates: Vec<[f64; MAX_AXES]> = (1..=16 * count.max(8))
-        .map(|index| {
-            std::array::from_fn(|k| {
-                if k < axes { std::f64::consts::PI * radical_inverse(index, [2, 3, 5][k]) } else { 0.0 }
-            })
-        })
-        .collect();
+    let pi = std::f64::consts::PI;
+    let corner = |bits: usize| std::array::from_fn(|k| if bits >> k & 1 == 1 { pi } else { 0.0 });
+    let inside =
+        |index: usize| std::array::from_fn(|k| if k < axes { pi * radical_inverse(index, [2, 3, 5][k]) } else { 0.0 });
+    let candidates: Vec<[f64; MAX_AXES]> =
+        (0..1 << axes).map(corner).chain((1..=16 * count.max(8)).map(inside)).collect();
     let distance = |a: &[f64; MAX_AXES], b: &[f64; MAX_AXES]| (0..axes).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>();
     let mut nearest: Vec<f64> = candidates
         .iter()
