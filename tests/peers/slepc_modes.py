@@ -2,7 +2,8 @@
 
 FOLDER holds compressed rows of both symmetric matrices as raw little-endian arrays: K.starts, K.rows (32 bits), K.values
 (64 bits) and M likewise. Prints JSON: seconds from matrices to modes, largest memory, squares ascending.
-Needs Debian's python3-slepc4py (written against 3.18).
+Needs Debian's python3-slepc4py (written against 3.18); where Python does not find it, PYTHONPATH names the dist-packages
+below /usr/lib/petscdir and /usr/lib/slepcdir.
 """
 
 import json
