@@ -318,10 +318,13 @@ fn may_diverge<'a>(spectra: impl Iterator<Item = &'a Spectrum>) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use faer::Mat;
+
     use super::*;
     use crate::physics::chart::hold_out::{HoldOut, hold_out};
-    use crate::physics::model::ContactLaw;
-    use crate::physics::synthetic::{Synthetic, rig};
+    use crate::physics::model::{ContactLaw, Law, Term};
+    use crate::physics::spectrum::Vectors;
+    use crate::physics::synthetic::{Synthetic, Uniform, rig};
     use crate::physics::test_models::nine_dof;
 
     fn options(low: (f64, f64, f64), high: (f64, f64, f64), band_max_hz: Option<f64>) -> ChartOptions {
@@ -369,6 +372,44 @@ mod tests {
             let options = options((0.0, 50.0, 1.0), (1.0, 2000.0, 60.0), Some(5000.0));
             let found = held_out(&model, &options, 300);
             assert!(found.charted > 290, "{modes} modes: {found:?}");
+        }
+    }
+
+    /// Static divergence: an undamped root is charted through `λ² = 0`; static roots of a damped model are not charted, and where
+    /// one grows no chart answers.
+    #[test]
+    fn static_roots() {
+        for damping in [0.0, 0.02] {
+            let mut uniform = Uniform::new(8);
+            let mut random = Mat::from_fn(6, 6, |_, _| 0.1 * uniform.draw());
+            random[(0, 0)] = -1.5;
+            let term = |matrix, law| Term { matrix, law };
+            let free = Mat::from_fn(6, 6, |i, j| if i == j { 1.0 + 1.3 * i as f64 } else { 0.0 });
+            let stiffness = vec![term(free, Law::Constant), term(random, Law::FrictionStiffness)];
+            let damping_term = term(Mat::<f64>::identity(6, 6) * faer::Scale(damping), Law::Constant);
+            let model = Model::new(6, stiffness, vec![damping_term], ContactLaw::default(), None).unwrap();
+            let options = options((0.0, 500.0, 13.0), (1.5, 501.0, 14.0), None);
+            let chart = build(&model, &options, &|_| true).expect("the chart can be built");
+            let (traces, mut solver) = (Traces::new(&model), Solver::new(6));
+            let (mut scratch, mut modes) = (Scratch::default(), vec![]);
+            let (mut charted, mut growing) = (0, 0);
+            for k in 0..500 {
+                let p = options.low.with_friction(0.003 * f64::from(k) + 0.0005);
+                modes.clear();
+                let dense = solver.solve(&model, &p, Vectors::Both).expect("it solves");
+                let grows = dense.nonoscillatory_growth_per_s().first().is_some_and(|&growth| growth > 0.0);
+                growing += usize::from(grows);
+                if chart.evaluate(&p, traces.at(&model, &p), &mut scratch, &mut modes).is_ok() {
+                    charted += 1;
+                    let found = modes.iter().any(|mode| !mode.root.oscillates() && mode.root.lambda.re > 0.0);
+                    assert_eq!(found, grows, "{p:?}, damping {damping}: {modes:?}");
+                    assert!(!(grows && damping > 0.0), "{p:?}: charted where a static root grows");
+                }
+            }
+            assert!(
+                growing > 100 && charted >= if damping > 0.0 { 200 } else { 490 },
+                "{growing} grow, {charted} charted"
+            );
         }
     }
 

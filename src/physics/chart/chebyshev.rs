@@ -172,9 +172,8 @@ pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
 pub struct Fitted {
     /// Coefficients of the basis.
     pub coefficients: Vec<f64>,
-    /// What the expansion leaves out, estimated: the largest misfit of a value, or of a slope as it is weighted, and what the
-    /// highest total degree amounts to at most, over the points. A slope in `θ` over the degree is as large as the value that
-    /// is left out, and tells of it where the value happens to be met.
+    /// What the expansion leaves out, estimated: the largest misfit of a value, and what the highest total degree amounts to
+    /// at most, over the points, or the one before it: one alone may be small by accident.
     pub missing: f64,
     /// The axis along which it converges worst.
     pub worst_axis: usize,
@@ -229,15 +228,18 @@ impl Fit {
             (0..data.ncols()).for_each(|column| data[(row, column)] *= weight);
         }
         let coefficients = self.qr.solve_lstsq(&data);
-        let highest = self.basis.of_degree(self.basis.degree);
-        let last = self.rows.get(.., highest.clone()) * coefficients.get(highest, ..);
+        let last: Vec<Mat<f64>> = (self.basis.degree.saturating_sub(1)..=self.basis.degree)
+            .map(|degree| self.basis.of_degree(degree))
+            .map(|range| self.rows.get(.., range.clone()) * coefficients.get(range, ..))
+            .collect();
         let fitted = &self.rows * &coefficients;
         let values = || (0..data.nrows()).step_by(1 + self.basis.axes);
         (0..data.ncols())
             .map(|column| {
-                let off = |row: usize| (fitted[(row, column)] - data[(row, column)]).abs();
-                let misfit = (0..data.nrows()).map(off).fold(0.0, f64::max);
-                let tail = values().map(|row| last[(row, column)].abs()).fold(0.0, f64::max);
+                let misfit =
+                    values().map(|row| (fitted[(row, column)] - data[(row, column)]).abs()).fold(0.0, f64::max);
+                let size = |last: &Mat<f64>| values().map(|row| last[(row, column)].abs()).fold(0.0, f64::max);
+                let tail = last.iter().map(size).fold(0.0, f64::max);
                 let coefficients: Vec<f64> = (0..self.basis.len()).map(|row| coefficients[(row, column)]).collect();
                 // NaN, of data that are not numbers, must not be lost in a maximum.
                 let missing = if coefficients[0].is_nan() { f64::NAN } else { misfit + tail };
