@@ -16,7 +16,7 @@ const look = (page) => page.evaluate(() => {
     id: Number(row.querySelector("button").dataset.mode),
     values: [...row.querySelectorAll("data")].map((data) => data.value),
   }));
-  return { seq: document.getElementById("seq").value, numbers: Object.fromEntries(ids.map((id) => [id, value(id)])), modes };
+  return { level: document.getElementById("status").dataset.level, seq: document.getElementById("seq").value, numbers: Object.fromEntries(ids.map((id) => [id, value(id)])), modes };
 });
 const cursor = (page) => page.locator("#map-growth .mu-cursor").evaluate((line) => line.getBoundingClientRect().x);
 
