@@ -152,12 +152,12 @@ fn main() -> anyhow::Result<()> {
         let largest =
             theirs.iter().map(|other| difference(&ours[0].omega_squared, &other.omega_squared)).fold(0.0, f64::max);
         ensure!(largest < 1e-9, "{} degrees of freedom: squares differ by {largest:e} relative", rows.len());
-        let of = |all: &[Solution], what: fn(&Solution) -> f64| median(all.iter().map(what).collect());
-        let (seconds, peak): (fn(&Solution) -> f64, fn(&Solution) -> f64) = (|s| s.seconds, |s| s.peak_mb);
-        print!("{:>8}  {:>10.1}  {:>8.0}", rows.len(), of(&ours, seconds), of(&ours, peak));
+        let seconds = |all: &[Solution]| median(all.iter().map(|one| one.seconds).collect());
+        let peak = |all: &[Solution]| median(all.iter().map(|one| one.peak_mb).collect());
+        print!("{:>8}  {:>10.1}  {:>8.0}", rows.len(), seconds(&ours), peak(&ours));
         if !theirs.is_empty() {
-            let ratio = of(&ours, seconds) / of(&theirs, seconds);
-            print!("  {:>10.1}  {:>9.0}  {ratio:>7.2}  {largest:.1e}", of(&theirs, seconds), of(&theirs, peak));
+            let ratio = seconds(&ours) / seconds(&theirs);
+            print!("  {:>10.1}  {:>9.0}  {ratio:>7.2}  {largest:.1e}", seconds(&theirs), peak(&theirs));
         }
         println!();
     }

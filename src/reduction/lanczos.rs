@@ -46,9 +46,9 @@ pub(super) struct Iteration<'a> {
     pub seed: u64,
 }
 
-/// Vectors that a basis for `count` pairs holds at most: three times as many, so that few restarts are needed.
+/// Vectors that a basis for `count` pairs holds at most: nearly three times as many, so that few restarts are needed.
 pub(super) fn capacity(dimension: usize, count: usize) -> usize {
-    (3 * count + 8 * BLOCK).min(dimension / BLOCK * BLOCK)
+    (11 * count / 4 + 8 * BLOCK).min(dimension / BLOCK * BLOCK)
 }
 
 impl Iteration<'_> {
