@@ -18,7 +18,7 @@ use crate::io::ros_args::RosArgs;
 use crate::io::ros2::{Parameters, Ros2};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::node::{self, Incoming, Node, Outputs, Shortcut, Watch};
-use crate::rig::Rig;
+use crate::rig::{EMBEDDED, Rig};
 use crate::session::Counters;
 use crate::settings::{self, Settings};
 
@@ -26,6 +26,7 @@ use crate::settings::{self, Settings};
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
+    #[arg(default_value = EMBEDDED[0].name)]
     rig: String,
     #[command(flatten)]
     buses: BusOptions,
