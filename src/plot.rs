@@ -343,27 +343,48 @@ fn shade() -> ShapeStyle {
     RGBColor(213, 94, 0).mix(0.12).filled()
 }
 
-/// Error against run time of the routes to a prediction, both axes logarithmic, a curve for each number of modes. From each
-/// route's median error a line goes up to its largest.
+/// Error against run time of the routes to a prediction, both axes logarithmic, a curve for each number of modes and a
+/// mark for each route. From each route's median error a line goes up to its largest.
 ///
 /// # Errors
 /// [`PlotError`] where the drawing library refuses.
 pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
     // Errors of nothing at all are drawn at the lower edge.
     let at = |route: &Route, error: f64| (route.median_us.log10(), error.max(1e-18).log10());
+    let drawn: Vec<&Route> = routes.iter().filter(|route| route.median_error.is_finite()).collect();
     let mut curves: BTreeMap<usize, Vec<&Route>> = BTreeMap::new();
-    for route in routes.iter().filter(|route| route.median_error.is_finite()) {
+    let mut names: Vec<&str> = vec![];
+    for route in &drawn {
         curves.entry(route.modes).or_default().push(route);
+        if !names.contains(&route.route) {
+            names.push(route.route);
+        }
     }
-    let drawn = || curves.values().flatten();
-    let x = padded(range(drawn().map(|route| route.median_us.log10())));
-    let x = (x.0.floor(), x.1.ceil() + 1.0); // labels stand to the right of their points
-    let y =
-        padded(range(drawn().flat_map(|route| [at(route, route.median_error).1, at(route, route.largest_error).1])));
+    let mark = |name: &str| names.iter().position(|known| *known == name).unwrap_or(0);
+    let x = decades(range(drawn.iter().map(|route| route.median_us.log10())));
+    let errors =
+        drawn.iter().flat_map(|route| [route.median_error, route.largest_error].map(|error| at(route, error).1));
+    let y = decades(range(errors));
     figure(title, (1000, 640), |area| {
-        let labels = ("run time per condition, log10 us", "relative error of the square, log10");
-        let mut chart = axes(area, x, y, labels.0, labels.1)?;
-        for (k, (modes, mut curve)) in curves.into_iter().enumerate() {
+        let size = |px: i32| px * FINE as i32;
+        let place = Pos::new(HPos::Left, VPos::Center);
+        let text = || ("sans-serif", 15 * FINE).into_text_style(area).pos(place);
+        let entry = |column: i32, row: i32| (size(84 + 180 * column), size(12 + 24 * row));
+        for (k, modes) in curves.keys().enumerate() {
+            let (x, y) = entry(k as i32, 0);
+            let line = PathElement::new([(x, y), (x + size(28), y)], COLOURS[k % COLOURS.len()].stroke_width(2 * FINE));
+            area.draw(&line).map_err(failed)?;
+            area.draw(&Text::new(format!("{modes} modes"), (x + size(34), y), text())).map_err(failed)?;
+        }
+        for (k, name) in names.iter().enumerate() {
+            let (x, y) = entry(k as i32 % 5, 1 + k as i32 / 5);
+            area.draw(&marker(k, (x + size(14), y), BLACK)).map_err(failed)?;
+            area.draw(&Text::new((*name).to_owned(), (x + size(34), y), text())).map_err(failed)?;
+        }
+        let area = &area.margin(24 * (1 + names.len().div_ceil(5) as u32) * FINE, 0, 0, 0);
+        let labels = ("run time per condition, us", "relative error of the squared eigenvalue");
+        let mut chart = axes_with_ticks(area, x, y, labels, (power_of_ten, power_of_ten))?;
+        for (k, (_, mut curve)) in curves.into_iter().enumerate() {
             let colour = COLOURS[k % COLOURS.len()];
             curve.sort_by(|a, b| a.median_us.total_cmp(&b.median_us));
             let line = curve.iter().map(|route| at(route, route.median_error));
@@ -372,13 +393,23 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
                 let (median, largest) = (at(route, route.median_error), at(route, route.largest_error));
                 let up = LineSeries::new([median, largest], colour.mix(0.5).stroke_width(FINE));
                 chart.draw_series(up).map_err(failed)?;
-                chart.draw_series([Circle::new(median, 4 * FINE, colour.filled())]).map_err(failed)?;
-                let label = format!("  {modes}: {}", route.route);
-                chart.draw_series([Text::new(label, median, ("sans-serif", 13 * FINE))]).map_err(failed)?;
+                chart.draw_series([marker(mark(route.route), median, colour)]).map_err(failed)?;
             }
         }
         Ok(())
     })
+}
+
+/// The mark of the k-th route.
+fn marker<'a, C: Clone + 'static>(k: usize, place: C, colour: RGBColor) -> DynElement<'static, SVGBackend<'a>, C> {
+    let size = 5 * FINE;
+    match k % 5 {
+        0 => Circle::new(place, size, colour.filled()).into_dyn(),
+        1 => TriangleMarker::new(place, size + FINE, colour.filled()).into_dyn(),
+        2 => Cross::new(place, size, colour.stroke_width(2 * FINE)).into_dyn(),
+        3 => Circle::new(place, size, colour.stroke_width(2 * FINE)).into_dyn(),
+        _ => TriangleMarker::new(place, size + FINE, colour.stroke_width(2 * FINE)).into_dyn(),
+    }
 }
 
 /// The errors of natural frequencies over the contact stiffness, as the paper's Fig. 13: mean below, largest above, the
@@ -437,6 +468,7 @@ fn stretches<T>(history: &History, of: impl Fn(&Bin) -> Option<T>) -> Vec<Vec<(i
     stretches
 }
 
+type Tick = fn(f64, (f64, f64)) -> String;
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Chart<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
@@ -448,6 +480,17 @@ fn axes<'a>(
     x_label: &str,
     y_label: &str,
 ) -> Result<Chart<'a>, PlotError> {
+    axes_with_ticks(area, x, y, (x_label, y_label), (tick, tick))
+}
+
+/// The same with labels of the ticks by functions of the value and the range.
+fn axes_with_ticks<'a>(
+    area: &Area<'a>,
+    x: (f64, f64),
+    y: (f64, f64),
+    (x_label, y_label): (&str, &str),
+    (x_tick, y_tick): (Tick, Tick),
+) -> Result<Chart<'a>, PlotError> {
     let mut chart = ChartBuilder::on(area)
         .margin(FINE * if x_label.is_empty() { 6 } else { 10 })
         .margin_right(30 * FINE)
@@ -457,8 +500,8 @@ fn axes<'a>(
         .map_err(failed)?;
     chart
         .configure_mesh()
-        .x_label_formatter(&|value| tick(*value, x))
-        .y_label_formatter(&|value| tick(*value, y))
+        .x_label_formatter(&|value| x_tick(*value, x))
+        .y_label_formatter(&|value| y_tick(*value, y))
         .axis_style(BLACK.stroke_width(FINE))
         .set_all_tick_mark_size(5 * FINE)
         .light_line_style(TRANSPARENT)
@@ -477,6 +520,23 @@ fn axes<'a>(
 fn tick(value: f64, (low, high): (f64, f64)) -> String {
     let value = if value.abs() < 1e-9 * (high - low) { 0.0 } else { value };
     FloatPrettyPrinter { allow_scientific: false, min_decimal: 1, max_decimal: 5 }.print(value)
+}
+
+/// The label of a tick of a logarithmic axis: whole powers of ten.
+fn power_of_ten(value: f64, _range: (f64, f64)) -> String {
+    let digits = ['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'];
+    let power = value.round();
+    if (value - power).abs() > 1e-9 {
+        return String::new();
+    }
+    let raised =
+        format!("{}", power.abs()).chars().filter_map(|c| digits.get(c.to_digit(10)? as usize)).collect::<String>();
+    format!("10{}{raised}", if power < 0.0 { "⁻" } else { "" })
+}
+
+/// The whole powers of ten around a range of logarithms.
+fn decades((low, high): (f64, f64)) -> (f64, f64) {
+    ((low - 0.04 * (high - low)).floor(), (high + 0.04 * (high - low)).ceil())
 }
 
 /// Smallest and largest of `values`; something to draw on where there is nothing.

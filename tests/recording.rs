@@ -291,7 +291,7 @@ fn small_recording(temp: &TempDir) -> (PathBuf, Vec<u8>) {
 fn a_file_cut_at_any_byte_is_read_up_to_the_cut() {
     let temp = TempDir::new().unwrap();
     let (file, bytes) = small_recording(&temp);
-    let whole: Vec<Vec<u8>> = read(&file).into_iter().map(|entry| entry.cdr).collect();
+    let whole: Vec<_> = read(&file).into_iter().map(|entry| entry.cdr).collect();
     let path = temp.path().join("cut.mcap");
     let step = (bytes.len() / 400).max(1);
     let dense = |near: usize| near.saturating_sub(60)..(near + 60).min(bytes.len());
@@ -302,7 +302,7 @@ fn a_file_cut_at_any_byte_is_read_up_to_the_cut() {
         let recording = Recording::open(&path).unwrap();
         assert!(!recording.is_complete(), "cut at {cut}");
         let mut messages = recording.messages();
-        let got: Vec<Vec<u8>> = messages.by_ref().map(|entry| entry.cdr).collect();
+        let got: Vec<_> = messages.by_ref().map(|entry| entry.cdr).collect();
         assert!(!messages.damage().is_empty());
         assert!(whole.starts_with(&got), "cut at {cut}");
         if cut > previous && got.len() < most {

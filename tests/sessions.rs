@@ -83,7 +83,7 @@ fn a_moving_load_carries_the_windows_along() {
 #[test]
 fn the_same_command_records_the_same_predictions() {
     let messages = |path: &Path| -> Vec<Vec<u8>> {
-        Recording::open(path).expect("a recording").messages().map(|entry| entry.cdr).collect()
+        Recording::open(path).expect("a recording").messages().map(|entry| entry.cdr.to_vec()).collect()
     };
     let ((_a, first), (_b, second)) = (recorded("nine-dof-4+2", "2"), recorded("nine-dof-4+2", "2"));
     let (first, second) = (messages(&first), messages(&second));

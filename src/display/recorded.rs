@@ -109,7 +109,7 @@ impl Recorded {
                 _ => {}
             }
         }
-        recorded.damage = messages.damage();
+        recorded.damage = messages.damage().to_vec();
         recorded
     }
 

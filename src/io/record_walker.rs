@@ -6,6 +6,7 @@
 //! that is damaged inside, and says what was damaged.
 
 use std::{
+    borrow::Cow,
     collections::{BTreeMap, HashMap, VecDeque},
     fs::File,
     io::{self, BufReader, Read},
@@ -13,6 +14,7 @@ use std::{
     sync::Arc,
 };
 
+use bytes::Bytes;
 use mcap::{
     MAGIC,
     records::{Metadata, Record, op},
@@ -56,7 +58,8 @@ pub struct RawMessage {
     pub sequence: u32,
     pub log_time_ns: u64,
     pub publish_time_ns: u64,
-    pub data: Vec<u8>,
+    /// Shares the memory of the chunk it came in.
+    pub data: Bytes,
 }
 
 /// What a file holds, in its order.
@@ -202,7 +205,7 @@ impl RecordWalker {
             self.offset += length;
             return Ok(());
         }
-        let body = self.read(length)?;
+        let body = Bytes::from(self.read(length)?);
         if body.len() as u64 != length {
             self.stop(start, "the file became shorter while it was read".to_owned(), matters);
             return Ok(());
@@ -264,6 +267,7 @@ impl RecordWalker {
                 return self.note(start, what, true);
             }
         }
+        let records = Bytes::from(records);
         let mut fields = Fields(&records);
         while !fields.0.is_empty() {
             let Some((opcode, record)) = fields.record() else {
@@ -275,14 +279,14 @@ impl RecordWalker {
             if !matches!(opcode, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
                 continue;
             }
-            if let Err(what) = self.record(opcode, record) {
+            if let Err(what) = self.record(opcode, &records.slice_ref(record)) {
                 self.note(start, format!("in a chunk: {what}"), true);
             }
         }
     }
 
     /// Takes in a record other than a chunk.
-    fn record(&mut self, opcode: u8, body: &[u8]) -> Result<(), String> {
+    fn record(&mut self, opcode: u8, body: &Bytes) -> Result<(), String> {
         if opcode == op::ATTACHMENT {
             self.queue.push_back(Item::Attachment(attachment(body)?));
             return Ok(());
@@ -333,7 +337,10 @@ impl RecordWalker {
                         sequence: header.sequence,
                         log_time_ns: header.log_time,
                         publish_time_ns: header.publish_time,
-                        data: data.into_owned(),
+                        data: match data {
+                            Cow::Borrowed(data) => body.slice_ref(data),
+                            Cow::Owned(data) => data.into(),
+                        },
                     }));
                 }
             }

@@ -1,11 +1,16 @@
 //! Reads recordings: finished, interrupted, cut or damaged, our own or another ROS 2 program's.
 
 use std::{
+    collections::VecDeque,
     io,
+    panic::resume_unwind,
     path::{Path, PathBuf},
     sync::Arc,
+    thread::JoinHandle,
 };
 
+use bytes::Bytes;
+use crossbeam_channel::{Receiver, Sender, bounded};
 use mcap::records::Metadata;
 
 use super::{
@@ -41,7 +46,7 @@ pub struct Entry {
     pub log_time_ns: u64,
     pub publish_time_ns: u64,
     /// As recorded, encapsulation header included.
-    pub cdr: Vec<u8>,
+    pub cdr: Bytes,
     pub message: Recorded,
 }
 
@@ -151,7 +156,62 @@ impl Recording {
 
     /// All messages in the order they were written, which for our own recordings is ascending log time.
     pub fn messages(&self) -> Messages<'_> {
-        Messages { recording: self, next_file: 0, walker: None, judged: Vec::new(), file_damage: Vec::new() }
+        let (batches, received) = bounded(BATCHES_AHEAD);
+        let files = self.files.clone();
+        // Chunks are decompressed there while messages are decoded and used here. It ends when nobody receives.
+        let reader = std::thread::spawn(move || read_ahead(&files, &batches));
+        Messages {
+            recording: self,
+            reader: Some(reader),
+            batches: received,
+            raw: VecDeque::new(),
+            judged: Vec::new(),
+            damage: Vec::new(),
+        }
+    }
+}
+
+/// Messages read at a time, and how many times ahead of their use.
+const BATCH: usize = 512;
+const BATCHES_AHEAD: usize = 4;
+
+/// Messages that follow each other, and what was found wrong before, between and behind them.
+#[derive(Debug, Default)]
+struct Batch {
+    raw: VecDeque<RawMessage>,
+    damage: Vec<FileDamage>,
+}
+
+fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
+    for file in files {
+        let mut walker = match open_walker(file, Depth::Messages) {
+            Ok(walker) => walker,
+            Err(error) => {
+                let damage = Damage { offset: 0, what: error.to_string(), loses_data: true };
+                let damage = vec![FileDamage { file: file.clone(), damage }];
+                if batches.send(Batch { damage, ..Batch::default() }).is_err() {
+                    return;
+                }
+                continue;
+            }
+        };
+        let mut told = 0;
+        loop {
+            let messages = walker.by_ref().filter_map(|item| match item {
+                Item::Message(raw) => Some(raw),
+                Item::Attachment(_) | Item::Metadata(_) => None,
+            });
+            let raw: VecDeque<_> = messages.take(BATCH).collect();
+            let last = raw.len() < BATCH;
+            let damage = located(file, &walker.damage()[told..]).collect();
+            told = walker.damage().len();
+            if batches.send(Batch { raw, damage }).is_err() {
+                return;
+            }
+            if last {
+                break;
+            }
+        }
     }
 }
 
@@ -159,22 +219,19 @@ impl Recording {
 #[derive(Debug)]
 pub struct Messages<'a> {
     recording: &'a Recording,
-    next_file: usize,
-    walker: Option<(PathBuf, RecordWalker)>,
+    reader: Option<JoinHandle<()>>,
+    batches: Receiver<Batch>,
+    raw: VecDeque<RawMessage>,
     /// What was found of each channel: comparing its fields with ours for every message would take most of the time.
     judged: Vec<(Arc<Channel>, Readable)>,
-    file_damage: Vec<FileDamage>,
+    damage: Vec<FileDamage>,
 }
 
 impl Messages<'_> {
     /// What was found wrong so far; complete once the iterator has ended. Messages are given out up to the damage, and
     /// from behind it where a single chunk is damaged.
-    pub fn damage(&self) -> Vec<FileDamage> {
-        let mut all = self.file_damage.clone();
-        if let Some((file, walker)) = &self.walker {
-            all.extend(located(file, walker.damage()));
-        }
-        all
+    pub fn damage(&self) -> &[FileDamage] {
+        &self.damage
     }
 
     fn entry(&mut self, raw: RawMessage) -> Entry {
@@ -201,24 +258,17 @@ impl Iterator for Messages<'_> {
 
     fn next(&mut self) -> Option<Entry> {
         loop {
-            if let Some((file, walker)) = &mut self.walker {
-                for item in walker.by_ref() {
-                    if let Item::Message(raw) = item {
-                        return Some(self.entry(raw));
-                    }
+            if let Some(raw) = self.raw.pop_front() {
+                return Some(self.entry(raw));
+            }
+            let Ok(batch) = self.batches.recv() else {
+                if let Err(panic) = self.reader.take()?.join() {
+                    resume_unwind(panic);
                 }
-                self.file_damage.extend(located(file, walker.damage()));
-                self.walker = None;
-            }
-            let file = self.recording.files.get(self.next_file)?;
-            self.next_file += 1;
-            match open_walker(file, Depth::Messages) {
-                Ok(walker) => self.walker = Some((file.clone(), walker)),
-                Err(error) => self.file_damage.push(FileDamage {
-                    file: file.clone(),
-                    damage: Damage { offset: 0, what: error.to_string(), loses_data: true },
-                }),
-            }
+                return None;
+            };
+            self.raw = batch.raw;
+            self.damage.extend(batch.damage);
         }
     }
 }

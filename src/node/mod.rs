@@ -46,8 +46,9 @@ const CATCH_UP: Duration = Duration::from_millis(100);
 const LATEST: Duration = Duration::from_millis(500);
 /// The fastest of so many predictions tells what one takes: on a busy machine any of them may have been interrupted.
 const TIMED: usize = 16;
-/// Inputs whose stamp and sequence number are remembered, to answer what comes over both buses once.
+/// Inputs, and measured vibrations, whose stamp and sequence number are remembered, to answer what comes over both buses once.
 const REMEMBERED: usize = 8192;
+const VIBRATIONS_REMEMBERED: usize = 1024;
 /// Time between diagnostics.
 const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
 /// Time between sensitivities, at least.
@@ -118,8 +119,8 @@ impl Node {
             outputs,
             statistics: Statistics::default(),
             watch,
-            heard_before: Remembered::default(),
-            vibration_heard_before: Remembered::default(),
+            heard_before: Remembered::new(REMEMBERED),
+            vibration_heard_before: Remembered::new(VIBRATIONS_REMEMBERED),
             last_heard: Instant::now(),
             silent: false,
             backlog: VecDeque::new(),
@@ -486,13 +487,19 @@ pub fn parameter_event(header: Header, name: &str, value: f64) -> SessionEvent {
 }
 
 /// The stamps and sequence numbers heard lately, each with the bus it came over first.
-#[derive(Default)]
 struct Remembered {
+    count: usize,
     bus: HashMap<(Time, u64), Bus>,
     order: VecDeque<(Time, u64)>,
 }
 
 impl Remembered {
+    /// Remembers the latest `count`, in memory that is there from the beginning: twice the room, so that the map clears up
+    /// behind what was forgotten instead of growing.
+    fn new(count: usize) -> Self {
+        Self { count, bus: HashMap::with_capacity(2 * (count + 1)), order: VecDeque::with_capacity(count + 1) }
+    }
+
     /// Whether this was not heard over another bus lately. What the same bus repeats is new: a recording played again.
     fn is_new(&mut self, bus: Bus, stamp: Time, seq: u64) -> bool {
         let key = (stamp, seq);
@@ -501,7 +508,7 @@ impl Remembered {
         }
         self.bus.insert(key, bus);
         self.order.push_back(key);
-        if self.order.len() > REMEMBERED
+        if self.order.len() > self.count
             && let Some(oldest) = self.order.pop_front()
         {
             self.bus.remove(&oldest);
@@ -516,12 +523,23 @@ mod tests {
 
     #[test]
     fn a_bus_may_repeat_itself_but_not_another() {
-        let mut heard = Remembered::default();
+        let mut heard = Remembered::new(4);
         let stamp = Time::from_ns(1);
         assert!(heard.is_new(Bus::Shm, stamp, 1));
         assert!(!heard.is_new(Bus::Ros2, stamp, 1), "answered over shared memory already");
         assert!(heard.is_new(Bus::Shm, stamp, 1), "a recording played again");
         assert!(!heard.is_new(Bus::Ros2, stamp, 1));
+    }
+
+    #[test]
+    fn what_was_heard_long_ago_is_forgotten_without_taking_memory() {
+        let mut heard = Remembered::new(100);
+        let room = (heard.bus.capacity(), heard.order.capacity());
+        for seq in 0..100_000 {
+            assert!(heard.is_new(Bus::Shm, Time::from_ns(0), seq));
+            assert_eq!(seq >= 100, heard.is_new(Bus::Ros2, Time::from_ns(0), seq.saturating_sub(100)), "{seq}");
+        }
+        assert_eq!(room, (heard.bus.capacity(), heard.order.capacity()));
     }
 
     #[test]

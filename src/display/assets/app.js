@@ -165,9 +165,8 @@ if (recording) {
     numbers();
     history.mark(moment);
   });
-  const whole = await ask("history.json");
+  const [whole, all, comparison] = await Promise.all(["history.json", "events.json", "comparison.json"].map(ask));
   history.load(whole);
-  const [all, comparison] = [await ask("events.json"), await ask("comparison.json")];
   const measured = comparison?.measured ?? [];
   timeline.paint(whole, measured);
   events.show(all, comparison);
