@@ -117,9 +117,14 @@ fn the_paper_s_tables_on_a_small_tribometer() {
     let least = curve.iter().min_by(|a, b| number(a, "rms_error_percent").total_cmp(&number(b, "rms_error_percent")));
     assert!((number(least.unwrap(), "contact_stiffness_n_per_m") / paper[1].1 - 1.0).abs() < 1e-12);
     assert!((number(least.unwrap(), "mean_error_percent") / paper[1].0 - 1.0).abs() < 1e-3);
-    for figure in ["figure-4", "figure-13", "figure-14", "figure-15"] {
+    for (figure, axis) in [
+        ("figure-4", "frequency, rad/s"),
+        ("figure-13", "contact stiffness of a pair"),
+        ("figure-14", "growth rate, 1/s"),
+        ("figure-15", "frequency, Hz"),
+    ] {
         let drawn = std::fs::read_to_string(out.join(format!("{figure}.svg"))).unwrap();
-        assert!(drawn.contains("<svg") && drawn.len() > 10_000, "{figure}");
+        assert!(drawn.contains("<svg") && drawn.contains(axis), "{figure}");
     }
     let page = std::fs::read_to_string(out.join("index.html")).unwrap();
     for told in

@@ -288,8 +288,8 @@ impl Study<'_> {
             "The full model of {} degrees of freedom at {} N and {} rad/s, solved at {} friction coefficients, and the parametric basis \
              through it; its windows of instability are shaded. At {} other points its roots are within {:.1e} of the full model's. \
              The paper's figure is Abaqus with surface-to-surface contact, whose area changes with load: there modes 1 and 2 unlock \
-             again and modes 3 and 4 fall, which a model with springs between fixed pairs of nodes need not show. Of the {} windows of \
-             ours {} close again.",
+             again and modes 3 and 4 fall, which a model with springs between fixed pairs of nodes need not show. Windows of \
+             instability here: {}, closing again: {}.",
             self.full.model.dimension(),
             p.normal_load_n,
             p.disc_speed_rad_s,
