@@ -343,6 +343,9 @@ fn shade() -> ShapeStyle {
     RGBColor(213, 94, 0).mix(0.12).filled()
 }
 
+/// Entries of that figure's legend in a row.
+const FRONT_COLUMNS: usize = 5;
+
 /// Error against run time of the routes to a prediction, both axes logarithmic, a curve for each number of modes and a
 /// mark for each route. From each route's median error a line goes up to its largest.
 ///
@@ -369,19 +372,23 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
         let size = |px: i32| px * FINE as i32;
         let place = Pos::new(HPos::Left, VPos::Center);
         let text = || ("sans-serif", 15 * FINE).into_text_style(area).pos(place);
-        let entry = |column: i32, row: i32| (size(84 + 180 * column), size(12 + 24 * row));
+        let entry = |k: usize, row: usize| {
+            let (column, row) = (k % FRONT_COLUMNS, row + k / FRONT_COLUMNS);
+            (size(84 + 180 * column as i32), size(12 + 24 * row as i32))
+        };
+        let rows_of_curves = curves.len().div_ceil(FRONT_COLUMNS);
         for (k, modes) in curves.keys().enumerate() {
-            let (x, y) = entry(k as i32, 0);
+            let (x, y) = entry(k, 0);
             let line = PathElement::new([(x, y), (x + size(28), y)], COLOURS[k % COLOURS.len()].stroke_width(2 * FINE));
             area.draw(&line).map_err(failed)?;
             area.draw(&Text::new(format!("{modes} modes"), (x + size(34), y), text())).map_err(failed)?;
         }
         for (k, name) in names.iter().enumerate() {
-            let (x, y) = entry(k as i32 % 5, 1 + k as i32 / 5);
+            let (x, y) = entry(k, rows_of_curves);
             area.draw(&marker(k, (x + size(14), y), BLACK)).map_err(failed)?;
             area.draw(&Text::new((*name).to_owned(), (x + size(34), y), text())).map_err(failed)?;
         }
-        let area = &area.margin(24 * (1 + names.len().div_ceil(5) as u32) * FINE, 0, 0, 0);
+        let area = &area.margin(24 * (rows_of_curves + names.len().div_ceil(FRONT_COLUMNS)) as u32 * FINE, 0, 0, 0);
         let labels = ("run time per condition, us", "relative error of the squared eigenvalue");
         let mut chart = axes_with_ticks(area, x, y, labels, (power_of_ten, power_of_ten))?;
         for (k, (_, mut curve)) in curves.into_iter().enumerate() {
@@ -403,12 +410,13 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
 /// The mark of the k-th route.
 fn marker<'a, C: Clone + 'static>(k: usize, place: C, colour: RGBColor) -> DynElement<'static, SVGBackend<'a>, C> {
     let size = 5 * FINE;
-    match k % 5 {
+    match k % 6 {
         0 => Circle::new(place, size, colour.filled()).into_dyn(),
         1 => TriangleMarker::new(place, size + FINE, colour.filled()).into_dyn(),
         2 => Cross::new(place, size, colour.stroke_width(2 * FINE)).into_dyn(),
         3 => Circle::new(place, size, colour.stroke_width(2 * FINE)).into_dyn(),
-        _ => TriangleMarker::new(place, size + FINE, colour.stroke_width(2 * FINE)).into_dyn(),
+        4 => TriangleMarker::new(place, size + FINE, colour.stroke_width(2 * FINE)).into_dyn(),
+        _ => Circle::new(place, size / 2, colour.filled()).into_dyn(),
     }
 }
 

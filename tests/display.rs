@@ -254,6 +254,12 @@ fn the_page_shows_a_demo_as_it_is() {
     for moment in moments {
         let seq: u64 = moment["seq"].as_str().unwrap().parse().unwrap();
         let (input, prediction) = &published[&seq];
+        // The level is there at once, the numbers follow: within 2 s of them there was such a prediction.
+        let level = moment["level"].as_str().unwrap();
+        let near = (seq.saturating_sub(400)..seq + 400).filter_map(|seq| published.get(&seq));
+        let levels: Vec<String> =
+            near.map(|(_, near)| squealcast::wire::level::name(near.level).to_lowercase()).collect();
+        assert!(levels.iter().any(|near| near == level), "{level} about input {seq}");
         let numbers = &moment["numbers"];
         for (name, value) in [
             ("margin", prediction.friction_margin),
@@ -286,8 +292,10 @@ fn the_page_shows_a_demo_as_it_is() {
                 known.growth_rate_per_s,
                 known.damping_ratio,
                 known.frequency_error_hz,
+                known.growth_rate_error_per_s,
                 known.pad_participation,
             ];
+            assert_eq!(mode["values"].as_array().unwrap().len(), values.len());
             for (shown, value) in mode["values"].as_array().unwrap().iter().zip(values) {
                 // What is not known, such as the pad's share where a chart does not tell it, is shown as nothing.
                 let exact = shown.as_str().unwrap().parse().ok();
@@ -360,17 +368,17 @@ fn measures() -> bool {
     measuring()
 }
 
-/// Ten minutes at 1 kHz.
+/// A minute at 1 kHz; ten where times are measured.
 #[test]
 fn a_long_recording_opens_at_once_and_is_reported() {
-    if !measures() {
-        return;
-    }
+    let minutes = if measures() { 10 } else { 1 };
+    let at_once = |took: Duration| !measuring() || took < Duration::from_secs(3);
     let _alone = alone();
     let directory = tempfile::tempdir().unwrap();
     let simulated = Command::new(env!("CARGO_BIN_EXE_squealcast"))
-        .args(["simulate", "--rig", "nine-dof-case-2", "--rate", "1000", "--duration", "600", "--record"])
+        .args(["simulate", "--rig", "nine-dof-case-2", "--rate", "1000", "--record"])
         .arg(directory.path())
+        .args(["--duration", &(60 * minutes).to_string()])
         .output()
         .unwrap();
     assert!(simulated.status.success(), "{}", String::from_utf8_lossy(&simulated.stderr));
@@ -380,16 +388,22 @@ fn a_long_recording_opens_at_once_and_is_reported() {
     let began = Instant::now();
     let shown = Shown::start(&["view", session]);
     let took = began.elapsed();
-    assert!(took < Duration::from_secs(3), "opened in {took:?}");
+    println!("served in {took:?}");
+    assert!(at_once(took), "opened in {took:?}");
     let about: serde_json::Value = serde_json::from_str(&shown.get("/about.json").2).unwrap();
     let span: Vec<f64> = about["span_s"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
-    assert!((span[1] - span[0] - 600.0).abs() < 0.5, "{span:?}");
+    assert!((span[1] - span[0] - 60.0 * f64::from(minutes)).abs() < 0.5, "{span:?}");
     // The paper's profile passes the critical value three times a round of 30 s.
     let events: serde_json::Value = serde_json::from_str(&shown.get("/events.json").2).unwrap();
-    assert_eq!(events.as_array().unwrap().len(), 60);
+    let squeals = 6 * minutes as usize;
+    assert_eq!(events.as_array().unwrap().len(), squeals);
     if browser_ready() {
         let speed = browse("view.mjs", &[&format!("http://{}/", shown.address)]);
-        assert!(speed["opened_ms"].as_f64().unwrap() < 3000.0, "{speed}");
+        println!("{speed}");
+        assert!(at_once(Duration::from_secs_f64(1e-3 * speed["opened_ms"].as_f64().unwrap())), "{speed}");
+        let waits = speed["scrub_ms"].as_array().unwrap();
+        let longest = waits.iter().map(|wait| wait.as_f64().unwrap()).fold(0.0, f64::max);
+        assert!(!measuring() || longest < 500.0, "{speed}");
     }
     shown.stop();
 
@@ -401,15 +415,52 @@ fn a_long_recording_opens_at_once_and_is_reported() {
         .unwrap();
     let took = began.elapsed();
     assert!(reported.status.success(), "{}", String::from_utf8_lossy(&reported.stderr));
-    assert!(took < Duration::from_secs(3), "reported in {took:?}");
+    println!("reported in {took:?}");
+    assert!(at_once(took), "reported in {took:?}");
     let html = std::fs::read_to_string(out.join("report.html")).unwrap();
-    assert!(html.contains("Squeal was predicted 60 times") && html.contains("Stability maps at the worst moments"));
+    assert!(
+        html.contains(&format!("Squeal was predicted {squeals} times"))
+            && html.contains("Stability maps at the worst moments")
+    );
     for part in ["<script", "src=", "href=", "@import", "url("] {
         assert!(!html.contains(part), "it needs something else: {part}");
     }
     assert!(html.len() < 5_000_000, "{} bytes", html.len());
     let csv = std::fs::read_to_string(out.join("events.csv")).unwrap();
-    assert_eq!(csv.lines().count(), 61);
+    assert_eq!(csv.lines().count(), 1 + squeals);
+}
+
+#[test]
+fn a_recording_of_faults_is_not_called_quiet() {
+    let directory = tempfile::tempdir().unwrap();
+    let (profile, recorded, out) =
+        (directory.path().join("crushing.toml"), directory.path().join("recorded"), directory.path().join("report"));
+    let point = |time_s: f64| {
+        format!(
+            "[[point]]\ntime_s = {time_s}\nnormal_load_n = 2e6\ndisc_speed_rad_s = 13\nfriction_coefficient = 0.2\n"
+        )
+    };
+    std::fs::write(&profile, point(0.0) + &point(1.0)).unwrap();
+    let run = |arguments: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_squealcast")).args(arguments).output().unwrap();
+        assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    };
+    let [profile, recorded, out] = [&profile, &recorded, &out].map(|path| path.to_str().unwrap());
+    let rate = ["--rate", "20", "--duration", "1"];
+    run(&[&["simulate", "--rig", "nine-dof-case-2", "--profile", profile, "--record", recorded], &rate[..]].concat());
+    let session = std::fs::read_dir(recorded).unwrap().next().unwrap().unwrap().path();
+    run(&["report", session.to_str().unwrap(), "-o", out]);
+    let html = std::fs::read_to_string(Path::new(out).join("report.html")).unwrap();
+    assert!(html.contains("20 of 20 predictions are faults") && !html.contains("No squeal was predicted"));
+}
+
+#[test]
+fn a_connection_that_says_nothing_is_closed() {
+    let shown = Shown::demo(&[]);
+    let mut silent = TcpStream::connect(shown.address).unwrap();
+    silent.set_read_timeout(Some(PATIENCE)).unwrap();
+    assert_eq!(silent.read(&mut [0; 16]).expect("it is closed before this test has lost its patience"), 0);
+    shown.stop();
 }
 
 /// Plateaus of the friction coefficient, 0.1 apart per second between them, no noise: of 0.33, 0.40 and 0.60 at 500 N and

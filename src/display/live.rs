@@ -49,7 +49,7 @@ struct Followed {
 }
 
 impl Live {
-    /// Begins to follow.
+    /// Follows from its first tick on: one that is served nowhere takes nothing.
     pub fn new(rig: Arc<Rig>, watch: Watch, threshold_db: f64) -> Self {
         let solver = Mutex::new(Solver::new(rig.model.dimension()));
         let followed = Followed {
@@ -65,9 +65,7 @@ impl Live {
             map_number: 0,
             curves: None,
         };
-        let live = Self { rig, watch, threshold_db, followed: Mutex::new(followed), solver };
-        live.watch.take_samples(&mut vec![]);
-        live
+        Self { rig, watch, threshold_db, followed: Mutex::new(followed), solver }
     }
 
     fn followed(&self) -> MutexGuard<'_, Followed> {
@@ -110,6 +108,7 @@ impl Followed {
             prediction: snapshot.prediction.as_ref().map(|p| Shown::new(snapshot.input.as_ref(), p)),
             spread: spread(&self.history, time_s),
             trend_per_s: trend_per_s(&self.history, time_s),
+            warn_margin: snapshot.warn_margin,
             map: self.map_number,
             events: self.event_changes,
             counters: Some(CountersShown::new(snapshot.counters, snapshot.passed_over)),

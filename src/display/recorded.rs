@@ -15,7 +15,7 @@ use crate::io::recording::{FileDamage, Recorded as Content, Recording};
 use crate::node::{Sample, VibrationSample, session_map};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
-use crate::wire::{OperatingPoint, Prediction, SessionEvent, event_kind};
+use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind};
 
 /// Bins of the history; they get longer with the recording.
 const BINS: usize = 3000;
@@ -54,8 +54,11 @@ pub struct Recorded {
     pub stride: u64,
     /// Predictions by level: OK, WARN, SQUEAL, FAULT.
     pub levels: [u64; 4],
-    /// Inputs, and those that were not predicted.
+    /// Inputs that were recorded, and those of them that were predicted.
     pub inputs: u64,
+    pub answered: u64,
+    /// What the node counted last.
+    pub counted: Option<DiagnosticArray>,
     pub reused: u64,
     /// Settings and maps, in order, with the time they were recorded.
     pub session_events: Vec<(i64, SessionEvent)>,
@@ -78,6 +81,8 @@ impl Recorded {
             stride: 1,
             levels: [0; 4],
             inputs: 0,
+            answered: 0,
+            counted: None,
             reused: 0,
             session_events: vec![],
             damage: vec![],
@@ -105,6 +110,7 @@ impl Recorded {
                     recorded.history.push_vibration(&sample);
                     recorded.vibration.push(&sample);
                 }
+                Content::Known(Payload::Diagnostics(counted)) => recorded.counted = Some(counted),
                 Content::Known(Payload::SessionEvent(event)) => recorded.session_events.push((time_ns, event)),
                 _ => {}
             }
@@ -120,6 +126,8 @@ impl Recorded {
         let count: u64 = self.levels.iter().sum();
         self.levels[usize::from(prediction.level).min(3)] += 1;
         self.reused += u64::from(prediction.reused);
+        // A fault for want of inputs names the last one and has a stamp of its own.
+        self.answered += u64::from(input.is_some_and(|input| input.header.stamp == prediction.header.stamp));
         let changed = self.level_before != Some(prediction.level);
         self.level_before = Some(prediction.level);
         if !changed && !count.is_multiple_of(self.stride) {
@@ -166,6 +174,13 @@ impl Recorded {
     /// Number of the map that was in use, from 1; 0 before the first.
     pub fn map_number(&self, at_s: f64) -> u64 {
         self.map_events().take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7).count() as u64
+    }
+
+    /// The margin below which the node warned at a moment; `None` where that was not recorded.
+    pub fn warn_margin(&self, at_s: f64) -> Option<f64> {
+        let named = |event: &&SessionEvent| event.kind == event_kind::PARAMETER && event.name == "warn_margin";
+        let before = self.session_events.iter().take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7);
+        before.map(|(_, event)| event).filter(named).last().map(|event| event.value)
     }
 
     /// The map of that number, computed again; `None` where there is none or it cannot be had.
@@ -233,6 +248,7 @@ impl Source for Recorded {
             prediction: moment.map(|moment| Shown::new(moment.input.as_ref(), &moment.prediction)),
             spread: spread(&self.history, time_s),
             trend_per_s: trend_per_s(&self.history, time_s),
+            warn_margin: self.warn_margin(time_s),
             map: self.map_number(time_s),
             events: self.events.count(),
             counters: None,

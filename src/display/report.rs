@@ -34,7 +34,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     let (from_s, to_s) = recorded.span_s().unwrap_or((0.0, 0.0));
     let title = format!("{}, {}", rig.name, iso(from_s));
     let mut html = format!("<h1>Session report</h1>\n<p class=\"lead\">{}</p>\n", escaped(&title));
-    html += &verdict(&recorded.events, to_s);
+    html += &verdict(recorded, to_s);
     html += &section("Session", &session(recorded, origin, from_s, to_s));
     html += &section(
         "Conditions and predictions",
@@ -82,7 +82,11 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         maps += &figure(&plot::map("", &curves, to, Some(mu))?, &escaped(&caption));
     }
     if maps.is_empty() {
-        maps = "<p>No squeal was predicted.</p>\n".to_owned();
+        maps = match worst(&recorded.events).is_empty() {
+            true => "<p>No mode was predicted to squeal.</p>\n",
+            false => "<p>The recording names no stability map.</p>\n",
+        }
+        .to_owned();
     }
     html += &section("Stability maps at the worst moments", &maps);
     html += &section("Error bounds", &error_bounds(recorded));
@@ -92,23 +96,36 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
 }
 
 /// One sentence for who reads no further.
-fn verdict(events: &Events, to_s: f64) -> String {
+fn verdict(recorded: &Recorded, to_s: f64) -> String {
+    let events = &recorded.events;
+    let predictions: u64 = recorded.levels.iter().sum();
+    let faults = recorded.levels[usize::from(level::FAULT)];
+    let failed = match faults {
+        0 => String::new(),
+        _ => format!(
+            "<p class=\"verdict fault\">{faults} of {predictions} predictions are faults: nothing is known of these \
+             moments.</p>\n"
+        ),
+    };
     let squeals: Vec<&Event> = events.iter().filter(|event| event.kind == level::name(level::SQUEAL)).collect();
     let lasted: f64 = squeals.iter().map(|event| event.end_s.unwrap_or(to_s) - event.onset_s).sum();
     let worst = worst(events).into_iter().next();
     match worst {
-        None if squeals.is_empty() => "<p class=\"verdict ok\">No squeal was predicted.</p>\n".to_owned(),
-        worst => format!(
-            "<p class=\"verdict squeal\">Squeal was predicted {} time{}, {lasted:.2} s in all{}.</p>\n",
-            squeals.len(),
-            if squeals.len() == 1 { "" } else { "s" },
-            worst.map_or_else(String::new, |event| format!(
-                "; worst in mode {} at {} Hz, growing by {} 1/s",
-                event.mode_id.unwrap_or_default(),
-                number(event.frequency_hz.unwrap_or(f64::NAN)),
-                number(event.growth_rate_per_s.unwrap_or(f64::NAN)),
-            ))
-        ),
+        None if squeals.is_empty() && faults == predictions => failed,
+        None if squeals.is_empty() => format!("<p class=\"verdict ok\">No squeal was predicted.</p>\n{failed}"),
+        worst => {
+            format!(
+                "<p class=\"verdict squeal\">Squeal was predicted {} time{}, {lasted:.2} s in all{}.</p>\n",
+                squeals.len(),
+                if squeals.len() == 1 { "" } else { "s" },
+                worst.map_or_else(String::new, |event| format!(
+                    "; worst in mode {} at {} Hz, growing by {} 1/s",
+                    event.mode_id.unwrap_or_default(),
+                    number(event.frequency_hz.unwrap_or(f64::NAN)),
+                    number(event.growth_rate_per_s.unwrap_or(f64::NAN)),
+                ))
+            ) + &failed
+        }
     }
 }
 
@@ -148,7 +165,7 @@ fn events(events: &Events, from_s: f64) -> String {
     if count == 0 {
         return "<p>None.</p>\n".to_owned();
     }
-    let mut html = "<table><thead><tr><th>no.</th><th>event</th><th>after, s</th><th>duration, s</th><th>mode</th>\
+    let mut html = "<table><thead><tr><th>no.</th><th>event</th><th>after, s</th><th>end, s</th><th>duration, s</th><th>mode</th>\
                     <th>frequency, Hz</th><th>growth, 1/s</th><th>μ</th><th>load, N</th><th>speed, rad/s</th></tr></thead>\
                     <tbody>\n"
         .to_owned();
@@ -157,7 +174,8 @@ fn events(events: &Events, from_s: f64) -> String {
             event.number.to_string(),
             event.kind.to_owned(),
             format!("{:.3}", event.onset_s - from_s),
-            event.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s)),
+            event.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - from_s)),
+            event.end_s.map_or_else(|| "–".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s)),
             event.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
             event.frequency_hz.map_or_else(|| "–".to_owned(), number),
             event.growth_rate_per_s.map_or_else(|| "–".to_owned(), number),
@@ -348,12 +366,23 @@ fn error_bounds(recorded: &Recorded) -> String {
 }
 
 fn skipped(recorded: &Recorded) -> String {
-    let predicted: u64 = recorded.levels.iter().sum();
     let mut html = format!(
         "<p>{} inputs were not predicted; {} predictions were reused within the dead band.</p>\n",
-        recorded.inputs.saturating_sub(predicted),
+        recorded.inputs.saturating_sub(recorded.answered),
         recorded.reused
     );
+    let counted = recorded.counted.iter().flat_map(|counted| &counted.status).flat_map(|status| &status.values);
+    let rows: String = counted
+        .map(|pair| {
+            format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escaped(&pair.key), escaped(&pair.value))
+        })
+        .collect();
+    if !rows.is_empty() {
+        let _ = writeln!(
+            html,
+            "<p>What the node counted by the end:</p>\n<table class=\"facts\"><tbody>\n{rows}</tbody></table>"
+        );
+    }
     if recorded.damage.is_empty() {
         html += "<p>The recording is whole.</p>\n";
     }

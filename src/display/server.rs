@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
-use tokio::time::{MissedTickBehavior, Sleep, interval, sleep};
+use tokio::time::{Instant, MissedTickBehavior, Sleep, interval, sleep};
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::WatchStream;
 
@@ -37,8 +37,10 @@ use crate::rig::Rig;
 const EVERY: Duration = Duration::from_millis(34);
 /// A client that takes nothing for this long is dropped.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Maps, shapes and histories that are prepared at a time; more wait.
-const BLOCKING_THREADS: usize = 2;
+/// A connection over which nothing goes in either direction for this long is dropped.
+const IDLE: Duration = Duration::from_secs(30);
+/// Maps, shapes and histories that are prepared at a time; more wait. Two may wait for each other's map.
+const BLOCKING_THREADS: usize = 4;
 /// Connections at a time; more wait.
 const MOST_CONNECTIONS: usize = 256;
 /// Pages that listen at a time; more are refused.
@@ -353,7 +355,8 @@ async fn aside(work: impl FnOnce() -> Response + Send + 'static) -> Response {
     }
 }
 
-/// Accepts a bounded number of connections, each of which fails when its other end takes nothing for too long.
+/// Accepts a bounded number of connections, each of which fails when its other end takes nothing for too long, or when
+/// nothing at all happens on it.
 struct Patient {
     listener: TcpListener,
     permits: Arc<Semaphore>,
@@ -362,6 +365,7 @@ struct Patient {
 struct PatientStream {
     stream: TcpStream,
     waiting: Option<Pin<Box<Sleep>>>,
+    idle: Pin<Box<Sleep>>,
     _permit: Option<OwnedSemaphorePermit>,
 }
 
@@ -376,7 +380,8 @@ impl axum::serve::Listener for Patient {
             match self.listener.accept().await {
                 Ok((stream, address)) => {
                     let _ = stream.set_nodelay(true);
-                    return (PatientStream { stream, waiting: None, _permit: permit }, address);
+                    let idle = Box::pin(sleep(IDLE));
+                    return (PatientStream { stream, waiting: None, idle, _permit: permit }, address);
                 }
                 // Out of file descriptors, or the client has gone again.
                 Err(_) => sleep(Duration::from_millis(50)).await,
@@ -393,6 +398,7 @@ impl PatientStream {
     fn judge<T>(&mut self, written: Poll<io::Result<T>>, context: &mut Context<'_>) -> Poll<io::Result<T>> {
         if written.is_ready() {
             self.waiting = None;
+            self.idle.as_mut().reset(Instant::now() + IDLE);
             return written;
         }
         let waiting = self.waiting.get_or_insert_with(|| Box::pin(sleep(PATIENCE)));
@@ -405,7 +411,15 @@ impl PatientStream {
 
 impl AsyncRead for PatientStream {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_read(cx, buffer)
+        let read = Pin::new(&mut self.stream).poll_read(cx, buffer);
+        if read.is_ready() {
+            self.idle.as_mut().reset(Instant::now() + IDLE);
+            return read;
+        }
+        match self.idle.as_mut().poll(cx) {
+            Poll::Ready(()) => Poll::Ready(Err(io::ErrorKind::TimedOut.into())),
+            Poll::Pending => Poll::Pending,
+        }
     }
 }
 

@@ -25,6 +25,8 @@ pub struct State<'a> {
     pub spread: Option<(f32, f32)>,
     /// Change of the margin over the last 2 s, 1/s.
     pub trend_per_s: Option<f64>,
+    /// Below this margin the node warns; `null` where that is not known.
+    pub warn_margin: Option<f64>,
     /// Which stability map belongs to it; 0 before the first.
     pub map: u64,
     /// Changes when an event begins or ends.

@@ -237,6 +237,7 @@ impl Node {
         for (name, value) in settings {
             self.note(parameter_event(now_header(), name, value));
         }
+        self.watch.warn_margin(self.session.settings().warn_margin);
         self.mapper.want(self.rig.reference);
     }
 
@@ -298,6 +299,7 @@ impl Node {
     fn parameter(&mut self, name: String, value: f64) {
         self.note(parameter_event(now_header(), &name, value));
         self.step(Event::Parameter { name, value }, None);
+        self.watch.warn_margin(self.session.settings().warn_margin);
     }
 
     fn map(&mut self, point: OperatingPoint, map: Result<Arc<StabilityMap>, String>) {
@@ -546,7 +548,7 @@ mod tests {
     fn of_a_long_backlog_the_newest_is_predicted_whatever_bus_repeats_it() {
         const COUNT: u64 = 8000;
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let settings = Settings::for_rig(&rig);
+        let settings = Settings { warn_margin: 0.3, ..Settings::for_rig(&rig) };
         let (sender, receiver) = channel();
         for seq in 0..COUNT {
             let message = wire::OperatingPoint {
@@ -567,6 +569,7 @@ mod tests {
         node.prediction_times.note(Duration::from_millis(10));
         node.run(&receiver);
         let seen = watch.snapshot();
+        assert_eq!(seen.warn_margin, Some(0.3), "of the settings, not of the rig");
         assert_eq!(seen.prediction.expect("one").input_seq, COUNT - 1);
         assert_eq!((seen.counters.solved, seen.passed_over), (1, COUNT - 1));
     }

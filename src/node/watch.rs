@@ -17,6 +17,8 @@ pub struct Snapshot {
     /// When the last input was heard.
     pub heard: Option<Instant>,
     pub map: Option<Arc<StabilityMap>>,
+    /// The margin below which the node warns now; `None` before it began.
+    pub warn_margin: Option<f64>,
     pub counters: Counters,
     pub passed_over: u64,
 }
@@ -185,6 +187,10 @@ impl Watch {
 
     pub(super) fn map(&self, map: &Arc<StabilityMap>) {
         self.with(|watched| watched.snapshot.map = Some(map.clone()));
+    }
+
+    pub(super) fn warn_margin(&self, warn_margin: f64) {
+        self.with(|watched| watched.snapshot.warn_margin = Some(warn_margin));
     }
 
     pub(super) fn counters(&self, counters: Counters, passed_over: u64) {

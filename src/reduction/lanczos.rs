@@ -20,13 +20,13 @@ use super::dense::symmetric_eigen;
 pub(super) const BLOCK: usize = 6;
 /// Restarts after which no more progress is expected.
 const MOST_RESTARTS: usize = 60;
-/// Rows of the basis that are recombined at once on a restart.
+/// Rows of the basis that are recombined at once.
 const ROWS_TOGETHER: usize = 4096;
 
 /// Converged eigenpairs, largest `θ` first.
 pub(super) struct Largest {
     pub theta: Vec<f64>,
-    /// `n` by as many as `theta`, orthonormal.
+    /// `n` by as many as `theta`, orthonormal; they hold the memory of the whole basis.
     pub vectors: Mat<f64>,
 }
 
@@ -74,7 +74,10 @@ impl Iteration<'_> {
                 let converged = (0..ritz.theta.len()).take_while(good).count();
                 progress(built, converged);
                 if enough(&ritz.theta[..converged]) {
-                    let vectors = space.basis.subcols(0, space.size) * ritz.vectors.subcols(0, converged);
+                    // In the memory of the basis: that is the most there is at a time.
+                    space.recombine(ritz.vectors.subcols(0, converged));
+                    let mut vectors = space.basis;
+                    vectors.truncate(self.dimension, converged);
                     return Ok(Largest { theta: ritz.theta[..converged].to_vec(), vectors });
                 }
                 if full && (restarts == MOST_RESTARTS || self.capacity + BLOCK > self.dimension) {
@@ -191,14 +194,18 @@ impl Space {
         })
     }
 
-    /// Keeps the `keep` best Ritz vectors; what remains of the last block goes on from them.
-    fn restart(&mut self, ritz: &Ritz, keep: usize) {
-        let kept = ritz.vectors.subcols(0, keep);
+    /// Puts `V S` in place of the first vectors.
+    fn recombine(&mut self, s: MatRef<'_, f64>) {
         for first in (0..self.basis.nrows()).step_by(ROWS_TOGETHER) {
             let rows = ROWS_TOGETHER.min(self.basis.nrows() - first);
-            let recombined = self.basis.submatrix(first, 0, rows, self.size) * kept;
-            self.basis.submatrix_mut(first, 0, rows, keep).copy_from(&recombined);
+            let recombined = self.basis.submatrix(first, 0, rows, self.size) * s;
+            self.basis.submatrix_mut(first, 0, rows, s.ncols()).copy_from(&recombined);
         }
+    }
+
+    /// Keeps the `keep` best Ritz vectors; what remains of the last block goes on from them.
+    fn restart(&mut self, ritz: &Ritz, keep: usize) {
+        self.recombine(ritz.vectors.subcols(0, keep));
         self.projected.fill(0.0);
         for (k, theta) in ritz.theta[..keep].iter().enumerate() {
             self.projected[(k, k)] = *theta;

@@ -218,6 +218,9 @@ impl<'a> Analysed<'a> {
     }
 }
 
+/// Vectors that are solved for together at the end.
+const TOGETHER: usize = 24;
+
 /// Modes before their residuals are known.
 struct Found {
     omega_squared: Vec<f64>,
@@ -293,10 +296,18 @@ fn shifted(
         &enough,
         &mut |vectors, converged| progress(Progress::Iterated { vectors, converged, wanted: count }),
     )?;
-    let mut phi = factor.unwhiten(largest.vectors);
-    for (k, theta) in largest.theta.iter().enumerate() {
-        phi.col_mut(k).iter_mut().for_each(|value| *value /= theta.sqrt());
+    let mut basis = largest.vectors;
+    for first in (0..basis.ncols()).step_by(TOGETHER) {
+        let columns = TOGETHER.min(basis.ncols() - first);
+        let phi = factor.unwhiten(basis.subcols(first, columns).to_owned());
+        basis.subcols_mut(first, columns).copy_from(&phi);
     }
+    for (k, theta) in largest.theta.iter().enumerate() {
+        basis.col_mut(k).iter_mut().for_each(|value| *value /= theta.sqrt());
+    }
+    // What the basis took is given back as soon as the factor is.
+    drop(factor);
+    let phi = basis.as_ref().to_owned();
     Ok((Found { omega_squared: largest.theta.into_iter().map(square).collect(), phi }, shift))
 }
 

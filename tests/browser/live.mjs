@@ -16,7 +16,7 @@ const look = (page) => page.evaluate(() => {
     id: Number(row.querySelector("button").dataset.mode),
     values: [...row.querySelectorAll("data")].map((data) => data.value),
   }));
-  return { seq: document.getElementById("seq").value, numbers: Object.fromEntries(ids.map((id) => [id, value(id)])), modes };
+  return { level: document.getElementById("status").dataset.level, seq: document.getElementById("seq").value, numbers: Object.fromEntries(ids.map((id) => [id, value(id)])), modes };
 });
 const cursor = (page) => page.locator("#map-growth .mu-cursor").evaluate((line) => line.getBoundingClientRect().x);
 
@@ -68,7 +68,7 @@ await wall.context().close();
 
 // A mode moves when chosen, and stands when paused.
 // A canvas of WebGL shows its picture and forgets it, and says its displacements instead.
-const pixels = () => page.locator("#shape").evaluate((canvas) => (canvas.displacements ? JSON.stringify(canvas.displacements) : canvas.toDataURL()));
+const pixels = () => page.locator("#shape").evaluate((canvas) => (canvas.displacements ? JSON.stringify(canvas.displacements()) : canvas.toDataURL()));
 await page.locator("#modes .mode-button").nth(2).click();
 await page.locator("#stage").scrollIntoViewIfNeeded();
 await page.waitForFunction(() => !/no mode/.test(document.getElementById("shape-note").textContent));

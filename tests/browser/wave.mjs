@@ -25,7 +25,7 @@ await page.locator("#shape-play").click();
 const turn = (degrees) => page.locator("#shape-phase").evaluate((slider, value) => {
   slider.value = value;
   slider.dispatchEvent(new Event("input", { bubbles: true }));
-  return document.querySelector("#shape").displacements[0];
+  return document.querySelector("#shape").displacements()[0];
 }, degrees);
 const pixels = () => page.locator("#shape").screenshot();
 

@@ -8,7 +8,7 @@ import { Modes } from "./modes.js";
 import { ShapeView } from "./shape.js";
 import { Status } from "./status.js";
 import { Timeline } from "./timeline.js";
-import { forgetColours } from "./format.js";
+import { forgetColours, known } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 const ask = async (path) => {
@@ -39,13 +39,17 @@ let eventsShown = -1;
 let asking = { map: false, history: false, events: false };
 
 let chosenAt = 0;
-let chosenMu = NaN;
+let chosenFor = [];
 let choices = 0;
+
+/** The conditions, and how far each may move before a shape is asked for again. */
+const conditions = (state) => [state.mu, state.load, state.speed];
+const moved = (now, then) => now.some((value, k) => !(Math.abs(value - then[k]) <= (k ? 0.02 * Math.abs(then[k]) : 0.005)));
 
 async function choose(id) {
   const order = ++choices;
   chosenAt = performance.now();
-  chosenMu = latest?.mu ?? NaN;
+  chosenFor = latest ? conditions(latest) : [];
   try {
     const moment = recording && latest ? `&at=${latest.time_s}` : "";
     const answer = await ask(`shape.json?id=${id}${moment}`);
@@ -99,6 +103,8 @@ function take(state) {
 
 /** What moves with every state. */
 function paint() {
+  // It may have been due when the connection went.
+  if (at("link").dataset.link === "gone") return;
   status.level(latest.level, latest.reason);
   status.needle(latest);
   map.cursor(latest);
@@ -115,7 +121,7 @@ function numbers() {
     const first = map.curves?.windows[0]?.mode_ids[0];
     if (latest.unstable) modes.select(fastest[0]);
     else if (map.curves) modes.select(first ?? fastest[0]);
-  } else if (modes.chosen !== null && performance.now() - chosenAt > 1500 && Math.abs(latest.mu - chosenMu) > 0.005) {
+  } else if (modes.chosen !== null && performance.now() - chosenAt > 1500 && known(latest.mu) && moved(conditions(latest), chosenFor)) {
     // Its shape changes with the conditions.
     choose(modes.chosen);
   }
@@ -141,11 +147,11 @@ function repaint() {
   shape.draw();
 }
 at("theme").addEventListener("click", () => {
-  const next = THEMES[(THEMES.indexOf(document.documentElement.dataset.theme ?? "auto") + 1) % 3];
-  if (next === "auto") delete document.documentElement.dataset.theme;
-  else document.documentElement.dataset.theme = next;
+  const chosen = THEMES[(THEMES.indexOf(document.documentElement.dataset.theme ?? "auto") + 1) % 3];
+  if (chosen === "auto") delete document.documentElement.dataset.theme;
+  else document.documentElement.dataset.theme = chosen;
   try {
-    localStorage.setItem("squealcast-theme", next);
+    localStorage.setItem("squealcast-theme", chosen);
   } catch {
     // Not kept then.
   }
@@ -160,8 +166,12 @@ if (recording) {
   at("age-unit").textContent = "s before";
   at("work").hidden = true;
   timeline = new Timeline(about, async (moment) => {
-    const state = await ask(`state.json?at=${moment}`);
-    take(state);
+    try {
+      take(await ask(`state.json?at=${moment}`));
+      link("file", "recording");
+    } catch {
+      return link("gone", "no answer");
+    }
     numbers();
     history.mark(moment);
   });
@@ -174,15 +184,30 @@ if (recording) {
   new ResizeObserver(() => timeline.paint(whole, measured)).observe(at("track-levels"));
   timeline.go(about.span_s[0]);
 } else {
-  const stream = new EventSource("stream");
-  stream.onopen = () => {
-    link("live", "live");
-    mapShown = 0;
-    loadHistory();
+  let stream;
+  const listen = () => {
+    heardAt = performance.now();
+    stream = new EventSource("stream");
+    stream.onopen = async () => {
+      link("live", "live");
+      mapShown = 0;
+      loadHistory();
+      // Another node may serve here now.
+      const now = await ask("about.json").catch(() => about);
+      if (JSON.stringify(now) !== JSON.stringify(about)) location.reload();
+    };
+    stream.onerror = () => link("gone", "no connection");
+    stream.onmessage = (event) => take(JSON.parse(event.data));
   };
-  stream.onerror = () => link("gone", "no connection");
-  stream.onmessage = (event) => take(JSON.parse(event.data));
+  // A browser keeps few connections to one place: a page that nobody sees leaves its own to others.
+  document.addEventListener("visibilitychange", () => {
+    stream?.close();
+    stream = undefined;
+    if (!document.hidden) listen();
+  });
+  if (!document.hidden) listen();
   setInterval(() => {
+    if (document.hidden) return;
     // A node that lives sends twice a second.
     if (latest && performance.now() - heardAt > 3000) link("gone", "no answer");
     next(numbers);

@@ -32,10 +32,11 @@ export class Events {
   #row(event) {
     const row = document.createElement("tr");
     row.className = event.class ?? event.kind.toLowerCase();
-    const duration = event.end_s === null ? "lasts" : fixed(event.end_s - event.onset_s, 2);
+    const moment = (at_s) => (this.start === undefined ? time(at_s) : `${fixed(at_s - this.start, 2)} s`);
+    const ends = known(event.end_s);
     const values = [
-      event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, this.start === undefined ? time(event.onset_s) : `${fixed(event.onset_s - this.start, 2)} s`,
-      duration, event.mode_id ?? NONE, this.#frequency(event.frequency_hz),
+      event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, moment(event.onset_s),
+      ends ? moment(event.end_s) : event.end_s === null ? "lasts" : NONE, ends ? fixed(event.end_s - event.onset_s, 2) : NONE, event.mode_id ?? NONE, this.#frequency(event.frequency_hz),
       fixed(event.friction_coefficient, 4), fixed(event.normal_load_n, 1), fixed(event.disc_speed_rad_s, 2),
     ];
     values.forEach((value, k) => {

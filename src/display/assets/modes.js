@@ -28,15 +28,16 @@ export class Modes {
       this.decimals.frequency.of(hz);
       this.decimals.growth.of(growth);
     }
-    modes.forEach(([id, [hz, growth, damping, pad, error]], place) => {
+    modes.forEach(([id, [hz, growth, damping, pad, hzError, growthError]], place) => {
       const { row, cells } = this.rows.get(id) ?? this.#row(id);
       if (this.body.children[place] !== row) this.body.insertBefore(row, this.body.children[place] ?? null);
       row.classList.toggle("grows", known(damping) && damping < -this.threshold);
       put(cells[0], this.decimals.frequency.text(hz), hz);
       put(cells[1], this.decimals.growth.text(growth), growth);
       put(cells[2], fixed(damping, 5), damping);
-      put(cells[3], known(error) ? bound(error) : NONE, error);
-      put(cells[4], known(pad) ? `${fixed(100 * pad, 0)} %` : NONE, pad);
+      put(cells[3], known(hzError) ? bound(hzError) : NONE, hzError);
+      put(cells[4], known(growthError) ? bound(growthError) : NONE, growthError);
+      put(cells[5], known(pad) ? `${fixed(100 * pad, 0)} %` : NONE, pad);
     });
   }
 
@@ -51,7 +52,7 @@ export class Modes {
     button.setAttribute("aria-pressed", "false");
     button.setAttribute("aria-label", `Show mode ${id}`);
     const swatch = document.createElement("span");
-    swatch.className = `swatch mode-${id % 7}`;
+    swatch.className = `swatch mode-${id % 7} dash-${Math.floor(id / 7) % 3}`;
     button.append(swatch, String(id));
     head.append(button);
     row.append(head);
@@ -60,7 +61,7 @@ export class Modes {
       // On a small screen the picture is elsewhere.
       document.querySelector(".panel.shape").scrollIntoView({ block: "nearest" });
     });
-    const cells = Array.from({ length: 5 }, () => {
+    const cells = Array.from({ length: 6 }, () => {
       const cell = document.createElement("td");
       const data = document.createElement("data");
       cell.append(data);

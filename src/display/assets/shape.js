@@ -261,6 +261,9 @@ class Sticks {
   }
 }
 
+/** The largest displacement, in units of the extent of what is shown. */
+const ENLARGED = 0.15;
+
 /** Interface nodes in space. */
 class Space {
   constructor(three, canvas) {
@@ -289,13 +292,36 @@ class Space {
   }
 
   dispose() {
+    this.#clear();
     this.renderer.dispose();
   }
 
+  #clear() {
+    this.scene.traverse((object) => {
+      object.geometry?.dispose();
+      object.material?.dispose();
+    });
+    this.scene.clear();
+  }
+
   take(shape) {
-    const { three, scene } = this;
-    scene.clear();
     const spatial = shape.parts.filter((part) => part.spatial && part.nodes_m.length);
+    // Most shapes are of the rig that stands there already.
+    const nodes = JSON.stringify(spatial.map((part) => part.nodes_m));
+    if (nodes !== this.nodes) this.#build(spatial);
+    this.nodes = nodes;
+    spatial.forEach((part, p) => {
+      const drawn = this.parts[p];
+      drawn.part = part;
+      drawn.tone.set(colour(part.name === "disc" ? "--mode-1" : "--mode-0"));
+      drawn.ghost.color.set(colour("--muted"));
+    });
+  }
+
+  /** The parts at rest: their nodes, and a net between them. */
+  #build(spatial) {
+    const { three, scene } = this;
+    this.#clear();
     const all = spatial.flatMap((part) => part.nodes_m);
     const low = [0, 1, 2].map((axis) => Math.min(...all.map((node) => node[axis])));
     const high = [0, 1, 2].map((axis) => Math.max(...all.map((node) => node[axis])));
@@ -309,14 +335,12 @@ class Space {
     const place = (node) => this.turned(node.map((value, axis) => (value - (low[axis] + high[axis]) / 2) / extent));
     this.parts = spatial.map((part) => {
       const rest = part.nodes_m.map(place).map(([x, y, z]) => [x, y, z + apart(part)]);
-      const tone = new three.Color(colour(part.name === "disc" ? "--mode-1" : "--mode-0"));
       const geometry = new three.BufferGeometry();
       const positions = new three.BufferAttribute(new Float32Array(3 * rest.length), 3);
       const colours = new three.BufferAttribute(new Float32Array(3 * rest.length), 3);
       geometry.setAttribute("position", positions);
       geometry.setAttribute("color", colours);
       const points = new three.Points(geometry, new three.PointsMaterial({ size: 0.05, vertexColors: true }));
-      geometry.setIndex(null);
       const wire = new three.BufferGeometry();
       wire.setAttribute("position", positions);
       wire.setAttribute("color", colours);
@@ -325,12 +349,12 @@ class Space {
       const still = new three.BufferGeometry();
       still.setAttribute("position", new three.BufferAttribute(new Float32Array(rest.flat()), 3));
       still.setIndex(wire.getIndex());
-      const ghost = new three.LineSegments(still, new three.LineBasicMaterial({ color: colour("--muted"), transparent: true, opacity: 0.25 }));
-      for (const object of [ghost, lines, points]) {
+      const ghost = new three.LineBasicMaterial({ transparent: true, opacity: 0.25 });
+      for (const object of [new three.LineSegments(still, ghost), lines, points]) {
         object.frustumCulled = false;
         scene.add(object);
       }
-      return { part, rest, positions, colours, tone };
+      return { rest, positions, colours, ghost, tone: new three.Color() };
     });
   }
 
@@ -355,15 +379,16 @@ class Space {
       const mixed = tone.clone();
       rest.forEach((node, k) => {
         const d = this.turned([u[3 * k], u[3 * k + 1], u[3 * k + 2]]);
-        positions.setXYZ(k, node[0] + 0.15 * d[0], node[1] + 0.15 * d[1], node[2] + 0.15 * d[2]);
+        positions.setXYZ(k, ...node.map((value, axis) => value + ENLARGED * d[axis]));
         mixed.copy(tone).lerp(bright, Math.min(0.7, 0.7 * Math.hypot(...d)));
         colours.setXYZ(k, mixed.r, mixed.g, mixed.b);
       });
       positions.needsUpdate = true;
       colours.needsUpdate = true;
     }
-    // For tests and for whoever wants the numbers.
-    this.canvas.displacements = this.parts.map(({ part }) => displaced(part.re, part.im, phase));
+    // For tests and for whoever wants the numbers: what is drawn, without its enlargement.
+    this.canvas.displacements = () => this.parts.map(({ rest, positions }) =>
+      rest.flatMap((node, k) => node.map((value, axis) => (positions.array[3 * k + axis] - value) / ENLARGED)));
     renderer.render(this.scene, camera);
   }
 }

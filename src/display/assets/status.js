@@ -46,7 +46,11 @@ export class Status {
   }
 
   needle(state) {
-    const { margin, trend_per_s: trend } = state;
+    const { margin, trend_per_s: trend, warn_margin: warn } = state;
+    if (known(warn) && warn !== this.warn) {
+      this.warn = warn;
+      this.#scale(Math.max(this.reach, 2 * warn));
+    }
     const needle = at("gauge-needle");
     needle.classList.toggle("none", !known(margin));
     at("gauge-trail").classList.toggle("none", !known(margin) || !known(trend));

@@ -70,11 +70,14 @@ export class Timeline {
     if (this.asking) return;
     this.asking = true;
     let asked;
-    do {
-      asked = this.moment;
-      await this.look(asked);
-    } while (asked !== this.moment && !this.playing);
-    this.asking = false;
+    try {
+      do {
+        asked = this.moment;
+        await this.look(asked);
+      } while (asked !== this.moment && !this.playing);
+    } finally {
+      this.asking = false;
+    }
   }
 
   #show() {
