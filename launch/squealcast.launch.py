@@ -1,6 +1,6 @@
 """Starts the node.
 
-ros2 launch launch/squealcast.launch.py rig:=nine-dof-case-2 record:=recordings
+ros2 launch launch/squealcast.launch.py rig:=tribometer record:=recordings
 ros2 launch launch/squealcast.launch.py --show-args
 """
 
@@ -14,7 +14,7 @@ from launch_ros.actions import Node
 HERE = Path(__file__).resolve().parent
 
 ARGUMENTS = [
-    DeclareLaunchArgument("rig", default_value="nine-dof-case-2", description="rig file, or name of an embedded rig"),
+    DeclareLaunchArgument("rig", default_value="tribometer", description="rig file, or name of an embedded rig"),
     DeclareLaunchArgument("domain", default_value="", description="DDS domain; empty: ROS_DOMAIN_ID, or 0"),
     DeclareLaunchArgument("loopback", default_value="false", description="true: speak to this machine alone"),
     DeclareLaunchArgument("record", default_value="", description="folder to record into; empty: no recording"),

@@ -31,8 +31,8 @@ const COLOURS: [RGBColor; 7] = [
 
 /// Dashes tell modes of the same colour apart: px drawn and px left out.
 const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
-/// Entries of a legend in a row, and the most it can have; more modes than that are told by nobody.
-const LEGEND_COLUMNS: usize = 9;
+/// Room for the entries of a legend, px, and the most it can have; more modes than that are told by nobody.
+const LEGEND_WIDTH: usize = 891;
 const LEGEND_MOST: usize = 27;
 
 /// One mode at one friction coefficient.
@@ -51,9 +51,16 @@ pub enum Unit {
     RadPerS,
 }
 
+/// A curve; those of the same label have the same style.
+struct Line<'a> {
+    style: u32,
+    label: String,
+    points: Vec<&'a Point>,
+}
+
 /// What is drawn against the friction coefficient.
 struct AgainstFriction<'a> {
-    lines: &'a [Point],
+    lines: Vec<Line<'a>>,
     dots: &'a [Point],
     windows: Vec<(f64, Option<f64>)>,
     mu: (f64, f64),
@@ -74,7 +81,7 @@ pub struct PlotError(String);
 /// [`PlotError`] where the drawing library refuses.
 pub fn sweep(title: &str, points: &[Point], windows: &[Window]) -> Result<String, PlotError> {
     AgainstFriction {
-        lines: points,
+        lines: by_mode(points),
         dots: &[],
         windows: windows.iter().map(|window| (window.mu_from, window.mu_to)).collect(),
         mu: range(points.iter().map(|point| point.mu)),
@@ -97,7 +104,28 @@ pub fn against_full(
     unit: Unit,
 ) -> Result<String, PlotError> {
     let windows = windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
-    AgainstFriction { lines, dots, windows, mu: (0.0, mu_max), marked: None, unit }.draw(title)
+    AgainstFriction { lines: by_mode(lines), dots, windows, mu: (0.0, mu_max), marked: None, unit }.draw(title)
+}
+
+/// Curves of several models as lines, each model in a style of its own under its name, and of another as dots.
+///
+/// # Errors
+/// [`PlotError`] where the drawing library refuses.
+pub fn several(title: &str, models: &[(String, Vec<Point>)], dots: &[Point], mu_max: f64) -> Result<String, PlotError> {
+    let lines = models.iter().enumerate().flat_map(|(k, (name, points))| {
+        by_mode(points).into_iter().map(move |line| Line { style: k as u32, label: name.clone(), ..line })
+    });
+    let (lines, mu) = (lines.collect(), (0.0, mu_max));
+    AgainstFriction { lines, dots, windows: vec![], mu, marked: None, unit: Unit::Hz }.draw(title)
+}
+
+/// A line for each mode.
+fn by_mode(points: &[Point]) -> Vec<Line<'_>> {
+    let mut modes: BTreeMap<u32, Vec<&Point>> = BTreeMap::new();
+    for point in points {
+        modes.entry(point.id).or_default().push(point);
+    }
+    modes.into_iter().map(|(id, points)| Line { style: id, label: format!("mode {id}"), points }).collect()
 }
 
 /// The curves of a stability map up to `mu_to`, as [`sweep`] draws them; a line marks the friction coefficient `marked`.
@@ -108,7 +136,7 @@ pub fn map(title: &str, curves: &Curves, mu_to: f64, marked: Option<f64>) -> Res
     let windows = curves.windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
     let from = curves.mu.first().copied().unwrap_or(0.0);
     let (lines, mu) = (points(curves, mu_to), (from, mu_to.max(from + 1e-6)));
-    AgainstFriction { lines: &lines, dots: &[], windows, mu, marked, unit: Unit::Hz }.draw(title)
+    AgainstFriction { lines: by_mode(&lines), dots: &[], windows, mu, marked, unit: Unit::Hz }.draw(title)
 }
 
 /// The points of some curves up to `mu_to`.
@@ -128,16 +156,15 @@ pub fn points(curves: &Curves, mu_to: f64) -> Vec<Point> {
 impl AgainstFriction<'_> {
     fn draw(&self, title: &str) -> Result<String, PlotError> {
         let mu = self.mu;
-        let mut modes: BTreeMap<u32, Vec<&Point>> = BTreeMap::new();
-        for point in self.lines {
-            modes.entry(point.id).or_default().push(point);
-        }
-        let ids: Vec<u32> = modes.keys().copied().collect();
-        let rows = if ids.len() > LEGEND_MOST { 0 } else { ids.len().div_ceil(LEGEND_COLUMNS) as u32 };
+        let mut entries: Vec<(u32, &str)> = self.lines.iter().map(|line| (line.style, &*line.label)).collect();
+        entries.dedup();
+        let longest = entries.iter().map(|(_, label)| label.chars().count()).max().unwrap_or(0);
+        let columns = (LEGEND_WIDTH / (43 + 8 * longest)).max(1);
+        let rows = if entries.len() > LEGEND_MOST { 0 } else { entries.len().div_ceil(columns) as u32 };
         figure(title, (1000, 760 + 24 * rows), |area| {
             let (head, area) = area.split_vertically(24 * rows * FINE);
             if rows > 0 {
-                legend(&head, &ids)?;
+                legend(&head, &entries, columns)?;
             }
             let (upper, lower) = area.split_vertically(50.percent());
             let growth: fn(&Point) -> f64 = |point| point.growth_rate_per_s;
@@ -146,7 +173,8 @@ impl AgainstFriction<'_> {
                 Unit::RadPerS => ("frequency, rad/s", |point| std::f64::consts::TAU * point.frequency_hz),
             };
             for (area, label, value) in [(&upper, "growth rate, 1/s", growth), (&lower, frequency_label, frequency)] {
-                let y = padded(range(self.lines.iter().chain(self.dots).map(value)));
+                let drawn = self.lines.iter().flat_map(|line| line.points.iter().copied()).chain(self.dots);
+                let y = padded(range(drawn.map(value)));
                 let mut chart = axes(area, mu, y, "friction coefficient", label)?;
                 for &(from, to) in &self.windows {
                     let (from, to) = (from.max(mu.0), to.unwrap_or(mu.1).min(mu.1));
@@ -154,8 +182,9 @@ impl AgainstFriction<'_> {
                         chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
                     }
                 }
-                for (&id, points) in &modes {
-                    curve(&mut chart, id, points.iter().map(|point| (point.mu, value(point))).collect())?;
+                for line in &self.lines {
+                    let points = line.points.iter().map(|point| (point.mu, value(point))).collect();
+                    curve(&mut chart, line.style, points)?;
                 }
                 let dot = |point: &Point| Circle::new((point.mu, value(point)), 3 * FINE / 2, BLACK.filled());
                 chart.draw_series(self.dots.iter().map(dot)).map_err(failed)?;
@@ -273,10 +302,11 @@ fn figure(
 }
 
 /// Which line is which mode, above the axes: it covers no curve.
-fn legend(area: &Area<'_>, ids: &[u32]) -> Result<(), PlotError> {
+fn legend(area: &Area<'_>, entries: &[(u32, &str)], columns: usize) -> Result<(), PlotError> {
     let size = |px: i32| px * FINE as i32;
-    for (k, &id) in ids.iter().enumerate() {
-        let (x, y) = (size(84 + 99 * (k % LEGEND_COLUMNS) as i32), size(12 + 24 * (k / LEGEND_COLUMNS) as i32));
+    let width = (LEGEND_WIDTH / columns) as i32;
+    for (k, &(id, label)) in entries.iter().enumerate() {
+        let (x, y) = (size(84 + width * (k % columns) as i32), size(12 + 24 * (k / columns) as i32));
         let ends = [(x, y), (x + size(28), y)];
         match DASHES[id as usize / COLOURS.len() % DASHES.len()] {
             None => area.draw(&PathElement::new(ends, style(id))).map_err(failed)?,
@@ -287,7 +317,7 @@ fn legend(area: &Area<'_>, ids: &[u32]) -> Result<(), PlotError> {
         }
         let place = Pos::new(HPos::Left, VPos::Center);
         let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(place);
-        area.draw(&Text::new(format!("mode {id}"), (x + size(34), y), text)).map_err(failed)?;
+        area.draw(&Text::new(label.to_owned(), (x + size(34), y), text)).map_err(failed)?;
     }
     Ok(())
 }
@@ -390,7 +420,7 @@ fn marker<'a, C: Clone + 'static>(k: usize, place: C, colour: RGBColor) -> DynEl
     }
 }
 
-/// The errors of natural frequencies over the contact stiffness, as the paper's Fig. 13: rms below, largest above, the
+/// The errors of natural frequencies over the contact stiffness, as the paper's Fig. 13: mean below, largest above, the
 /// range in which the rms error is below twice its minimum shaded, the minimiser marked. `stiffness_n_per_m` is that of
 /// a factor of 1; without it the axis is the factor.
 ///
@@ -403,7 +433,7 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
     let mut trials: Vec<&Trial> = found.curve.iter().chain([&found.best]).collect();
     trials.sort_by(|a, b| a.factor.total_cmp(&b.factor));
     let x = range(trials.iter().map(|trial| at(trial.factor)));
-    let y = padded(range(trials.iter().flat_map(|trial| [height(trial.rms_error), height(trial.largest_error)])));
+    let y = padded(range(trials.iter().flat_map(|trial| [height(trial.mean_error), height(trial.largest_error)])));
     let x_label = match stiffness_n_per_m {
         Some(_) => "contact stiffness of a pair, log10 N/m",
         None => "contact stiffness relative to the rig's, log10",
@@ -413,18 +443,22 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
         let [from, to] = found.doubled;
         let (from, to) = (from.map_or(x.0, &at), to.map_or(x.1, &at));
         chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
+        // Behind the curves, whose lowest points it would hide.
+        let best = at(found.best.factor);
+        let marked = RGBColor(150, 150, 150).stroke_width(FINE);
+        chart.draw_series(LineSeries::new([(best, y.0), (best, y.1)], marked)).map_err(failed)?;
         for (name, colour, side, of) in [
-            ("rms", COLOURS[0], VPos::Top, (|trial| trial.rms_error) as fn(&Trial) -> f64),
+            ("mean", COLOURS[0], VPos::Top, (|trial| trial.mean_error) as fn(&Trial) -> f64),
             ("largest", COLOURS[1], VPos::Bottom, |trial| trial.largest_error),
         ] {
             let line: Vec<_> = trials.iter().map(|trial| (at(trial.factor), height(of(trial)))).collect();
             let beside = Pos::new(HPos::Left, side);
             let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(beside).color(&colour);
-            chart.draw_series([Text::new(format!(" {name}"), line[0], text)]).map_err(failed)?;
+            let away = if matches!(side, VPos::Top) { -0.015 } else { 0.015 } * (y.1 - y.0);
+            let place = (line[0].0 + 0.01 * (x.1 - x.0), line[0].1 + away);
+            chart.draw_series([Text::new(name, place, text)]).map_err(failed)?;
             chart.draw_series(LineSeries::new(line, colour.stroke_width(2 * FINE))).map_err(failed)?;
         }
-        let best = at(found.best.factor);
-        chart.draw_series(LineSeries::new([(best, y.0), (best, y.1)], BLACK.stroke_width(2 * FINE))).map_err(failed)?;
         Ok(())
     })
 }

@@ -57,7 +57,7 @@ pub enum ProfileError {
 impl Profile {
     /// The paper's test, 500 N and 13 rad/s with a friction coefficient between 0.3 and 0.4, then a ramp from 0 to 1.
     pub fn paper() -> Self {
-        let corners = [
+        Self::of_friction(&[
             (0.0, 0.30),
             (3.0, 0.40),
             (6.0, 0.32),
@@ -67,15 +67,34 @@ impl Profile {
             (24.0, 1.0),
             (27.0, 1.0),
             (30.0, 0.30),
-        ];
-        let point = |(time_s, friction_coefficient)| ProfilePoint {
+        ])
+    }
+
+    /// The same in an order in which something happens soon: the ramp up to 1 and back, then the paper's test.
+    pub fn demo() -> Self {
+        Self::of_friction(&[
+            (0.0, 0.35),
+            (3.0, 0.40),
+            (10.0, 1.0),
+            (13.0, 1.0),
+            (18.0, 0.30),
+            (21.0, 0.40),
+            (24.0, 0.32),
+            (27.0, 0.38),
+            (30.0, 0.35),
+        ])
+    }
+
+    /// The paper's load and speed, the friction coefficient along straight lines between `(time_s, value)`, with noise.
+    fn of_friction(corners: &[(f64, f64)]) -> Self {
+        let point = |&(time_s, friction_coefficient): &(f64, f64)| ProfilePoint {
             time_s,
             normal_load_n: 500.0,
             disc_speed_rad_s: 13.0,
             friction_coefficient,
         };
         let noise = Noise { normal_load_n: 2.0, disc_speed_rad_s: 0.02, friction_coefficient: 0.002 };
-        Self { point: corners.map(point).to_vec(), noise }
+        Self { point: corners.iter().map(point).collect(), noise }
     }
 
     /// A profile from a TOML file.

@@ -31,7 +31,7 @@ fn rig_of(more: &str, sides: &[ModalSide<'_>]) -> Vec<RigFile> {
     let patch = "[[contact_patch]]\naxis_point_m = [0.0, 0.0, 0.0]\naxis_direction = [0.0, 1.0, 0.0]\n\
                  normal = [0.0, 1.0, 0.0]\nstiffness_n_per_m = 2e5\n";
     let patches: toml::Table = patch.parse().unwrap();
-    modal_rig("rig.toml", "test", &[], &more.parse().unwrap(), &patches["contact_patch"], None, sides).unwrap()
+    modal_rig("rig.toml", &[], &more.parse().unwrap(), patches.get("contact_patch"), None, sides, None).unwrap()
 }
 
 fn spectrum(rig: &Rig, p: &OperatingPoint) -> Spectrum {
@@ -181,4 +181,35 @@ fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
         assert!(found.errors.len() > 8 && found.worst() < 1e-6, "{mu}: {} {:e}", found.errors.len(), found.worst());
     }
     assert!(growing > 0, "no flutter among the conditions of this test");
+}
+
+/// Contact that stiffens with the load: a basis made at one load is found out by `verify` at others, and only there.
+#[test]
+fn a_rig_made_at_one_load_and_used_at_another_is_caught() {
+    let temp = tempfile::tempdir().unwrap();
+    let folder = temp.path().join("full");
+    run(["tribometer", "--dof", "5000", "-o", &text(&folder)]).exits(0);
+    let path = folder.join("tribometer.toml");
+    let hertzian = folder.join("hertzian.toml");
+    let written = fs::read_to_string(&path).unwrap().replace("max_hz = 4000.0", "max_hz = 2700.0");
+    fs::write(&hertzian, written + "\n[load]\nexponent = 0.3333333333333333\nreference_n = 500.0\n").unwrap();
+    let to = temp.path().join("at-500-n.toml");
+    run(["reduce", &text(&hertzian), "--range", "mu=0:1,load=500", "--points", "0", "-o", &text(&to)]).exits(0);
+    let verify = |rig: &std::path::Path, code: i32| {
+        let tolerance = ["--points", "2", "--no-windows", "--tolerance", "1e-6", "--json"];
+        let told = run([&["verify", &text(rig), "--against", &text(&hertzian)][..], &tolerance].concat()).exits(code);
+        let found = told.json();
+        eprintln!("{}", found["certificate"]);
+        found["certificate"]["max_relative_error"].as_f64().unwrap()
+    };
+    // 50 to 2000 N, of which nothing was told to the basis: more than the 1e-6 that it holds at 500 N.
+    let elsewhere = verify(&to, 3);
+    // The same rig at its own load: the range that points are drawn from is the rig's chart.
+    let mut near: toml::Table = fs::read_to_string(&to).unwrap().parse().unwrap();
+    let chart = near.entry("chart").or_insert_with(|| toml::Table::new().into()).as_table_mut().unwrap();
+    chart.insert("normal_load_n".to_owned(), vec![499.999, 500.001].into());
+    let own = temp.path().join("own-load.toml");
+    fs::write(&own, near.to_string()).unwrap();
+    let own = verify(&own, 0);
+    assert!(own < 1e-6 && elsewhere > 1e-6, "{own:e} {elsewhere:e}");
 }

@@ -777,7 +777,7 @@ fn help_states_units() {
         ("verify", &["--against <FULL>", "Highest frequency in Hz"]),
         ("reduce", &["--modes <I+J>", "--cutoff-hz <HZ>", "--range <mu=A:B,speed=A:B,load=A:B>"]),
         ("tribometer", &["--dof <N> Degrees of freedom"]),
-        ("reproduce", &["--output <DIR>"]),
+        ("reproduce", &["--dof <N> Degrees of freedom of the tribometer", "--output <DIR>"]),
         ("completions", &["bash", "fish", "zsh"]),
     ] {
         let help = flat(command);

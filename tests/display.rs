@@ -130,7 +130,7 @@ fn nothing_can_be_changed_and_no_other_site_gets_in() {
 #[test]
 fn a_state_comes_at_most_thirty_times_a_second_whatever_the_input_rate() {
     let _alone = alone();
-    let shown = Shown::demo(&["--rate", "2000"]);
+    let shown = Shown::demo(&["nine-dof-case-2", "--rate", "2000"]);
     let mut lines = BufReader::new(shown.listen()).lines();
     let mut states = lines.by_ref().map_while(Result::ok).filter(|line| line.starts_with("data: "));
     let mut state = || serde_json::from_str::<serde_json::Value>(&states.next().unwrap()[6..]).unwrap();
@@ -560,7 +560,7 @@ fn pages_do_not_slow_the_node() {
     let _alone = alone();
     const PHASE: Duration = Duration::from_secs(5);
     let directory = tempfile::tempdir().unwrap();
-    let shown = Shown::demo(&["--rate", "1000", "--record", directory.path().to_str().unwrap()]);
+    let shown = Shown::demo(&["nine-dof-case-2", "--rate", "1000", "--record", directory.path().to_str().unwrap()]);
     std::thread::sleep(Duration::from_secs(1));
     let wall_ns = || std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap().as_nanos() as u64;
     let stop = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
@@ -637,7 +637,7 @@ fn memory_is_flat_with_pages_attached() {
         return;
     }
     let _alone = alone();
-    let shown = Shown::demo(&["--rate", "1000", "--vibration", "0.36:0.33"]);
+    let shown = Shown::demo(&["nine-dof-case-2", "--rate", "1000", "--vibration", "0.36:0.33"]);
     let _stalled = shown.listen();
     for _ in 0..3 {
         let mut page = shown.listen();

@@ -158,6 +158,9 @@ fn the_rig_file_names_archives_by_their_hash_and_hands_on_the_tables() {
     run(["reduce", &path, "--cutoff-hz", "4000", "--no-residual", "--points", "0", "-o", &text(&to)]).exits(0);
     let below = Rig::load(to.to_str().unwrap()).unwrap();
     assert_ne!(names(&below), names(&rig));
+    // Archives that the rig file named before, and no longer does, are gone; others stay.
+    assert!(names(&rig).iter().all(|name| !folder.path().join(name).exists()), "{:?}", files_below(folder.path()));
+    assert!(names(&below).iter().all(|name| folder.path().join(name).exists()) && Path::new(&path).exists());
     let omega: Vec<f64> = (0..2)
         .map(|side| {
             let phi = &below.shapes[side];
@@ -169,6 +172,45 @@ fn the_rig_file_names_archives_by_their_hash_and_hands_on_the_tables() {
         })
         .collect();
     assert!(omega.iter().all(|omega| *omega < TAU * 4000.0 && *omega > TAU * 2500.0), "{omega:?}");
+}
+
+/// The same sums of the same residuals, made before the archive or after it, differ by rounding.
+#[test]
+fn a_compact_rig_is_the_same_rig() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = tribometer(folder.path(), 5000);
+    let [whole, compact] = ["whole", "compact"].map(|name| folder.path().join(format!("{name}.toml")));
+    let args = |to: &Path| ["reduce", &path, "--modes", "20+15", "--points", "0", "-o", &text(to)].map(str::to_owned);
+    run(args(&whole)).exits(0).says("residual   of pad and disc");
+    run(args(&compact).into_iter().chain(["--compact".to_owned()])).exits(0).says("residual   of the contact pairs");
+    let [one, other] = [&whole, &compact].map(|path| Rig::load(path.to_str().unwrap()).unwrap());
+    assert_eq!(one.band_max_hz, other.band_max_hz);
+    let stiffness = |rig: &Rig, mu: f64| {
+        let n = rig.model.dimension();
+        let (mut k, mut c) = (faer::Mat::zeros(n, n), faer::Mat::zeros(n, n));
+        rig.model.assemble(&rig.reference.with_friction(mu), &mut k, &mut c).unwrap();
+        k
+    };
+    for mu in [0.0, 0.7] {
+        let (a, b) = (stiffness(&one, mu), stiffness(&other, mu));
+        assert!((&a - &b).norm_l2() < 1e-13 * a.norm_l2(), "{mu}: {:e}", (&a - &b).norm_l2() / a.norm_l2());
+    }
+    let bytes = |rig: &Rig| rig.files.iter().map(|file| file.bytes.len()).sum::<usize>();
+    assert!(5 * bytes(&other) < bytes(&one), "{} {}", bytes(&other), bytes(&one));
+    // Another contact stiffness is as good as before, other modes are not.
+    let written = std::fs::read_to_string(&compact).unwrap();
+    other.with_contact_stiffness_times(0.5).unwrap();
+    let changed = |name: &str, from: &str, to: &str| {
+        assert!(written.contains(from), "{written}");
+        write(folder.path(), name, &written.replace(from, to))
+    };
+    let fewer = changed("fewer.toml", "[pad]", "[pad]\nmodes = 10");
+    run(["check", &fewer]).exits(1).complains("`pad.modes` leaves out modes that [residual] does not hold");
+    let pairs = other.files.iter().map(|file| file.name.as_str()).find(|name| name.contains("-residual-")).unwrap();
+    let pad = other.files.iter().map(|file| file.name.as_str()).find(|name| name.contains("-pad-")).unwrap();
+    run(["check", &changed("swapped.toml", pairs, pad)]).exits(1).complains("array `flexibility_normal` is missing");
+    run(["check", &changed("none.toml", pairs, "none.npz")]).exits(1).complains("residual.pairs = \"none.npz\"");
+    run(args(&compact).into_iter().chain(["--compact", "--no-residual"].map(str::to_owned))).exits(2);
 }
 
 #[test]

@@ -11,14 +11,14 @@ use crate::io::clock;
 use crate::io::heard::{Bus, Heard};
 use crate::io::ros_args::RosArgs;
 use crate::node::{self, Incoming};
-use crate::rig::Rig;
+use crate::rig::{EMBEDDED, Rig};
 use crate::simulator::{Profile, Simulator};
 
 /// Run the node with a simulated rig: what to try first. It hears nobody else, and announces itself on this machine only
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
-    #[arg(default_value = "nine-dof-case-2")]
+    #[arg(default_value = EMBEDDED[0].name)]
     rig: String,
     /// Measurements per second
     #[arg(long, value_name = "HZ", value_parser = rate_hz, default_value = "100")]
@@ -42,7 +42,7 @@ impl Options {
         let rig = Arc::new(Rig::load(&self.rig)?);
         let (sender, receiver) = node::channel();
         let period = period(self.rate);
-        let mut measuring = Measuring::new(Simulator::new(Profile::paper(), self.seed), self.vibration, period);
+        let mut measuring = Measuring::new(Simulator::new(Profile::demo(), self.seed), self.vibration, period);
         let (measurements, duration) = (sender.clone(), self.duration);
         std::thread::spawn(move || {
             let started = Instant::now();

@@ -10,15 +10,14 @@ use super::signals::on_stop;
 use super::steps::{GIB, Steps};
 use super::{Outcome, positive, print};
 use crate::certificate::{Against, Certificate, verify_against};
-use crate::export::{ModalSide, basis_rig, modal_rig};
-use crate::full_model::{FullModelFile, PartGeometry};
+use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
+use crate::full_model::FullModelFile;
 use crate::io::memory::available_bytes;
 use crate::io::whole_file::{beside, write_whole};
-use crate::reduction::{Kept, Progress, Substructure, Wanted, keep_modes};
-use crate::rig::{Rig, RigFile};
+use crate::physics::ResidualFlexibility;
+use crate::reduction::{Kept, Progress, Residual, Wanted};
+use crate::rig::{Rig, RigFile, SideResidual, between_patches};
 
-/// Remarks on where the full model is from, before those on what was kept of it.
-const REMARKS_OF_SOURCE: usize = 2;
 /// The cut-off of the modes kept, relative to the band, where nothing else is asked for.
 const CUTOFF: f64 = 2.5;
 
@@ -49,6 +48,9 @@ pub struct Options {
     /// Leave out what the modes left out do at the contact
     #[arg(long)]
     no_residual: bool,
+    /// Keep what the modes left out do between this model's contact pairs alone: a twelfth of the size, for these patches only
+    #[arg(long, conflicts_with_all = ["no_residual", "tolerance", "range"])]
+    compact: bool,
     /// Held-out operating points at which the rig is compared with the full model; 0 leaves the comparison out
     #[arg(long, value_name = "N", default_value_t = 3)]
     points: usize,
@@ -93,7 +95,7 @@ impl Options {
         let full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
         let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
-        if self.modes.is_none() && self.cutoff_hz.is_none() && !self.no_residual {
+        if self.modes.is_none() && self.cutoff_hz.is_none() && !self.no_residual && !self.compact {
             let (tolerance, range) = (self.tolerance.unwrap_or(TOLERANCE), self.range.unwrap_or_default());
             let (request, basis) = basis_of(&full, tolerance, range, limit, &mut |text| steps.say(text))?;
             let method = format!("{} vectors of the full model", basis.projected.omega_squared.len());
@@ -104,41 +106,19 @@ impl Options {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
         }
         let wanted = self.wanted(&full)?;
-        let rows: Vec<Vec<Option<usize>>> = full.geometry.iter().map(interface_rows).collect();
-        let parts: Vec<Substructure<'_>> = full
-            .model
-            .parts
-            .iter()
-            .zip(&rows)
-            .zip(&wanted)
-            .map(|((part, rows), &wanted)| Substructure {
-                name: &part.name,
-                mass: &part.mass,
-                stiffness: &part.stiffness,
-                rows,
-                wanted,
-            })
-            .collect();
-        let names: Vec<&str> = parts.iter().map(|part| part.name).collect();
-        let kept =
-            keep_modes(&parts, !self.no_residual, limit, &mut |part, what| tell(&mut steps, part, names[part], what))?;
-        let sides: Vec<ModalSide<'_>> = full
-            .geometry
-            .iter()
-            .zip(&kept)
-            .zip(&rows)
-            .zip(&names)
-            .map(|(((geometry, kept), rows), name)| {
-                let nodes_m = geometry.interface.iter().map(|&node| geometry.nodes_m[node]).collect();
-                ModalSide::new(name, kept, nodes_m, rows, geometry.damping_ratio)
-            })
-            .collect();
-        let patches = contact_patches(&full.path)?;
-        let remarks = remarks(&full, &names, &kept);
+        let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
+        let kept = full.keep_modes(&wanted, !self.no_residual, limit, &mut |part, what| {
+            tell(&mut steps, part, names[part], what)
+        })?;
+        let mut sides = modal_sides(&full, &kept);
+        let residual = if self.compact { between_pairs(&file, &full, &mut sides)? } else { None };
+        let (kept, mut remarks) = (remarks(&names, &kept), source_remarks(&full));
+        remarks.extend(kept.iter().cloned());
         let make = |known: Option<&Certificate>| {
-            modal_rig(&file, &full.name, &remarks, &full.common_tables, &patches, known, &sides)
+            let patches = full.contact_patches.as_ref();
+            modal_rig(&file, &remarks, &full.common_tables, patches, known, &sides, residual.as_ref())
         };
-        self.finish(steps, &unfinished, &full, limit, remarks[REMARKS_OF_SOURCE..].join("; "), &make)
+        self.finish(steps, &unfinished, &full, limit, kept.join("; "), &make)
     }
 
     /// Compares what is left with the full model, and writes the files of the rig with what was found.
@@ -177,7 +157,10 @@ impl Options {
                 }
             }
         }
+        let replaced = replaced(&self.output, &files);
         unfinished.write(self.output.parent().unwrap_or(Path::new("")), &files)?;
+        // The rig file no longer names them; what cannot be removed harms nobody.
+        replaced.into_iter().for_each(|path| drop(std::fs::remove_file(path)));
         steps.say(&format!("{} written", self.output.display()));
         drop(steps);
         print(&format!("{}\n", rig.describe()))?;
@@ -202,32 +185,34 @@ impl Options {
     }
 }
 
-/// The rows of x, y and z of every interface node; `None` where a direction is held.
-pub fn interface_rows(geometry: &PartGeometry) -> Vec<Option<usize>> {
-    let row_of: std::collections::HashMap<(usize, usize), usize> =
-        geometry.rows.iter().enumerate().map(|(row, &place)| (place, row)).collect();
-    let places = geometry.interface.iter().flat_map(|&node| (0..3).map(move |direction| (node, direction)));
-    places.map(|place| row_of.get(&place).copied()).collect()
+/// The residual of both sides between the contact pairs of `full`, taken from the sides.
+fn between_pairs(
+    file: &str,
+    full: &FullModelFile,
+    sides: &mut [ModalSide<'_>],
+) -> anyhow::Result<Option<ResidualFlexibility>> {
+    let ([pad, disc], Some(patches)) = (sides, &full.contact_patches) else {
+        bail!("{}: --compact is for a pad on a disc that is not rigid", full.path.display());
+    };
+    let mut known = vec![];
+    for (disc, side) in [(false, &mut *pad), (true, &mut *disc)] {
+        let of_side = |residual: &'_ Residual| (disc, residual.clone());
+        known.extend(side.residual.take().map(of_side));
+    }
+    let known: Vec<SideResidual<'_>> = known
+        .iter()
+        .map(|(disc, residual)| SideResidual {
+            disc: *disc,
+            flexibility: &residual.flexibility,
+            inertia: Some(&residual.inertia),
+        })
+        .collect();
+    Ok(Some(between_patches(file, patches, [&pad.nodes_m, &disc.nodes_m], &known)?))
 }
 
-/// The contact patches of a full model as they are written; their nodes are counted as a rig's are.
-fn contact_patches(path: &Path) -> anyhow::Result<toml::Value> {
-    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
-    let table: toml::Table = text.parse().with_context(|| path.display().to_string())?;
-    table.get("contact_patch").cloned().with_context(|| format!("{}: `contact_patch` is gone", path.display()))
-}
-
-/// What the rig was made of, for its head.
-fn remarks(full: &FullModelFile, names: &[&str], kept: &[Kept]) -> Vec<String> {
-    let mut lines = vec![
-        format!(
-            "Reduced by squealcast {} from {}: {} degrees of freedom, SHA-256",
-            env!("CARGO_PKG_VERSION"),
-            full.path.file_name().unwrap_or_default().to_string_lossy(),
-            full.model.dimension()
-        ),
-        full.content_hash.clone(),
-    ];
+/// What was kept of each part, for the head of the rig file.
+fn remarks(names: &[&str], kept: &[Kept]) -> Vec<String> {
+    let mut lines = vec![];
     for (name, kept) in names.iter().zip(kept) {
         let highest = kept.modes.omega_squared.last().map_or(0.0, |square| square.max(0.0).sqrt() / TAU);
         lines.push(format!(
@@ -240,7 +225,7 @@ fn remarks(full: &FullModelFile, names: &[&str], kept: &[Kept]) -> Vec<String> {
 }
 
 /// What a part is doing, in words.
-fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
+pub fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
     match what {
         Progress::Analysing => steps.say(&format!("{name}: ordering and analysing")),
         Progress::Analysed { factor_entries, bytes } => steps.say(&format!(
@@ -259,6 +244,34 @@ fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
         }
         Progress::Loaded { solved, loads } => steps.at(part, &format!("{name}: residual"), solved, loads),
     }
+}
+
+/// Archives and matrices that the rig file at `path` names now, as this command names them, and `files` do not.
+fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
+    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let Some(stem) = path.file_stem() else { return vec![] };
+    let start = format!("{}-", stem.to_string_lossy());
+    let named = |text: &str| -> Option<PathBuf> {
+        let (rest, kind) = text.strip_prefix(&start)?.rsplit_once('.')?;
+        let hash = rest.rsplit('-').next().unwrap_or_default();
+        let ours = ["npz", "mtx"].contains(&kind)
+            && hash.len() == HASH_DIGITS
+            && hash.bytes().all(|digit| digit.is_ascii_hexdigit())
+            && !text.contains(['/', '\\']);
+        (ours && files.iter().all(|file| file.name != text)).then(|| path.with_file_name(text))
+    };
+    fn strings(value: &toml::Value, visit: &mut dyn FnMut(&str)) {
+        match value {
+            toml::Value::String(text) => visit(text),
+            toml::Value::Array(values) => values.iter().for_each(|value| strings(value, visit)),
+            toml::Value::Table(table) => table.iter().for_each(|(_, value)| strings(value, visit)),
+            _ => {}
+        }
+    }
+    let mut found = vec![];
+    let table = text.parse::<toml::Table>().unwrap_or_default();
+    strings(&table.into(), &mut |text| found.extend(named(text)));
+    found
 }
 
 /// Files that are not there in full yet, or not of use without the last one.

@@ -3,12 +3,29 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
-use super::{Outcome, write_file};
-use crate::reproduce::{Item, index, nine_dof};
+use super::on_basis::{Ranges, TOLERANCE, basis_of};
+use super::reduce::tell;
+use super::steps::{GIB, Steps};
+use super::{Outcome, positive, write_file};
+use crate::export::write_full_model;
+use crate::fem::tribometer::{Dimensions, Tribometer};
+use crate::full_model::FullModelFile;
+use crate::io::memory::available_bytes;
+use crate::reduction::Wanted;
+use crate::reproduce::{Item, MODES, Study, index, nine_dof};
 
 /// Make the paper's tables and figures again: CSV, SVG and one page beside the paper's numbers
+///
+/// Those of its nine-degree-of-freedom models in a second, those of its tribometer, on a full model of this project, in some
+/// minutes. The full model is written into the folder, too.
 #[derive(Debug, Args)]
 pub struct Options {
+    /// Degrees of freedom of the tribometer, at least; the paper's model has 904968
+    #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = clap::value_parser!(u32).range(5_000..=4_000_000))]
+    dof: u32,
+    /// Memory that may be used [default: what the machine has to spare]
+    #[arg(long, value_name = "GIB", value_parser = positive)]
+    memory_gib: Option<f64>,
     /// Folder to write into
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
@@ -18,13 +35,32 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         std::fs::create_dir_all(&self.output)
             .with_context(|| format!("{}: cannot make the folder", self.output.display()))?;
-        let items = nine_dof()?;
-        for item in &items {
-            self.write(item)?;
-        }
+        let mut items = nine_dof()?;
+        items.iter().try_for_each(|item| self.write(item))?;
+        let of_tribometer = self.tribometer()?;
+        of_tribometer.iter().try_for_each(|item| self.write(item))?;
+        items.extend(of_tribometer);
         // Last: where the page is, all of it is.
         self.file("index.html", &index(&items))?;
         Ok(Outcome::Done)
+    }
+
+    /// Section 4 of the paper.
+    fn tribometer(&self) -> anyhow::Result<Vec<Item>> {
+        let mut steps = Steps::new(2);
+        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
+        let folder = self.output.join("tribometer");
+        write_full_model(&Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?, &folder, |_| ())?;
+        steps.say(&format!("{} written", folder.display()));
+        let full = FullModelFile::load(&folder.join("tribometer.toml"))?;
+        steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
+        let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
+        let most = Wanted::Lowest(MODES.into_iter().max().unwrap_or(0));
+        let kept = full.keep_modes(&vec![most; names.len()], true, limit, &mut |part, what| {
+            tell(&mut steps, part, names[part], what);
+        })?;
+        let (_, basis) = basis_of(&full, TOLERANCE, Ranges::default(), limit, &mut |text| steps.say(text))?;
+        Study { full: &full, kept: &kept, basis: &basis, memory_limit_bytes: limit }.items(&mut |text| steps.say(text))
     }
 
     fn write(&self, item: &Item) -> anyhow::Result<()> {

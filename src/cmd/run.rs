@@ -18,7 +18,7 @@ use crate::io::ros_args::RosArgs;
 use crate::io::ros2::{Parameters, Ros2};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::node::{self, Incoming, Node, Outputs, Shortcut, Watch};
-use crate::rig::Rig;
+use crate::rig::{EMBEDDED, Rig};
 use crate::session::Counters;
 use crate::settings::{self, Settings};
 
@@ -26,6 +26,7 @@ use crate::settings::{self, Settings};
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
+    #[arg(default_value = EMBEDDED[0].name)]
     rig: String,
     #[command(flatten)]
     buses: BusOptions,
@@ -85,6 +86,9 @@ pub fn serve(
     if let Some(known) = &rig.reduction {
         eprintln!("{}", known.told());
     }
+    // Before the recording begins, so that it is finished whenever the signal comes.
+    let stop = sender.clone();
+    signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let mut initial = Settings::for_rig(rig);
     let addresses = options.display.addresses()?;
     let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
@@ -128,8 +132,6 @@ pub fn serve(
         outputs.ros2 = Some(started.context("ROS 2; --no-ros stays off it")?);
     }
 
-    let stop = sender.clone();
-    signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let watch = Watch::default();
     let display = display::of_node(&addresses, rig, &watch, options.threshold);
     let shown = live::show(frame(rig, display.as_ref(), sender.clone()), watch.clone(), options.plain);

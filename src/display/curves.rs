@@ -293,8 +293,10 @@ mod tests {
     /// The curves against spectra solved where they are drawn.
     #[test]
     fn curves_follow_the_modes_between_the_nodes_and_through_mergings() {
-        for (name, _) in EMBEDDED {
-            let rig = Rig::load(name).unwrap();
+        // Those of which all modes are in the band.
+        for embedded in EMBEDDED.iter().filter(|embedded| embedded.name.starts_with("nine-dof")) {
+            let rig = Rig::load(embedded.name).unwrap();
+            let name = embedded.name;
             let mut solver = Solver::new(rig.model.dimension());
             let map = StabilityMap::build(&rig.model, &mut solver, &rig.reference, &map_options(&rig)).unwrap();
             let curves = Curves::new(&map, rig.band_max_hz);

@@ -1,15 +1,13 @@
 //! A full model on a parametric basis to a rig file: pad and disc on shared coordinates, or a system of small matrices.
 
-use std::collections::HashMap;
-
 use anyhow::Context;
 use faer::Mat;
 use sha2::{Digest, Sha256};
 
 use super::matrix_market::write_array;
-use super::rig::{HASH_DIGITS, ModalSide, modal_rig};
+use super::rig::{HASH_DIGITS, ModalSide, modal_rig, rig_name, source_remarks};
 use crate::certificate::Certificate;
-use crate::full_model::{FullModelFile, PartGeometry};
+use crate::full_model::FullModelFile;
 use crate::physics::{Law, Term};
 use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
 use crate::rig::RigFile;
@@ -34,14 +32,10 @@ pub fn basis_rig(
             let known = toml::Value::try_from(known).context("the comparison cannot be put into words of TOML")?;
             common.insert("reduction".to_owned(), known);
         }
-        return system_rig(file, full, basis, &remarks, &common);
+        return system_rig(file, basis, &remarks, &common);
     }
     record.insert("shared".to_owned(), true.into());
     common.insert("basis".to_owned(), record.into());
-    let text = std::fs::read_to_string(&full.path).with_context(|| full.path.display().to_string())?;
-    let table: toml::Table = text.parse().with_context(|| full.path.display().to_string())?;
-    let patches =
-        table.get("contact_patch").with_context(|| format!("{}: `contact_patch` is gone", full.path.display()))?;
     let projected = &basis.projected;
     let sides: Vec<ModalSide<'_>> = full
         .model
@@ -50,10 +44,10 @@ pub fn basis_rig(
         .zip(full.model.offsets())
         .zip(&full.geometry)
         .map(|((part, offset), geometry)| {
-            let rows = interface_rows(geometry);
+            let rows = geometry.interface_rows();
             ModalSide {
                 name: &part.name,
-                nodes_m: geometry.interface.iter().map(|&node| geometry.nodes_m[node]).collect(),
+                nodes_m: geometry.interface_m(),
                 // A rigid-body motion is found a rounding above or below zero.
                 omega_rad_s: projected.omega_squared.iter().map(|square| square.max(0.0).sqrt()).collect(),
                 phi: Mat::from_fn(rows.len(), projected.omega_squared.len(), |i, k| {
@@ -68,7 +62,7 @@ pub fn basis_rig(
             }
         })
         .collect();
-    modal_rig(file, &full.name, &remarks, &common, patches, known, &sides)
+    modal_rig(file, &remarks, &common, full.contact_patches.as_ref(), known, &sides, None)
 }
 
 /// The common tables of the full model, what a rig searches and prepares cut down to what the basis was made for.
@@ -93,23 +87,14 @@ fn within(common: &toml::Table, request: &ParametricRequest) -> toml::Table {
     tables
 }
 
-/// The rows of x, y and z of every interface node; `None` where a direction is held.
-fn interface_rows(geometry: &PartGeometry) -> Vec<Option<usize>> {
-    let row_of: HashMap<(usize, usize), usize> =
-        geometry.rows.iter().enumerate().map(|(row, &place)| (place, row)).collect();
-    let places = geometry.interface.iter().flat_map(|&node| (0..3).map(move |direction| (node, direction)));
-    places.map(|place| row_of.get(&place).copied()).collect()
-}
-
 /// `[system]` of dense matrices in array form; the mass matrix is the unit matrix.
 fn system_rig(
     file: &str,
-    full: &FullModelFile,
     basis: &ParametricBasis,
     remarks: &[String],
     common: &toml::Table,
 ) -> anyhow::Result<Vec<RigFile>> {
-    let stem = std::path::Path::new(file).file_stem().map_or(file.into(), |stem| stem.to_string_lossy());
+    let stem = rig_name(file);
     let mut files = vec![];
     let mut write = |what: &str, matrix: &Mat<f64>| -> anyhow::Result<toml::Value> {
         let mut bytes = vec![];
@@ -141,7 +126,7 @@ fn system_rig(
         }
     }
     let mut table = toml::Table::new();
-    table.insert("name".to_owned(), full.name.as_str().into());
+    table.insert("name".to_owned(), stem.as_str().into());
     table.extend(common.clone());
     table.insert("system".to_owned(), system.into());
     let mut text: String = remarks.iter().map(|line| format!("# {line}\n")).collect();
@@ -167,21 +152,13 @@ fn record(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricB
 
 /// What the rig was made of, for its head.
 fn remarks(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricBasis) -> Vec<String> {
-    let mut lines = vec![
-        format!(
-            "Reduced by squealcast {} from {}: {} degrees of freedom, SHA-256",
-            env!("CARGO_PKG_VERSION"),
-            full.path.file_name().unwrap_or_default().to_string_lossy(),
-            full.model.dimension()
-        ),
-        full.content_hash.clone(),
-        format!(
-            "{} vectors, of right and left vectors of the full model at {} operating points; tolerance {:e}, held out:",
-            basis.projected.omega_squared.len(),
-            basis.sampled.len(),
-            request.tolerance
-        ),
-    ];
+    let mut lines = source_remarks(full);
+    lines.push(format!(
+        "{} vectors, of right and left vectors of the full model at {} operating points; tolerance {:e}, held out:",
+        basis.projected.omega_squared.len(),
+        basis.sampled.len(),
+        request.tolerance
+    ));
     lines.extend(basis.held_out.iter().map(|held| {
         format!(
             "  {} N, {} rad/s, friction coefficient {}: {} roots, largest |dlambda|/|lambda| {:.1e}",

@@ -12,5 +12,5 @@ pub use basis::basis_rig;
 pub use calculix::write_deck;
 pub use full_model::write_full_model;
 pub use matrix_market::write_symmetric;
-pub use rig::{ModalSide, modal_rig};
+pub use rig::{HASH_DIGITS, ModalSide, modal_rig, modal_sides, source_remarks};
 pub use vtk::write_mesh;

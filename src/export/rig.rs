@@ -11,11 +11,18 @@ use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
 use crate::certificate::Certificate;
-use crate::reduction::{Kept, Residual};
+use crate::full_model::{FullModelFile, PartGeometry};
+use crate::physics::ResidualFlexibility;
+use crate::reduction::{FullPart, Kept, Residual};
 use crate::rig::RigFile;
 
+/// The name of the rig in a rig file called `file`.
+pub(super) fn rig_name(file: &str) -> String {
+    Path::new(file).file_stem().map_or(file.into(), |stem| stem.to_string_lossy()).into_owned()
+}
+
 /// Digits of a hash that a name carries.
-pub(super) const HASH_DIGITS: usize = 12;
+pub const HASH_DIGITS: usize = 12;
 
 /// One side of a rig of kind 2.
 #[derive(Clone, Debug)]
@@ -36,99 +43,138 @@ pub struct ModalSide<'a> {
     pub mass_share: Option<Mat<f64>>,
 }
 
-impl<'a> ModalSide<'a> {
-    /// What was kept of a substructure, `rows` being those of x, y and z of every interface node.
-    pub fn new(
-        name: &'a str,
-        kept: &'a Kept,
-        nodes_m: Vec<[f64; 3]>,
-        rows: &[Option<usize>],
-        damping_ratio: Option<f64>,
-    ) -> Self {
-        let phi = kept.modes.phi.as_ref();
-        Self {
-            name,
-            nodes_m,
+/// What was kept of pad and disc of a full model.
+pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> Vec<ModalSide<'a>> {
+    let side = |((part, geometry), kept): ((&'a FullPart, &PartGeometry), &'a Kept)| {
+        let (rows, phi) = (geometry.interface_rows(), kept.modes.phi.as_ref());
+        ModalSide {
+            name: &part.name,
+            nodes_m: geometry.interface_m(),
             // A rigid-body motion is found a rounding above or below zero.
             omega_rad_s: kept.modes.omega_squared.iter().map(|square| square.max(0.0).sqrt()).collect(),
             phi: Mat::from_fn(rows.len(), phi.ncols(), |i, mode| rows[i].map_or(0.0, |row| phi[(row, mode)])),
             residual: kept.residual.as_ref(),
-            damping_ratio,
+            damping_ratio: geometry.damping_ratio,
             mass_share: None,
         }
-    }
+    };
+    full.model.parts.iter().zip(&full.geometry).zip(kept).map(side).collect()
+}
 
-    /// The arrays that a rig of kind 2 reads, as `numpy.savez` would write them.
+/// Lines of comment: what a rig was reduced from.
+pub fn source_remarks(full: &FullModelFile) -> Vec<String> {
+    let file = full.path.file_name().unwrap_or_default().to_string_lossy();
+    vec![
+        format!(
+            "Reduced by squealcast {} from {file}: {} degrees of freedom, SHA-256",
+            env!("CARGO_PKG_VERSION"),
+            full.model.dimension()
+        ),
+        full.content_hash.clone(),
+    ]
+}
+
+impl ModalSide<'_> {
+    /// The arrays that a rig of kind 2 reads.
     fn archive(&self) -> std::io::Result<Vec<u8>> {
-        let mut bytes = Cursor::new(vec![]);
-        let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
-        let mut write = |name: &str, shape: &[usize], values: &mut dyn Iterator<Item = f64>| -> std::io::Result<()> {
-            let shape: Vec<u64> = shape.iter().map(|&length| length as u64).collect();
-            // The time of writing would make the same modes another archive.
-            let options = FileOptions::default().last_modified_time(DateTime::default());
-            let array = archive.array(name, options).map_err(std::io::Error::other)?;
-            let mut writer = array.default_dtype().shape(&shape).begin_nd()?;
-            writer.extend(values)?;
-            writer.finish()
-        };
-        let (count, modes) = (self.nodes_m.len(), self.omega_rad_s.len());
-        write("omega_rad_s", &[modes], &mut self.omega_rad_s.iter().copied())?;
-        let phi = &self.phi;
-        let rows = (0..3 * count).flat_map(|row| (0..modes).map(move |mode| phi[(row, mode)]));
-        write("phi", &[count, 3, modes], &mut { rows })?;
-        write("nodes_m", &[count, 3], &mut self.nodes_m.iter().flatten().copied())?;
+        let (count, modes, phi) = (self.nodes_m.len(), self.omega_rad_s.len(), &self.phi);
+        let mut arrays = vec![
+            ("omega_rad_s", vec![modes], self.omega_rad_s.clone()),
+            ("phi", vec![count, 3, modes], by_rows(phi)),
+            ("nodes_m", vec![count, 3], self.nodes_m.iter().flatten().copied().collect()),
+        ];
         if let Some(share) = &self.mass_share {
-            let entries = (0..modes).flat_map(|row| (0..modes).map(move |column| share[(row, column)]));
-            write("mass_share", &[modes, modes], &mut { entries })?;
+            arrays.push(("mass_share", vec![modes, modes], by_rows(share)));
         }
         if let Some(residual) = self.residual {
-            let matrices = [("residual_flexibility", &residual.flexibility), ("residual_inertia", &residual.inertia)];
-            for (name, matrix) in matrices {
-                let n = matrix.nrows();
-                let entries = (0..n).flat_map(|row| (0..n).map(move |column| matrix[(row, column)]));
-                write(name, &[n, n], &mut { entries })?;
-            }
+            let n = residual.flexibility.nrows();
+            arrays.push(("residual_flexibility", vec![n, n], by_rows(&residual.flexibility)));
+            arrays.push(("residual_inertia", vec![n, n], by_rows(&residual.inertia)));
         }
-        drop(archive);
-        Ok(bytes.into_inner())
+        packed(&arrays)
     }
+}
+
+/// What the modes left out do between contact pairs, as a rig of kind 2 reads it.
+fn residual_archive(residual: &ResidualFlexibility) -> std::io::Result<Vec<u8>> {
+    let c = residual.normal.nrows();
+    let lower = |m: &Mat<f64>| (0..c).flat_map(|i| (0..=i).map(move |j| m[(i, j)])).collect::<Vec<f64>>();
+    let mut arrays = vec![
+        ("flexibility_normal", vec![c * (c + 1) / 2], lower(&residual.normal)),
+        ("flexibility_sliding", vec![c, c], by_rows(&residual.sliding)),
+    ];
+    if let Some([normal, sliding]) = &residual.inertia {
+        arrays.push(("inertia_normal", vec![c * (c + 1) / 2], lower(normal)));
+        arrays.push(("inertia_sliding", vec![c, c], by_rows(sliding)));
+    }
+    packed(&arrays)
+}
+
+fn by_rows(matrix: &Mat<f64>) -> Vec<f64> {
+    (0..matrix.nrows()).flat_map(|i| (0..matrix.ncols()).map(move |j| matrix[(i, j)])).collect()
+}
+
+/// An archive of arrays: name, shape and values in C order, as `numpy.savez` would write it.
+fn packed(arrays: &[(&str, Vec<usize>, Vec<f64>)]) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Cursor::new(vec![]);
+    let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
+    for (name, shape, values) in arrays {
+        let shape: Vec<u64> = shape.iter().map(|&length| length as u64).collect();
+        // The time of writing would make the same modes another archive.
+        let options = FileOptions::default().last_modified_time(DateTime::default());
+        let array = archive.array(name, options).map_err(std::io::Error::other)?;
+        let mut writer = array.default_dtype().shape(&shape).begin_nd()?;
+        writer.extend(values.iter().copied())?;
+        writer.finish()?;
+    }
+    drop(archive);
+    Ok(bytes.into_inner())
 }
 
 /// The files of a rig of kind 2: the rig file, called `file`, first, then the archives it names.
 ///
-/// `common` are the tables that full models and rigs share; `patches` is `contact_patch` with nodes counted as in the
-/// sides; `reduction`, where it is known, is how far the rig is from its full model; `remarks` are lines of comment at the
-/// top.
+/// The rig is named as its file. `common` are the tables that full models and rigs share; `patches` is `contact_patch` with
+/// nodes counted as in the sides; `reduction`, where it is known, is how far the rig is from its full model; `remarks` are
+/// lines of comment at the top; `residual` is what the modes left out do between pairs, where the sides do not have it.
 ///
 /// # Errors
 /// What could not be put into words of TOML or into an archive.
 pub fn modal_rig(
     file: &str,
-    name: &str,
     remarks: &[String],
     common: &toml::Table,
-    patches: &toml::Value,
+    patches: Option<&toml::Value>,
     reduction: Option<&Certificate>,
     sides: &[ModalSide<'_>],
+    residual: Option<&ResidualFlexibility>,
 ) -> anyhow::Result<Vec<RigFile>> {
-    let stem = Path::new(file).file_stem().map_or(file.into(), |stem| stem.to_string_lossy());
+    let stem = rig_name(file);
     let mut table = toml::Table::new();
-    table.insert("name".to_owned(), name.into());
+    table.insert("name".to_owned(), stem.as_str().into());
     table.extend(common.clone());
     let mut archives = vec![];
+    let mut add = |what: &str, bytes: Vec<u8>| -> toml::Value {
+        let hash: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        let name = format!("{stem}-{what}-{}.npz", &hash[..HASH_DIGITS]);
+        archives.push(RigFile { name: name.clone(), bytes });
+        name.into()
+    };
     for side in sides {
         let bytes = side.archive().with_context(|| format!("{}: its modes cannot be packed", side.name))?;
-        let hash: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        let archive = format!("{stem}-{}-{}.npz", side.name, &hash[..HASH_DIGITS]);
         let mut keys = toml::Table::new();
-        keys.insert("modal".to_owned(), archive.as_str().into());
+        keys.insert("modal".to_owned(), add(side.name, bytes));
         if let Some(ratio) = side.damping_ratio {
             keys.insert("damping_ratio".to_owned(), ratio.into());
         }
         table.insert(side.name.to_owned(), keys.into());
-        archives.push(RigFile { name: archive, bytes });
     }
-    table.insert("contact_patch".to_owned(), patches.clone());
+    if let Some(residual) = residual {
+        let bytes = residual_archive(residual).context("the residual cannot be packed")?;
+        let mut keys = toml::Table::new();
+        keys.insert("pairs".to_owned(), add("residual", bytes));
+        table.insert("residual".to_owned(), keys.into());
+    }
+    table.extend(patches.map(|patches| ("contact_patch".to_owned(), patches.clone())));
     if let Some(reduction) = reduction {
         let known = toml::Value::try_from(reduction).context("the comparison cannot be put into words of TOML")?;
         table.insert("reduction".to_owned(), known);

@@ -15,13 +15,15 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use crate::physics::ContactLaw;
-use crate::reduction::{FullContact, FullModel, FullPart, SparseMatrix, SparseRow, SparseTerm};
+use crate::reduction::{
+    FullContact, FullModel, FullPart, Kept, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
+    Substructure, Wanted, keep_modes,
+};
 use crate::rig::raw::{RawPatch, RawSystem, RawTerm};
 use crate::rig::settings::Settings;
 use crate::rig::{Pair, RigError, patch, settings, system};
 
 use files::Files;
-use part::Part;
 use raw::{RawFullModel, RawPart};
 
 /// Tables that a full model has in common with rig files.
@@ -42,6 +44,8 @@ pub struct FullModelFile {
     pub settings: Settings,
     /// The common tables as they are written.
     pub common_tables: toml::Table,
+    /// `[[contact_patch]]` as it is written; none for a system.
+    pub contact_patches: Option<toml::Value>,
     /// Where its TOML file is.
     pub path: PathBuf,
     /// SHA-256 of the TOML file and everything it refers to, hexadecimal.
@@ -88,6 +92,7 @@ impl FullModelFile {
         let (mut files, bytes) = Files::open(path)?;
         let (common, own) = crate::rig::raw::parse::<RawFullModel>(&files.toml, &bytes)?.split();
         let mut common_tables: toml::Table = crate::rig::raw::parse(&files.toml, &bytes)?;
+        let contact_patches = common_tables.remove("contact_patch");
         common_tables.retain(|key, _| COMMON.contains(&key));
         let settings = settings::check(&files.toml, &common)?;
         let toml = files.toml.clone();
@@ -122,6 +127,7 @@ impl FullModelFile {
             pairs: read.pairs,
             settings,
             common_tables,
+            contact_patches,
             path: path.to_owned(),
             content_hash: files.content_hash(),
             contents,
@@ -147,6 +153,31 @@ impl FullModelFile {
         }
     }
 
+    /// The modes of pad and disc that are `wanted`, a word for each, and the residual of all others if that is asked for.
+    /// `progress` hears which part does what.
+    ///
+    /// # Errors
+    /// Those of [`keep_modes`].
+    pub fn keep_modes(
+        &self,
+        wanted: &[Wanted],
+        with_residual: bool,
+        memory_limit_bytes: Option<usize>,
+        progress: &mut dyn FnMut(usize, Progress),
+    ) -> Result<Vec<Kept>, ReductionError> {
+        let rows: Vec<Vec<Option<usize>>> = self.geometry.iter().map(PartGeometry::interface_rows).collect();
+        let parts: Vec<Substructure<'_>> = (self.model.parts.iter().zip(&rows).zip(wanted))
+            .map(|((part, rows), &wanted)| Substructure {
+                name: &part.name,
+                mass: &part.mass,
+                stiffness: &part.stiffness,
+                rows,
+                wanted,
+            })
+            .collect();
+        keep_modes(&parts, with_residual, memory_limit_bytes, progress)
+    }
+
     /// What the full model is and holds, a few lines for people.
     pub fn describe(&self) -> String {
         let mut lines = vec![format!("full model {}", self.name)];
@@ -162,6 +193,21 @@ impl FullModelFile {
         ));
         lines.push(format!("hash       {}", self.content_hash));
         lines.join("\n")
+    }
+}
+
+impl PartGeometry {
+    /// The rows of x, y and z of every interface node; `None` where a direction is held.
+    pub fn interface_rows(&self) -> Vec<Option<usize>> {
+        let row_of: HashMap<(usize, usize), usize> =
+            self.rows.iter().enumerate().map(|(row, &place)| (place, row)).collect();
+        let places = self.interface.iter().flat_map(|&node| (0..3).map(move |direction| (node, direction)));
+        places.map(|place| row_of.get(&place).copied()).collect()
+    }
+
+    /// Positions of the interface nodes, m.
+    pub fn interface_m(&self) -> Vec<[f64; 3]> {
+        self.interface.iter().map(|&node| self.nodes_m[node]).collect()
     }
 }
 
@@ -184,10 +230,7 @@ fn read_parts(
     let pad = part::read(files, "pad", pad)?;
     let disc = disc.map(|disc| part::read(files, "disc", disc)).transpose()?;
     let toml = files.toml.clone();
-    let at_interface = |part: &Part| -> Vec<[f64; 3]> {
-        part.geometry.interface.iter().map(|&node| part.geometry.nodes_m[node]).collect()
-    };
-    let (pad_m, disc_m) = (at_interface(&pad), disc.as_ref().map(at_interface));
+    let (pad_m, disc_m) = (pad.geometry.interface_m(), disc.as_ref().map(|disc| disc.geometry.interface_m()));
     let patch::Contacts { mut pairs, stiffness_n_per_m, damping_n_s_per_m } =
         patch::contacts(&toml, patches, &pad_m, disc_m.as_deref())?;
     for pair in &mut pairs {

@@ -106,6 +106,7 @@ impl RawFullModel {
             contact: None,
             contact_patch: None,
             system: None,
+            residual: None,
             basis: None,
             reduction: None,
         };

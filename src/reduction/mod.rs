@@ -20,10 +20,12 @@
 
 mod compare;
 mod contact_solver;
+mod coverage;
 mod dense;
 mod error;
 mod full_model;
 mod full_order;
+mod full_problem;
 mod krylov_schur;
 mod lanczos;
 mod matching;

@@ -1,10 +1,12 @@
 //! The paper's tables and figures, made again: data, figures and one page that sets ours beside the paper's numbers.
 
 mod nine_dof;
+mod tribometer;
 
 use crate::html::{figure, page, section};
 
 pub use nine_dof::nine_dof;
+pub use tribometer::{MODES, Study};
 
 /// A table or figure of the paper, made again.
 #[derive(Clone, Debug)]

@@ -1,16 +1,60 @@
 //! Rigs that come with the program: ordinary rig files, read by the ordinary parser.
 
-/// Name and text of every embedded rig.
-pub const EMBEDDED: [(&str, &str); 6] = [
-    ("nine-dof", include_str!("../../launch/rigs/nine-dof.toml")),
-    ("nine-dof-case-2", include_str!("../../launch/rigs/nine-dof-case-2.toml")),
-    ("nine-dof-3+2", include_str!("../../launch/rigs/nine-dof-3+2.toml")),
-    ("nine-dof-4+2", include_str!("../../launch/rigs/nine-dof-4+2.toml")),
-    ("nine-dof-case-2-3+2", include_str!("../../launch/rigs/nine-dof-case-2-3+2.toml")),
-    ("nine-dof-case-2-4+2", include_str!("../../launch/rigs/nine-dof-case-2-4+2.toml")),
+use super::RigFile;
+
+/// A rig that comes with the program.
+#[derive(Clone, Copy, Debug)]
+pub struct Embedded {
+    pub name: &'static str,
+    /// The rig file.
+    text: &'static str,
+    /// What it refers to, by the names it uses.
+    attached: &'static [(&'static str, &'static [u8])],
+}
+
+/// A rig file of `launch/rigs`, and what stands beside it.
+macro_rules! embedded {
+    ($name:literal $(, $attached:literal)*) => {
+        Embedded {
+            name: $name,
+            text: include_str!(concat!("../../launch/rigs/", $name, ".toml")),
+            attached: &[$(($attached, include_bytes!(concat!("../../launch/rigs/", $attached)))),*],
+        }
+    };
+}
+
+/// Every embedded rig; the first is what `run` and `demo` take where nothing else is asked for.
+pub const EMBEDDED: [Embedded; 8] = [
+    embedded!("tribometer", "tribometer-pad-565599e19c40.npz", "tribometer-disc-545e876cea94.npz"),
+    embedded!(
+        "tribometer-80+80",
+        "tribometer-80+80-pad-a17eb7113e19.npz",
+        "tribometer-80+80-disc-694d2050be74.npz",
+        "tribometer-80+80-residual-c3ebf5556a34.npz"
+    ),
+    embedded!("nine-dof"),
+    embedded!("nine-dof-case-2"),
+    embedded!("nine-dof-3+2"),
+    embedded!("nine-dof-4+2"),
+    embedded!("nine-dof-case-2-3+2"),
+    embedded!("nine-dof-case-2-4+2"),
 ];
 
-/// The text of the embedded rig of that name.
-pub fn text(name: &str) -> Option<&'static str> {
-    EMBEDDED.iter().find(|(embedded, _)| *embedded == name).map(|(_, text)| *text)
+impl Embedded {
+    /// The embedded rig of that name.
+    pub fn named(name: &str) -> Option<Self> {
+        EMBEDDED.into_iter().find(|embedded| embedded.name == name)
+    }
+
+    /// Their names, for messages.
+    pub fn names() -> String {
+        EMBEDDED.map(|embedded| embedded.name).join(", ")
+    }
+
+    /// The rig file first, then what it refers to.
+    pub fn files(&self) -> Vec<RigFile> {
+        let file = |name: &str, bytes: &[u8]| RigFile { name: name.to_owned(), bytes: bytes.to_vec() };
+        let rig_file = file(&format!("{}.toml", self.name), self.text.as_bytes());
+        std::iter::once(rig_file).chain(self.attached.iter().map(|(name, bytes)| file(name, bytes))).collect()
+    }
 }

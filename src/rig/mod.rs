@@ -29,10 +29,11 @@ use faer::Mat;
 use crate::certificate::Certificate;
 use crate::physics::{Model, OperatingPoint};
 
-pub use embedded::EMBEDDED;
+pub use embedded::{EMBEDDED, Embedded};
 pub use error::RigError;
 pub use modal_data::{ModalData, Residual};
 pub use patch::Pair;
+pub use residual::{SideResidual, between_patches};
 pub use settings::Settings;
 
 use source::Source;
@@ -129,14 +130,14 @@ impl Rig {
     /// # Errors
     /// [`RigError`], naming file, field, value and limit.
     pub fn load(name_or_path: &str) -> Result<Self, RigError> {
-        if let Some(text) = embedded::text(name_or_path) {
-            return Self::from_files(&[RigFile { name: format!("{name_or_path}.toml"), bytes: text.into() }]);
+        if let Some(embedded) = Embedded::named(name_or_path) {
+            return Self::from_files(&embedded.files());
         }
         let path = std::path::Path::new(name_or_path);
         let bytes = std::fs::read(path).map_err(|error| RigError::NoSuchRig {
             value: name_or_path.to_owned(),
             reason: error.to_string(),
-            limit: EMBEDDED.map(|(name, _)| name).join(", "),
+            limit: Embedded::names(),
         })?;
         let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
         let directory = path.parent().unwrap_or(std::path::Path::new(""));
@@ -156,7 +157,7 @@ impl Rig {
         let (first, others) = files.split_first().ok_or_else(|| RigError::NoSuchRig {
             value: "no files at all".to_owned(),
             reason: "the list of files is empty".to_owned(),
-            limit: EMBEDDED.map(|(name, _)| name).join(", "),
+            limit: Embedded::names(),
         })?;
         let read = |name: &str| match others.iter().find(|file| file.name == name) {
             Some(file) => Ok(file.bytes.clone()),
@@ -177,8 +178,7 @@ impl Rig {
                 inline::build(&source.rig_file, pad, disc, contacts, &settings)?
             }
             settings::Kind::Modal { pad, disc, patches } => {
-                let shared = raw.basis.as_ref().is_some_and(|basis| basis.shared);
-                modal::build(&mut source, pad, disc, patches, shared, &settings)?
+                modal::build(&mut source, pad, disc, patches, &raw, &settings)?
             }
             settings::Kind::System(system) => system::build(&mut source, system, &settings)?,
         };

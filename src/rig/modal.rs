@@ -3,14 +3,14 @@
 use faer::Mat;
 
 use super::inline::{Side, assemble};
-use super::modal_data::ModalData;
+use super::modal_data::{ModalData, Residual};
 use super::patch::{self, Pair};
-use super::raw::{RawPatch, RawSubstructure};
+use super::raw::{RawPatch, RawResidual, RawRig, RawSubstructure};
 use super::residual::{self, SideResidual};
 use super::settings::{Settings, spread};
 use super::source::Source;
-use super::{Built, RigError, basis};
-use crate::physics::ContactPairs;
+use super::{Built, RigError, basis, npz};
+use crate::physics::{ContactPairs, ResidualFlexibility};
 use crate::reduction::Modes;
 
 /// A substructure with the modes that were selected, ascending in frequency.
@@ -29,19 +29,25 @@ pub(super) fn build(
     pad: &RawSubstructure,
     disc: Option<&RawSubstructure>,
     patches: &[RawPatch],
-    shared: bool,
+    raw: &RawRig,
     settings: &Settings,
 ) -> Result<Built, RigError> {
+    let shared = raw.basis.as_ref().is_some_and(|basis| basis.shared);
     let pad = part(source, "pad", pad)?;
     let disc = disc.map(|disc| part(source, "disc", disc)).transpose()?;
     let file = source.rig_file.clone();
     let patch::Contacts { pairs, stiffness_n_per_m, damping_n_s_per_m } =
         patch::contacts(&file, patches, &pad.data.nodes_m, disc.as_ref().map(|disc| &*disc.data.nodes_m))?;
     let values = [stiffness_n_per_m, damping_n_s_per_m];
+    let given = raw.residual.as_ref().map(|raw| given(source, raw, &pad, disc.as_ref(), pairs.len())).transpose()?;
     let mut built = if shared {
+        if given.is_some() {
+            let (field, limit) = ("residual".to_owned(), "modes of the parts, or none".to_owned());
+            return Err(RigError::Kind { file, field, value: "stands beside a shared basis".to_owned(), limit });
+        }
         basis::build(&file, &pad, disc.as_ref(), &pairs, values, settings)?
     } else {
-        apart(&file, &pad, disc.as_ref(), &pairs, values, settings)?
+        apart(&file, &pad, disc.as_ref(), &pairs, values, given, settings)?
     };
     for (shapes, part) in built.shapes.iter_mut().zip(std::iter::once(&pad).chain(&disc)) {
         let rows = 3 * part.data.nodes_m.len();
@@ -66,6 +72,7 @@ fn apart(
     disc: Option<&Part>,
     pairs: &[Pair],
     [stiffness_n_per_m, damping_n_s_per_m]: [Vec<f64>; 2],
+    given: Option<ResidualFlexibility>,
     settings: &Settings,
 ) -> Result<Built, RigError> {
     let rows = |direction: &dyn Fn(&Pair) -> [f64; 3]| relative_displacement(pairs, direction, pad, disc);
@@ -77,9 +84,14 @@ fn apart(
         damping_n_s_per_m,
         radius_m: pairs.iter().map(|pair| pair.radius_m).collect(),
     };
-    let pad_residual = pad.residual("pad", file)?;
-    let disc_residual = disc.map(|disc| disc.residual("disc", file)).transpose()?;
-    let residual = residual::between(pairs, &pad_residual, disc_residual.as_ref(), settings.band_max_hz);
+    let sides: Vec<(&'static str, &Part)> =
+        std::iter::once(("pad", pad)).chain(disc.map(|disc| ("disc", disc))).collect();
+    let known = match given {
+        Some(given) => Some((given, "the contact pairs".to_owned())),
+        None => of_sides(file, pairs, &sides)?,
+    };
+    let cutoff_hz = sides.iter().map(|(_, part)| part.cutoff_hz()).fold(f64::INFINITY, f64::min);
+    let residual = known.map(|(known, of)| residual::within_band(known, &of, cutoff_hz, settings.band_max_hz));
     let mut built = assemble(
         file,
         "modal substructures (kind 2)",
@@ -104,16 +116,67 @@ impl Part {
     }
 
     /// What the modes that do not take part still do at the contact.
-    fn residual(&self, name: &'static str, file: &str) -> Result<SideResidual, RigError> {
-        let residual = self.data.residual_beyond(&self.selected).map_err(|mode| RigError::Range {
+    fn residual(&self, name: &'static str, file: &str) -> Result<Option<Residual>, RigError> {
+        self.data.residual_beyond(&self.selected).map_err(|mode| RigError::Range {
             file: file.to_owned(),
             field: format!("{name}.modes"),
             value: format!("a selection without mode {mode} of {} rad/s", self.data.omega_rad_s[mode]),
             limit: "one with every rigid-body motion: they have no residual flexibility".to_owned(),
-        })?;
-        let highest = self.side.modes.omega_rad_s.iter().copied().fold(0.0, f64::max);
-        Ok(SideResidual { name, residual, cutoff_hz: highest / std::f64::consts::TAU })
+        })
     }
+
+    /// The highest frequency kept.
+    fn cutoff_hz(&self) -> f64 {
+        self.side.modes.omega_rad_s.iter().copied().fold(0.0, f64::max) / std::f64::consts::TAU
+    }
+}
+
+/// The residuals that came with the sides, between `pairs`, and of which sides they are; `None` where none came.
+fn of_sides(
+    file: &str,
+    pairs: &[Pair],
+    sides: &[(&'static str, &Part)],
+) -> Result<Option<(ResidualFlexibility, String)>, RigError> {
+    let mut known = vec![];
+    for &(name, part) in sides {
+        known.extend(part.residual(name, file)?.map(|residual| (name, residual)));
+    }
+    if known.is_empty() {
+        return Ok(None);
+    }
+    let of_sides: Vec<SideResidual<'_>> = known
+        .iter()
+        .map(|(name, residual)| SideResidual {
+            disc: *name == "disc",
+            flexibility: &residual.flexibility,
+            inertia: residual.inertia.as_ref(),
+        })
+        .collect();
+    let between = residual::between(pairs, &of_sides);
+    let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
+    Ok(Some((between, names.join(" and "))))
+}
+
+/// `[residual]`: what the modes left out do between the pairs themselves.
+fn given(
+    source: &mut Source<'_>,
+    raw: &RawResidual,
+    pad: &Part,
+    disc: Option<&Part>,
+    pairs: usize,
+) -> Result<ResidualFlexibility, RigError> {
+    let file = source.rig_file.clone();
+    for (name, part) in std::iter::once(("pad", pad)).chain(disc.map(|disc| ("disc", disc))) {
+        if part.data.residual.is_some() {
+            let (field, value) = (format!("{name}.modal"), "holds a residual beside [residual]".to_owned());
+            return Err(RigError::Kind { file, field, value, limit: "one of the two".to_owned() });
+        }
+        if part.selected.len() != part.data.omega_rad_s.len() {
+            let (field, value) = (format!("{name}.modes"), "leaves out modes that [residual] does not hold".to_owned());
+            return Err(RigError::Kind { file, field, value, limit: "all of them".to_owned() });
+        }
+    }
+    npz::read_pair_residual(&raw.pairs, source.read("residual.pairs", &raw.pairs)?, pairs)
 }
 
 /// Reads one side and selects its modes.

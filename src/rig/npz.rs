@@ -7,6 +7,7 @@ use npyz::{NpyFile, Order, TypeChar};
 
 use super::RigError;
 use super::modal_data::{ModalData, Residual};
+use crate::physics::ResidualFlexibility;
 
 /// Largest array that is read, in bytes: a limit for archives that unpack to far more than they hold.
 const LARGEST: u64 = 2 << 30;
@@ -21,18 +22,49 @@ struct Array {
     values: Vec<f64>,
 }
 
+/// Reads what the modes left out do between `c` contact pairs: `flexibility_sliding` and `inertia_sliding` (c, c),
+/// `flexibility_normal` and `inertia_normal` (c (c + 1) / 2), the lower triangles of symmetric matrices row by row. Without
+/// inertia both of its arrays are missing.
+///
+/// # Errors
+/// [`RigError::Npz`], [`RigError::NotFinite`].
+pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<ResidualFlexibility, RigError> {
+    let mut archive = open(file, bytes)?;
+    let triangle = |row: usize, column: usize| row * (row + 1) / 2 + column;
+    let mut both = |kind: &str| -> Result<Option<[Mat<f64>; 2]>, RigError> {
+        let names = ["normal", "sliding"].map(|direction| format!("{kind}_{direction}"));
+        let shapes = [vec![triangle(c, 0)], vec![c, c]];
+        let mut arrays = vec![];
+        for (name, shape) in names.iter().zip(&shapes) {
+            let array = read_array(file, &mut archive, name)?;
+            if let Some(array) = array.as_ref().filter(|array| array.shape != *shape) {
+                let (value, limit) = (format!("has shape ({})", told(&array.shape)), format!("({})", told(shape)));
+                return Err(refuse(file, name, &value, &format!("{limit}, by the {c} contact pairs")));
+            }
+            arrays.push(array);
+        }
+        match (&arrays[0], &arrays[1]) {
+            (None, None) => Ok(None),
+            (Some(normal), Some(sliding)) => Ok(Some([
+                Mat::from_fn(c, c, |i, j| normal.values[triangle(i.max(j), i.min(j))]),
+                Mat::from_fn(c, c, |i, j| sliding.values[i * c + j]),
+            ])),
+            (None, Some(_)) => Err(refuse(file, &names[0], "is missing", "both directions")),
+            (Some(_), None) => Err(refuse(file, &names[1], "is missing", "both directions")),
+        }
+    };
+    let [normal, sliding] =
+        both("flexibility")?.ok_or_else(|| refuse(file, "flexibility_normal", "is missing", "an array"))?;
+    Ok(ResidualFlexibility { normal, sliding, inertia: both("inertia")? })
+}
+
 /// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and, where they are there, `damping_ratio` (i), `mass_share`
 /// (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
 ///
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
 pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
-    let mut archive = npyz::npz::NpzArchive::new(Cursor::new(bytes)).map_err(|error| RigError::Npz {
-        file: file.to_owned(),
-        field: "(archive)".to_owned(),
-        value: format!("cannot be opened: {error}"),
-        limit: "an .npz archive as numpy.savez writes it".to_owned(),
-    })?;
+    let mut archive = open(file, bytes)?;
     let mut array = |name: &str| read_array(file, &mut archive, name);
     let required = |name: &str, array: Option<Array>, shape: &str| {
         array.ok_or_else(|| refuse(file, name, "is missing", &format!("an array of shape {shape}")))
@@ -113,6 +145,13 @@ fn residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> Result<Opti
             inertia: inertia.map(|inertia| symmetric(names[1], inertia)).transpose()?,
         })),
     }
+}
+
+fn open<'a>(file: &str, bytes: &'a [u8]) -> Result<npyz::npz::NpzArchive<Cursor<&'a [u8]>>, RigError> {
+    npyz::npz::NpzArchive::new(Cursor::new(bytes)).map_err(|error| {
+        let limit = "an .npz archive as numpy.savez writes it";
+        refuse(file, "(archive)", &format!("cannot be opened: {error}"), limit)
+    })
 }
 
 fn refuse(file: &str, field: &str, value: &str, limit: &str) -> RigError {

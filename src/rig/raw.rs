@@ -31,6 +31,7 @@ pub struct RawRig {
     pub contact: Option<Vec<RawContact>>,
     pub contact_patch: Option<Vec<RawPatch>>,
     pub system: Option<RawSystem>,
+    pub residual: Option<RawResidual>,
     pub basis: Option<RawBasis>,
     pub reduction: Option<Certificate>,
 }
@@ -102,6 +103,14 @@ pub struct RawSubstructure {
     pub modal: Option<String>,
     pub damping_ratio: Option<OneOrMany>,
     pub modes: Option<RawModes>,
+}
+
+/// `[residual]`: what the modes left out do between the contact pairs.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawResidual {
+    /// An `.npz` archive.
+    pub pairs: String,
 }
 
 /// A value for all, or one for each.

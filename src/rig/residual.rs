@@ -11,14 +11,15 @@
 
 use faer::Mat;
 
-use super::modal_data::Residual;
-use super::patch::Pair;
+use super::RigError;
+use super::patch::{self, Pair};
+use super::raw::RawPatch;
 use crate::physics::ResidualFlexibility;
 
 /// The largest band, relative to the cut-off, for which the inertial term is used.
 const INERTIA_BELOW: f64 = 0.5;
 
-/// The residuals of both sides, what they are used for, and up to where.
+/// What the modes left out do between pairs, and up to where it is used.
 pub(super) struct PairResidual {
     pub flexibility: ResidualFlexibility,
     /// `[band] max_hz`, or the lower cut-off where the former is not given or higher.
@@ -27,36 +28,25 @@ pub(super) struct PairResidual {
     pub told: String,
 }
 
-/// One side: its name, its residual if it came with one, and its cut-off in Hz.
-pub(super) struct SideResidual {
-    pub name: &'static str,
-    pub residual: Option<Residual>,
-    pub cutoff_hz: f64,
+/// The residual of one side between x, y and z of its nodes.
+#[derive(Clone, Copy, Debug)]
+pub struct SideResidual<'a> {
+    /// Whether it is the disc's.
+    pub disc: bool,
+    /// `R`, `3c×3c`, m/N.
+    pub flexibility: &'a Mat<f64>,
+    /// `Q`, `3c×3c`, s²·m/N.
+    pub inertia: Option<&'a Mat<f64>>,
 }
 
-/// Residuals between `pairs`; `None` where neither side has any.
-pub(super) fn between(
-    pairs: &[Pair],
-    pad: &SideResidual,
-    disc: Option<&SideResidual>,
-    band_max_hz: Option<f64>,
-) -> Option<PairResidual> {
-    let sides: Vec<&SideResidual> = std::iter::once(pad).chain(disc).collect();
-    let known: Vec<&SideResidual> = sides.iter().copied().filter(|side| side.residual.is_some()).collect();
-    if known.is_empty() {
-        return None;
-    }
-    let cutoff_hz = sides.iter().map(|side| side.cutoff_hz).fold(f64::INFINITY, f64::min);
-    let asked_hz = band_max_hz.unwrap_or(cutoff_hz);
-    let has_inertia =
-        known.iter().all(|side| side.residual.as_ref().is_some_and(|residual| residual.inertia.is_some()));
-    let with_inertia = has_inertia && asked_hz <= INERTIA_BELOW * cutoff_hz;
+/// The residuals of `sides` between `pairs`, the inertial one where every side has it.
+pub(super) fn between(pairs: &[Pair], sides: &[SideResidual<'_>]) -> ResidualFlexibility {
     let c = pairs.len();
     let (mut normal, mut sliding) = (Mat::zeros(c, c), Mat::zeros(c, c));
+    let with_inertia = sides.iter().all(|side| side.inertia.is_some());
     let mut inertia = with_inertia.then(|| [Mat::zeros(c, c), Mat::zeros(c, c)]);
-    for (index, side) in sides.iter().enumerate() {
-        let Some(residual) = &side.residual else { continue };
-        let along = |direction: &dyn Fn(&Pair) -> [f64; 3]| weights(pairs, index == 1, direction);
+    for side in sides {
+        let along = |direction: &dyn Fn(&Pair) -> [f64; 3]| weights(pairs, side.disc, direction);
         let (n, t) = (along(&|pair| pair.normal), along(&|pair| pair.sliding));
         let entry = |matrix: &Mat<f64>, left: &[(usize, f64)], right: &[(usize, f64)]| -> f64 {
             let row = |i: usize| right.iter().map(|&(j, weight)| weight * matrix[(i, j)]).sum::<f64>();
@@ -67,26 +57,60 @@ pub(super) fn between(
             let nn = Mat::from_fn(c, c, |i, j| entry(matrix, &n[i.max(j)], &n[i.min(j)]));
             (nn, Mat::from_fn(c, c, |i, j| entry(matrix, &n[i], &t[j])))
         };
-        let (nn, nt) = seen(&residual.flexibility);
+        let (nn, nt) = seen(side.flexibility);
         normal += nn;
         sliding += nt;
-        if let (Some([inertia_n, inertia_t]), Some(matrix)) = (&mut inertia, &residual.inertia) {
+        if let (Some([inertia_n, inertia_t]), Some(matrix)) = (&mut inertia, side.inertia) {
             let (nn, nt) = seen(matrix);
             *inertia_n += nn;
             *inertia_t += nt;
         }
     }
-    let names: Vec<&str> = known.iter().map(|side| side.name).collect();
-    let inertial = match (with_inertia, has_inertia) {
+    ResidualFlexibility { normal, sliding, inertia }
+}
+
+/// The residuals of pad and disc between the pairs of `patches`, the tables `[[contact_patch]]` of a rig file called
+/// `file`; `nodes_m` are the interface nodes of each side.
+///
+/// # Errors
+/// [`RigError`]: a patch that is none.
+pub fn between_patches(
+    file: &str,
+    patches: &toml::Value,
+    nodes_m: [&[[f64; 3]]; 2],
+    sides: &[SideResidual<'_>],
+) -> Result<ResidualFlexibility, RigError> {
+    let patches: Vec<RawPatch> = patches.clone().try_into().map_err(|error: toml::de::Error| RigError::Kind {
+        file: file.to_owned(),
+        field: "contact_patch".to_owned(),
+        value: format!("cannot be read: {}", error.message()),
+        limit: "contact patches".to_owned(),
+    })?;
+    Ok(between(&patch::contacts(file, &patches, nodes_m[0], Some(nodes_m[1]))?.pairs, sides))
+}
+
+/// `flexibility` as it serves a rig with this cut-off and `[band] max_hz`; `of` says of what modes it is.
+pub(super) fn within_band(
+    flexibility: ResidualFlexibility,
+    of: &str,
+    cutoff_hz: f64,
+    band_max_hz: Option<f64>,
+) -> PairResidual {
+    let asked_hz = band_max_hz.unwrap_or(cutoff_hz);
+    let has_inertia = flexibility.inertia.is_some();
+    let inertia = flexibility.inertia.filter(|_| asked_hz <= INERTIA_BELOW * cutoff_hz);
+    let inertial = match (inertia.is_some(), has_inertia) {
         (true, _) => "with the inertial term".to_owned(),
         (false, true) => format!("without the inertial term (the band is above {INERTIA_BELOW} of the cut-off)"),
         (false, false) => "no inertial term given".to_owned(),
     };
     let clamped =
         if asked_hz > cutoff_hz { format!(", to which the band of {asked_hz} Hz is cut") } else { String::new() };
-    let told = format!("residual   of {}, {inertial}; cut-off {cutoff_hz:.1} Hz{clamped}", names.join(" and "));
-    let flexibility = ResidualFlexibility { normal, sliding, inertia };
-    Some(PairResidual { flexibility, band_max_hz: asked_hz.min(cutoff_hz), told })
+    PairResidual {
+        flexibility: ResidualFlexibility { inertia, ..flexibility },
+        band_max_hz: asked_hz.min(cutoff_hz),
+        told: format!("residual   of {of}, {inertial}; cut-off {cutoff_hz:.1} Hz{clamped}"),
+    }
 }
 
 /// The rows of `W`, `c×3c'`: what a direction of every pair sees of the displacements of a side's nodes.

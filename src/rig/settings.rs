@@ -137,6 +137,9 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
         if let Some((field, _)) = friction_or_load.iter().find(|(_, set)| *set) {
             return mixed(field, "has nothing to act on beside [system]", "a scale of a matrix instead");
         }
+        if raw.residual.is_some() {
+            return mixed("residual", "stands beside [system]", "[pad] and [disc] with modal");
+        }
         if raw.basis.as_ref().is_some_and(|basis| basis.shared) {
             return mixed("basis.shared", "is true beside [system]", "[pad] and [disc] with modal");
         }
@@ -146,6 +149,9 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
         return missing("pad", "[pad] with mass and stiffness, [pad] with modal, or [system]");
     };
     let modal = pad.modal.is_some();
+    if !modal && raw.residual.is_some() {
+        return mixed("residual", "stands beside inline substructures", "[pad] and [disc] with modal");
+    }
     if !modal && raw.basis.is_some() {
         return mixed("basis", "stands beside inline substructures", "[pad] and [disc] with modal, or [system]");
     }

@@ -67,7 +67,8 @@ const work = ((await worked()) - work0) * 1000 / (Date.now() - began);
 await wall.context().close();
 
 // A mode moves when chosen, and stands when paused.
-const pixels = () => page.locator("#shape").evaluate((canvas) => canvas.toDataURL());
+// A canvas of WebGL shows its picture and forgets it, and says its displacements instead.
+const pixels = () => page.locator("#shape").evaluate((canvas) => (canvas.displacements ? JSON.stringify(canvas.displacements()) : canvas.toDataURL()));
 await page.locator("#modes .mode-button").nth(2).click();
 await page.locator("#stage").scrollIntoViewIfNeeded();
 await page.waitForFunction(() => !/no mode/.test(document.getElementById("shape-note").textContent));

@@ -326,10 +326,15 @@ class Space {
     const low = [0, 1, 2].map((axis) => Math.min(...all.map((node) => node[axis])));
     const high = [0, 1, 2].map((axis) => Math.max(...all.map((node) => node[axis])));
     const extent = Math.max(...high.map((value, axis) => value - low[axis]), 1e-9);
-    // In units of the patch, about its middle.
-    const place = (node) => node.map((value, axis) => (value - (low[axis] + high[axis]) / 2) / extent);
+    // The patch lies flat: its thinnest direction points up.
+    const sizes = high.map((value, axis) => value - low[axis]);
+    const up = sizes.indexOf(Math.min(...sizes));
+    this.turned = (v) => [v[(up + 1) % 3], v[(up + 2) % 3], v[up]];
+    // In units of the patch, about its middle; sides that touch are drawn a little apart.
+    const apart = (part) => (spatial.length < 2 ? 0 : part.name === "disc" ? -0.06 : 0.06);
+    const place = (node) => this.turned(node.map((value, axis) => (value - (low[axis] + high[axis]) / 2) / extent));
     this.parts = spatial.map((part) => {
-      const rest = part.nodes_m.map(place);
+      const rest = part.nodes_m.map(place).map(([x, y, z]) => [x, y, z + apart(part)]);
       const geometry = new three.BufferGeometry();
       const positions = new three.BufferAttribute(new Float32Array(3 * rest.length), 3);
       const colours = new three.BufferAttribute(new Float32Array(3 * rest.length), 3);
@@ -373,7 +378,7 @@ class Space {
       const u = displaced(part.re, part.im, phase);
       const mixed = tone.clone();
       rest.forEach((node, k) => {
-        const d = [u[3 * k], u[3 * k + 1], u[3 * k + 2]];
+        const d = this.turned([u[3 * k], u[3 * k + 1], u[3 * k + 2]]);
         positions.setXYZ(k, ...node.map((value, axis) => value + ENLARGED * d[axis]));
         mixed.copy(tone).lerp(bright, Math.min(0.7, 0.7 * Math.hypot(...d)));
         colours.setXYZ(k, mixed.r, mixed.g, mixed.b);

@@ -1,0 +1,164 @@
+//! What part of a band the discs around shifts cover, whether they agree where two do, and the roots taken from each.
+
+use faer::{Mat, MatRef, c64};
+
+use super::ReductionError;
+use super::full_order::{FullRoot, FullSpectrum};
+
+/// Half the chord of a disc that counts as covered, relative to its radius: its half width there is 0.31 of it.
+const CHORD: f64 = 0.95;
+/// Distance, relative to `|λ|`, at which two roots found are the same: ten times the square root of the residual of a
+/// pair, for where roots merge.
+pub(super) const SAME: f64 = 1e-5;
+
+/// A disc around a shift in which every root has converged.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CoveredDisc {
+    /// Its centre: `λ = iω`, or `-λ² = ω²`, by `ω` in rad/s.
+    pub shift_rad_s: f64,
+    /// Its radius: of `λ` in 1/s, or of `λ²` in 1/s².
+    pub radius: f64,
+    /// It is a disc of `λ²`, of an undamped model.
+    pub squared: bool,
+}
+
+impl CoveredDisc {
+    /// The stretch of the imaginary axis that it covers, rad/s.
+    pub fn stretch_rad_s(&self) -> [f64; 2] {
+        let (omega, half) = (self.shift_rad_s, CHORD * self.radius);
+        if self.squared {
+            let square = omega * omega;
+            let low = if half >= square { 0.0 } else { (square - half).sqrt() };
+            return [low, (square + half).sqrt()];
+        }
+        [(omega - half).max(0.0), omega + half]
+    }
+
+    /// The growth rate up to which, either way, it covers this frequency, 1/s.
+    pub fn growth_per_s(&self, omega: f64) -> f64 {
+        if self.radius == f64::INFINITY {
+            return f64::INFINITY;
+        }
+        if self.squared {
+            // |ω² - σ² - ω₀² - 2 i σ ω|² < ρ², quadratic in σ².
+            let (a, b) = (omega * omega, self.shift_rad_s * self.shift_rad_s);
+            return ((4.0 * a * b + self.radius * self.radius).sqrt() - a - b).max(0.0).sqrt();
+        }
+        let off = (omega - self.shift_rad_s).abs().min(self.radius);
+        (self.radius * self.radius - off * off).sqrt()
+    }
+
+    /// Whether it covers a stretch, and there growth rates up to `growth`.
+    pub(super) fn covers(&self, [from, to]: [f64; 2], growth: f64) -> bool {
+        let [low, high] = self.stretch_rad_s();
+        low <= from && high >= to && self.growth_per_s(from).min(self.growth_per_s(to)) >= growth
+    }
+
+    /// Whether `λ` lies in the disc shrunk by [`CHORD`].
+    pub(super) fn holds(&self, lambda: c64) -> bool {
+        let centre = c64::new(0.0, self.shift_rad_s);
+        let distance = if self.squared { (lambda * lambda - centre * centre).norm() } else { (lambda - centre).norm() };
+        distance < CHORD * self.radius
+    }
+}
+
+/// What was found around one shift.
+pub(super) struct Found {
+    pub disc: CoveredDisc,
+    pub roots: Vec<FullRoot>,
+    pub right: Mat<c64>,
+    pub left: Mat<c64>,
+}
+
+/// The lowest stretch of the band that no disc covers.
+pub(super) fn first_gap(found: &[Found], band_rad_s: f64) -> Option<[f64; 2]> {
+    let mut covered = 0.0;
+    for [low, high] in found.iter().map(|found| found.disc.stretch_rad_s()) {
+        if low > covered {
+            return Some([covered, low.min(band_rad_s)]);
+        }
+        covered = high.max(covered);
+        if covered >= band_rad_s {
+            return None;
+        }
+    }
+    (covered < band_rad_s).then_some([covered, band_rad_s])
+}
+
+/// That roots which two discs cover were found around both shifts.
+pub(super) fn agree(what: &str, found: &[Found]) -> Result<(), ReductionError> {
+    for (a, b) in found.iter().zip(found.iter().skip(1)).flat_map(|(a, b)| [(a, b), (b, a)]) {
+        let mut free: Vec<c64> = b.roots.iter().map(|root| root.lambda).collect();
+        for root in a.roots.iter().filter(|root| a.disc.holds(root.lambda) && b.disc.holds(root.lambda)) {
+            let near = |lambda: &c64| (*lambda - root.lambda).norm() <= SAME * root.lambda.norm();
+            match free.iter().position(near) {
+                Some(index) => {
+                    free.swap_remove(index);
+                }
+                None => {
+                    return Err(ReductionError::MissedRoot {
+                        what: what.to_owned(),
+                        growth_per_s: root.lambda.re,
+                        omega_rad_s: root.lambda.im,
+                        found: a.disc.shift_rad_s,
+                        missed: b.disc.shift_rad_s,
+                    });
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Takes every root from the disc whose stretch of the axis it lies in.
+pub(super) fn assemble(found: &[Found], band_rad_s: f64) -> FullSpectrum {
+    let mut chosen: Vec<(FullRoot, usize, usize)> = vec![];
+    let (mut from, mut half_width) = (0.0, f64::INFINITY);
+    for (index, part) in found.iter().enumerate() {
+        let [_, high] = part.disc.stretch_rad_s();
+        let to: f64 = match found.get(index + 1) {
+            // The middle of what both cover.
+            Some(next) => {
+                let [low, _] = next.disc.stretch_rad_s();
+                (0.5 * (high.min(next.disc.shift_rad_s) + low.max(part.disc.shift_rad_s))).max(from).min(band_rad_s)
+            }
+            None => band_rad_s,
+        };
+        let last = index + 1 == found.len();
+        for (k, root) in part.roots.iter().enumerate() {
+            let omega = root.lambda.im;
+            if omega < from || omega > to || (omega == to && !last) {
+                continue;
+            }
+            // One on the border may have been found just before it too.
+            let again = |other: &(FullRoot, usize, usize)| {
+                other.1 != index && (other.0.lambda - root.lambda).norm() <= SAME * root.lambda.norm()
+            };
+            if (omega - from).abs() > SAME * from || !chosen.iter().any(again) {
+                chosen.push((*root, index, k));
+            }
+        }
+        half_width = half_width.min(part.disc.growth_per_s(from)).min(part.disc.growth_per_s(to));
+        from = to;
+    }
+    chosen.sort_by(|a, b| a.0.lambda.im.total_cmp(&b.0.lambda.im).then(a.0.lambda.re.total_cmp(&b.0.lambda.re)));
+    let n = found.first().map_or(0, |found| found.right.nrows());
+    let gather = |of: &dyn Fn(&Found) -> MatRef<'_, c64>| {
+        let there = found.iter().all(|found| of(found).ncols() == found.roots.len());
+        let mut gathered = Mat::<c64>::zeros(n, if there { chosen.len() } else { 0 });
+        for column in 0..gathered.ncols() {
+            let (_, part, k) = chosen[column];
+            for i in 0..n {
+                gathered[(i, column)] = of(&found[part])[(i, k)];
+            }
+        }
+        gathered
+    };
+    FullSpectrum {
+        right: gather(&|found| found.right.as_ref()),
+        left: gather(&|found| found.left.as_ref()),
+        roots: chosen.iter().map(|(root, ..)| *root).collect(),
+        discs: found.iter().map(|found| found.disc).collect(),
+        covered_growth_per_s: half_width,
+    }
+}
