@@ -42,18 +42,35 @@ pub struct Certificate {
     pub missed: usize,
     /// Unstable modes and windows of the rig that the full model does not have.
     pub invented: usize,
+    /// Modes of the full model, stable or not, that have no partner in the rig, over all points.
+    #[serde(default, skip_serializing_if = "none_of_them")]
+    pub absent: usize,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
+fn none_of_them(count: &usize) -> bool {
+    *count == 0
 }
 
 impl Certificate {
+    /// Whether the rig has what the full model has in the band, and nothing else.
+    pub fn is_complete(&self) -> bool {
+        self.missed == 0 && self.invented == 0 && self.absent == 0 && !self.max_relative_error.is_nan()
+    }
+
     /// A line for people.
     pub fn told(&self) -> String {
         let critical = match self.critical_friction_error {
             Some(error) => format!(", critical friction {error:.1e}"),
             None => String::new(),
         };
+        let absent = match self.absent {
+            0 => String::new(),
+            count => format!(", {count} modes without a partner"),
+        };
         format!(
             "reduction  errors at {} held-out points up to {} Hz: frequency {:.1e} relative, growth rate {:.1e} 1/s{critical}; \
-             {} unstable modes missed, {} invented",
+             {} unstable modes or windows missed, {} invented{absent}",
             self.points,
             self.band_hz,
             self.max_frequency_error,
@@ -177,7 +194,7 @@ pub fn verify_against(
         let of_rig = StabilityMap::build(&rig.model, &mut solver, &p, &options)?.windows;
         let compared = compare_windows(&of_full, &of_rig);
         if !compared.pairs.is_empty() {
-            critical = Some(critical.unwrap_or(0.0).max(compared.friction_error()));
+            critical = Some(critical.unwrap_or(0.0).max(compared.friction_error(options.mu_max)));
         }
         missed += compared.missed.len();
         invented += compared.invented.len();
@@ -192,7 +209,9 @@ pub fn verify_against(
         windows.extend(compared.missed.iter().map(|full| report(Some(full), None)));
         windows.extend(compared.invented.iter().map(|rig| report(None, Some(rig))));
     }
-    let largest = |of: fn(&PointReport) -> f64| points.iter().map(of).fold(0.0, f64::max);
+    // Where nothing could be compared nothing is known.
+    let nothing = if points.iter().all(|point| point.modes == 0) { f64::NAN } else { 0.0 };
+    let largest = |of: fn(&PointReport) -> f64| nothing + points.iter().map(of).fold(0.0, f64::max);
     let certificate = Certificate {
         full_model_hash: full.content_hash.clone(),
         method: rig.reduction.as_ref().map(|known| known.method.clone()).unwrap_or_default(),
@@ -204,6 +223,7 @@ pub fn verify_against(
         critical_friction_error: critical,
         missed: missed + points.iter().map(|point| point.missed.len()).sum::<usize>(),
         invented: invented + points.iter().map(|point| point.invented.len()).sum::<usize>(),
+        absent: points.iter().map(|point| point.unpaired).sum(),
     };
     Ok(Verified { certificate, points, windows })
 }

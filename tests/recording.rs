@@ -94,6 +94,7 @@ fn rig_info() -> Message {
         version: "0.1.0".to_owned(),
         mode_count: 9,
         band_max_hz: 20_000.0,
+        reduction: "0 missed".to_owned(),
     };
     Message { log_time_ns: T0, publish_time_ns: T0, payload: Payload::RigInfo(info) }
 }

@@ -235,7 +235,34 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     run(["reduce", "none.toml", "-o", &to]).exits(1).complains("none.toml");
     let nowhere = text(&folder.path().join("none/rig.toml"));
     run(["reduce", &path, "--modes", "5+5", "--points", "0", "-o", &nowhere]).exits(1).complains("cannot write");
+    run(["reduce", &path, "--modes", "5+5", "-o", &path]).exits(1).complains("is the full model itself");
+    run(["reduce", &path, "--no-residual", "--range", "mu=0:1", "-o", &to]).exits(2).complains("--range");
+    let whole = std::fs::read_to_string(&path).unwrap();
+    let hertzian = whole.clone() + "\n[load]\nexponent = 0.3333\nreference_n = 500.0\n";
+    let hertzian = write(folder.path(), "hertzian.toml", &hertzian);
+    run(["reduce", &hertzian, "--modes", "5+5", "-o", &to]).exits(1).complains("`load.exponent` is 0.3333");
+    // A matrix that ends early, of a format that does not say where it should.
+    let matrix = std::fs::read_to_string(folder.path().join("disc-stiffness.mtx")).unwrap();
+    let entries: Vec<&str> = matrix.lines().filter(|line| !line.starts_with('%')).skip(1).collect();
+    write(folder.path(), "cut.txt", &(entries[..7 * entries.len() / 10].join("\n") + "\n"));
+    let cut = write(folder.path(), "cut.toml", &whole.replace("disc-stiffness.mtx", "cut.txt"));
+    run(["check", &cut]).exits(1).complains("cut.txt").complains("is missing; expected every row on the diagonal");
+    for name in ["hertzian.toml", "cut.txt", "cut.toml"] {
+        std::fs::remove_file(folder.path().join(name)).unwrap();
+    }
     assert_eq!(files_below(folder.path()), before);
+}
+
+/// Of 3 + 3 modes the unstable ones of the full model are missed: the rig is written, and the exit code says so.
+#[test]
+fn a_rig_that_misses_modes_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = tribometer(folder.path(), 5000);
+    let to = text(&folder.path().join("few.toml"));
+    run(["reduce", &path, "--modes", "3+3", "--no-residual", "--points", "1", "-o", &to])
+        .exits(3)
+        .says("modes without a partner");
+    run(["check", &to]).exits(0).says("modes without a partner");
 }
 
 #[test]

@@ -46,7 +46,7 @@ pub struct Options {
     #[arg(long, value_name = "HZ", value_parser = positive)]
     cutoff_hz: Option<f64>,
     /// Leave out what the modes left out do at the contact
-    #[arg(long)]
+    #[arg(long, conflicts_with_all = ["tolerance", "range"])]
     no_residual: bool,
     /// Keep what the modes left out do between this model's contact pairs alone: a twelfth of the size, for these patches only
     #[arg(long, conflicts_with_all = ["no_residual", "tolerance", "range"])]
@@ -88,6 +88,7 @@ impl Options {
             eprintln!("\nstopped: nothing was written");
             std::process::exit(130);
         })?;
+        self.check_output()?;
         let file = self.output.file_name().with_context(|| format!("{}: not a file", self.output.display()))?;
         let file = file.to_string_lossy().into_owned();
         let mut steps = Steps::new(2);
@@ -96,6 +97,12 @@ impl Options {
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
         let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
         if self.modes.is_none() && self.cutoff_hz.is_none() && !self.no_residual && !self.compact {
+            if full.geometry.len() == 1 {
+                bail!(
+                    "{}: a pad on a rigid disc has no basis of its own; expected --modes or --cutoff-hz",
+                    self.full.display()
+                );
+            }
             let (tolerance, range) = (self.tolerance.unwrap_or(TOLERANCE), self.range.unwrap_or_default());
             let (request, basis) = basis_of(&full, tolerance, range, limit, &mut |text| steps.say(text))?;
             let method = format!("{} vectors of the full model", basis.projected.omega_squared.len());
@@ -105,12 +112,20 @@ impl Options {
         if full.geometry.is_empty() {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
         }
+        let exponent = full.settings.contact_law.exponent;
+        if exponent != 0.0 && !self.no_residual {
+            bail!(
+                "{}: `load.exponent` is {exponent}: the residual of the modes left out is for contact whose stiffness stays; \
+                 expected 0, --no-residual, or a basis (neither --modes nor --cutoff-hz)",
+                self.full.display()
+            );
+        }
         let wanted = self.wanted(&full)?;
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
         let kept = full.keep_modes(&wanted, !self.no_residual, limit, &mut |part, what| {
             tell(&mut steps, part, names[part], what)
         })?;
-        let mut sides = modal_sides(&full, &kept);
+        let mut sides = modal_sides(&full, &kept)?;
         let residual = if self.compact { between_pairs(&file, &full, &mut sides)? } else { None };
         let (kept, mut remarks) = (remarks(&names, &kept), source_remarks(&full));
         remarks.extend(kept.iter().cloned());
@@ -119,6 +134,21 @@ impl Options {
             modal_rig(&file, &remarks, &full.common_tables, patches, known, &sides, residual.as_ref())
         };
         self.finish(steps, &unfinished, &full, limit, kept.join("; "), &make)
+    }
+
+    /// That the rig file can be written, and is not what is read.
+    fn check_output(&self) -> anyhow::Result<()> {
+        let output = self.output.display();
+        let folder = self.output.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        if self.output.is_dir() || !folder.is_dir() {
+            bail!("{output}: cannot write; expected a file in a folder that is there");
+        }
+        if let (Ok(read), Ok(written)) = (self.full.canonicalize(), self.output.canonicalize())
+            && read == written
+        {
+            bail!("{output}: is the full model itself; expected another file for the rig");
+        }
+        Ok(())
     }
 
     /// Compares what is left with the full model, and writes the files of the rig with what was found.
@@ -148,7 +178,12 @@ impl Options {
                     steps.say(&format!("compared with the full model, {what}: {}", super::full::told(step)));
                 });
                 match found {
-                    Ok(found) => (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?,
+                    Ok(found) => {
+                        if !found.certificate.is_complete() {
+                            outcome = Outcome::Differences;
+                        }
+                        (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?;
+                    }
                     // The rig is kept: it took long to make, and `verify --against` can compare it again.
                     Err(error) => {
                         steps.say(&format!("not compared with the full model: {error:#}"));

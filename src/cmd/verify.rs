@@ -10,6 +10,11 @@ use crate::certificate::{Against, Verified, WindowEnds, verify_against};
 use crate::full_model::FullModelFile;
 use crate::rig::Rig;
 
+/// Relative error of an eigenvalue that is agreement where nothing else is known.
+const TOLERANCE: f64 = 0.01;
+/// Difference of an end of a window of instability that is agreement, unless more is allowed.
+const FRICTION_TOLERANCE: f64 = 0.003;
+
 /// Compare a reduced rig with the full model it stands for
 ///
 /// Frequencies and growth rates at operating points drawn from the rig's chart, windows of instability at its reference
@@ -28,9 +33,9 @@ pub struct Options {
     /// Which points are drawn
     #[arg(long, value_name = "SEED", default_value_t = 1)]
     seed: u64,
-    /// Largest relative error of an eigenvalue that is agreement
-    #[arg(long, value_name = "R", value_parser = positive, default_value = "0.01")]
-    tolerance: f64,
+    /// Largest relative error of an eigenvalue that is agreement [default: what the rig's basis was made for, else 0.01]
+    #[arg(long, value_name = "R", value_parser = positive)]
+    tolerance: Option<f64>,
     /// Highest frequency in Hz [default: the rig's band, else the full model's, else 5000]
     #[arg(long, value_name = "HZ", value_parser = positive)]
     band_hz: Option<f64>,
@@ -68,10 +73,10 @@ impl Options {
         })?;
         print(&if self.json { serde_json::to_string(&found)? + "\n" } else { text(&rig, &full, &found) })?;
         let certificate = &found.certificate;
-        let agrees = certificate.missed == 0
-            && certificate.invented == 0
-            && certificate.max_relative_error <= self.tolerance
-            && found.points.iter().all(|point| point.unpaired == 0);
+        let tolerance = self.tolerance.or(rig.basis_tolerance).unwrap_or(TOLERANCE);
+        let agrees = certificate.is_complete()
+            && certificate.max_relative_error <= tolerance
+            && certificate.critical_friction_error.is_none_or(|error| error <= tolerance.max(FRICTION_TOLERANCE));
         Ok(if agrees { Outcome::Done } else { Outcome::Differences })
     }
 }

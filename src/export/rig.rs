@@ -3,7 +3,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use faer::Mat;
 use npyz::WriterBuilder;
 use npyz::zip::DateTime;
@@ -23,6 +23,9 @@ pub(super) fn rig_name(file: &str) -> String {
 
 /// Digits of a hash that a name carries.
 pub const HASH_DIGITS: usize = 12;
+
+/// A rigid-body motion is found this far from zero at most, relative to the highest square kept.
+const ROUNDING: f64 = 1e-6;
 
 /// One side of a rig of kind 2.
 #[derive(Clone, Debug)]
@@ -44,7 +47,18 @@ pub struct ModalSide<'a> {
 }
 
 /// What was kept of pad and disc of a full model.
-pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> Vec<ModalSide<'a>> {
+///
+/// # Errors
+/// A part whose stiffness is indefinite by more than a rounding.
+pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Result<Vec<ModalSide<'a>>> {
+    for (part, kept) in full.model.parts.iter().zip(kept) {
+        let squares = &kept.modes.omega_squared;
+        let limit = -ROUNDING * squares.iter().fold(0.0_f64, |largest, square| largest.max(square.abs()));
+        if let Some(square) = squares.iter().find(|square| **square < limit) {
+            let (path, name) = (full.path.display(), &part.name);
+            bail!("{path}: `{name}.stiffness` has a mode of {square:.3e} rad^2/s^2; expected at least {limit:.1e}");
+        }
+    }
     let side = |((part, geometry), kept): ((&'a FullPart, &PartGeometry), &'a Kept)| {
         let (rows, phi) = (geometry.interface_rows(), kept.modes.phi.as_ref());
         ModalSide {
@@ -58,7 +72,7 @@ pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> Vec<ModalSi
             mass_share: None,
         }
     };
-    full.model.parts.iter().zip(&full.geometry).zip(kept).map(side).collect()
+    Ok(full.model.parts.iter().zip(&full.geometry).zip(kept).map(side).collect())
 }
 
 /// Lines of comment: what a rig was reduced from.

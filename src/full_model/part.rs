@@ -204,7 +204,12 @@ impl Read<'_> {
     fn check(&self, files: &mut Files, mass: bool) -> Result<(), RigError> {
         let view = self.matrix.as_ref();
         for row in 0..self.matrix.nrows() {
-            let value = view.get(row, row).copied().unwrap_or(0.0);
+            let listed = view.get(row, row).copied();
+            if listed.is_none() && !mass {
+                let told = format!("at row {}, column {} is missing", row + 1, row + 1);
+                return Err(self.at_line(files, (row, row), told, "every row on the diagonal; is the file whole?"));
+            }
+            let value = listed.unwrap_or(0.0);
             if value < 0.0 || (mass && value == 0.0) {
                 let limit = if mass { "more than 0 on the diagonal" } else { "at least 0 on the diagonal" };
                 let value = format!("at row {}, column {} is {value}", row + 1, row + 1);

@@ -24,6 +24,7 @@ pub use sensitivity::end_derivatives;
 pub use shortcut::Shortcut;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
+use crate::certificate::Certificate;
 use crate::io::chart_file::ChartFile;
 use crate::io::clock;
 use crate::io::heard::{Bus, Heard};
@@ -469,6 +470,7 @@ pub fn rig_info(rig: &Rig) -> RigInfo {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         mode_count: rig.model.dimension() as u32,
         band_max_hz: rig.band_max_hz.unwrap_or(f64::NAN),
+        reduction: rig.reduction.as_ref().map(Certificate::told).unwrap_or_default(),
     }
 }
 

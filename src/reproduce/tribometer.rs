@@ -169,7 +169,7 @@ impl Study<'_> {
 
     /// The rig of all modes kept.
     fn files(&self, residual: bool) -> anyhow::Result<Vec<RigFile>> {
-        let mut sides = modal_sides(self.full, self.kept);
+        let mut sides = modal_sides(self.full, self.kept)?;
         if !residual {
             sides.iter_mut().for_each(|side| side.residual = None);
         }

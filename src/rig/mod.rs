@@ -69,6 +69,8 @@ pub struct Rig {
     pub contents: Vec<String>,
     /// `[reduction]`: how far it is from the full model it was reduced from.
     pub reduction: Option<Certificate>,
+    /// `[basis] tolerance`: the largest `|Δλ|/|λ|` its basis was made to hold.
+    pub basis_tolerance: Option<f64>,
     /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
     pub shapes: Vec<SideShapes>,
 }
@@ -200,6 +202,7 @@ impl Rig {
             files: source.into_files(),
             contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::told)).collect(),
             reduction: raw.reduction,
+            basis_tolerance: raw.basis.as_ref().and_then(|basis| basis.tolerance),
             shapes: built.shapes,
         })
     }

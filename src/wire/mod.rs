@@ -173,6 +173,7 @@ pub struct RigInfo {
     pub version: String,
     pub mode_count: u32,
     pub band_max_hz: f64,
+    pub reduction: String,
 }
 
 /// `squealcast_msgs/SessionEvent`.
