@@ -543,7 +543,8 @@ mod tests {
             assert!(heard.is_new(Bus::Shm, Time::from_ns(0), seq));
             assert_eq!(seq >= 100, heard.is_new(Bus::Ros2, Time::from_ns(0), seq.saturating_sub(100)), "{seq}");
         }
-        assert_eq!(room, (heard.bus.capacity(), heard.order.capacity()));
+        // A map with traces of what was forgotten says less than it has.
+        assert!(heard.bus.capacity() <= room.0 && heard.order.capacity() == room.1);
     }
 
     #[test]

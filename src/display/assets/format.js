@@ -40,6 +40,9 @@ export class Decimals {
   text(value) { return fixed(value, this.of(value)); }
 }
 
+/** A growth rate is told to this, however quiet it is: a damping ratio of 1e-4. */
+export const leastGrowth = (hz) => 2e-4 * Math.PI * hz;
+
 /** Writes text and the exact value behind it; only where it changed, and into the text that is there. */
 export function put(element, text, value) {
   const node = element.firstChild;

@@ -1,6 +1,6 @@
 // The table of modes.
 
-import { Decimals, NONE, fixed, known, put } from "./format.js";
+import { Decimals, NONE, fixed, known, leastGrowth, put } from "./format.js";
 
 /** A bound says its order of magnitude. */
 const bound = (error) => (error === 0 ? "0" : error.toExponential(0).replace("-", "\u2212"));
@@ -27,6 +27,7 @@ export class Modes {
     for (const [, [hz, growth]] of modes) {
       this.decimals.frequency.of(hz);
       this.decimals.growth.of(growth);
+      this.decimals.growth.of(leastGrowth(hz));
     }
     modes.forEach(([id, [hz, growth, damping, pad, hzError, growthError]], place) => {
       const { row, cells } = this.rows.get(id) ?? this.#row(id);

@@ -1,6 +1,6 @@
 // Status in words, colour and shape; the gauge of the margin; the numbers.
 
-import { Decimals, LEVELS, fixed, known, put, signed } from "./format.js";
+import { Decimals, LEVELS, fixed, known, leastGrowth, put, signed } from "./format.js";
 
 const WORDS = ["OK", "WARN", "SQUEAL", "FAULT"];
 const CALM = "quiet: no mode grows";
@@ -66,6 +66,7 @@ export class Status {
 
   numbers(state, age) {
     const { growth, worst, load, speed } = this.decimals;
+    for (const [, [hz]] of state.modes ?? []) growth.of(leastGrowth(hz));
     // Its numbers change with every state; nobody reads as fast.
     if (!at("status").classList.contains("stale")) this.#reason(state.level, state.reason);
     put(at("margin"), signed(state.margin, 4), state.margin);
