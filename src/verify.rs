@@ -3,7 +3,7 @@
 //! Exactly the inputs that were predicted are predicted again, in the recorded order, with the recorded session events
 //! between them; stability maps and ends of windows are computed anew at the load and speed their events name.
 //! Sensitivities are left out: nothing depends on them. Dense spectra of inputs to come are solved side by side, ahead of the
-//! session ([`crate::ahead`]).
+//! session (`ahead`).
 
 use std::collections::{HashSet, VecDeque};
 use std::sync::Arc;

@@ -81,7 +81,7 @@ impl Solver {
         }
     }
 
-    /// The spectrum of `model` at `p`. Coordinates that nothing couples stay out of the eigenvalue problem: see [`super::decoupled`].
+    /// The spectrum of `model` at `p`. Coordinates that nothing couples stay out of the eigenvalue problem: see `physics::decoupled`.
     ///
     /// # Errors
     /// [`SolveError::Model`] where the model cannot be evaluated there, [`SolveError::NoConvergence`],
