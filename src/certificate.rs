@@ -43,19 +43,14 @@ pub struct Certificate {
     /// Unstable modes and windows of the rig that the full model does not have.
     pub invented: usize,
     /// Modes of the full model, stable or not, that have no partner in the rig, over all points.
-    #[serde(default, skip_serializing_if = "none_of_them")]
-    pub absent: usize,
-}
-
-#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde passes references")]
-fn none_of_them(count: &usize) -> bool {
-    *count == 0
+    #[serde(default)]
+    pub unpaired: usize,
 }
 
 impl Certificate {
     /// Whether the rig has what the full model has in the band, and nothing else.
     pub fn is_complete(&self) -> bool {
-        self.missed == 0 && self.invented == 0 && self.absent == 0 && !self.max_relative_error.is_nan()
+        self.missed == 0 && self.invented == 0 && self.unpaired == 0 && !self.max_relative_error.is_nan()
     }
 
     /// A line for people.
@@ -64,13 +59,13 @@ impl Certificate {
             Some(error) => format!(", critical friction {error:.1e}"),
             None => String::new(),
         };
-        let absent = match self.absent {
+        let unpaired = match self.unpaired {
             0 => String::new(),
             count => format!(", {count} modes without a partner"),
         };
         format!(
             "reduction  errors at {} held-out points up to {} Hz: frequency {:.1e} relative, growth rate {:.1e} 1/s{critical}; \
-             {} unstable modes or windows missed, {} invented{absent}",
+             {} unstable modes or windows missed, {} invented{unpaired}",
             self.points,
             self.band_hz,
             self.max_frequency_error,
@@ -223,7 +218,7 @@ pub fn verify_against(
         critical_friction_error: critical,
         missed: missed + points.iter().map(|point| point.missed.len()).sum::<usize>(),
         invented: invented + points.iter().map(|point| point.invented.len()).sum::<usize>(),
-        absent: points.iter().map(|point| point.unpaired).sum(),
+        unpaired: points.iter().map(|point| point.unpaired).sum(),
     };
     Ok(Verified { certificate, points, windows })
 }

@@ -18,6 +18,14 @@ pub fn section(title: &str, body: &str) -> String {
     format!("<section>\n<h2>{title}</h2>\n{body}</section>\n")
 }
 
+/// What something is, name by name; texts that are no markup.
+pub fn facts<N: AsRef<str>, V: AsRef<str>>(rows: impl IntoIterator<Item = (N, V)>) -> String {
+    let row = |(name, value): (N, V)| {
+        format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escaped(name.as_ref()), escaped(value.as_ref()))
+    };
+    format!("<table class=\"facts\"><tbody>\n{}</tbody></table>\n", rows.into_iter().map(row).collect::<String>())
+}
+
 /// A figure of [`crate::plot`] with a caption, which is markup.
 pub fn figure(svg: &str, caption: &str) -> String {
     // Without the declaration a file of its own would have.

@@ -303,11 +303,9 @@ fn figure(
 
 /// Which line is which mode, above the axes: it covers no curve.
 fn legend(area: &Area<'_>, entries: &[(u32, &str)], columns: usize) -> Result<(), PlotError> {
-    let size = |px: i32| px * FINE as i32;
-    let width = (LEGEND_WIDTH / columns) as i32;
     for (k, &(id, label)) in entries.iter().enumerate() {
-        let (x, y) = (size(84 + width * (k % columns) as i32), size(12 + 24 * (k / columns) as i32));
-        let ends = [(x, y), (x + size(28), y)];
+        let (x, y) = legend_place(k, columns);
+        let ends = [(x, y), (x + 28 * FINE as i32, y)];
         match DASHES[id as usize / COLOURS.len() % DASHES.len()] {
             None => area.draw(&PathElement::new(ends, style(id))).map_err(failed)?,
             Some((on, off)) => {
@@ -315,11 +313,21 @@ fn legend(area: &Area<'_>, entries: &[(u32, &str)], columns: usize) -> Result<()
                 area.draw(&line).map_err(failed)?;
             }
         }
-        let place = Pos::new(HPos::Left, VPos::Center);
-        let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(place);
-        area.draw(&Text::new(label.to_owned(), (x + size(34), y), text)).map_err(failed)?;
+        legend_text(area, (x, y), label)?;
     }
     Ok(())
+}
+
+/// Where the k-th entry of a legend begins.
+fn legend_place(k: usize, columns: usize) -> (i32, i32) {
+    let (width, size) = ((LEGEND_WIDTH / columns) as i32, |px: i32| px * FINE as i32);
+    (size(84 + width * (k % columns) as i32), size(12 + 24 * (k / columns) as i32))
+}
+
+/// What an entry is, beside its line or mark.
+fn legend_text(area: &Area<'_>, (x, y): (i32, i32), label: &str) -> Result<(), PlotError> {
+    let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(Pos::new(HPos::Left, VPos::Center));
+    area.draw(&Text::new(label.to_owned(), (x + 34 * FINE as i32, y), text)).map_err(failed)
 }
 
 /// The line of a mode.
@@ -369,24 +377,14 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
         drawn.iter().flat_map(|route| [route.median_error, route.largest_error].map(|error| at(route, error).1));
     let y = decades(range(errors));
     figure(title, (1000, 640), |area| {
-        let size = |px: i32| px * FINE as i32;
-        let place = Pos::new(HPos::Left, VPos::Center);
-        let text = || ("sans-serif", 15 * FINE).into_text_style(area).pos(place);
-        let entry = |k: usize, row: usize| {
-            let (column, row) = (k % FRONT_COLUMNS, row + k / FRONT_COLUMNS);
-            (size(84 + 180 * column as i32), size(12 + 24 * row as i32))
-        };
-        let rows_of_curves = curves.len().div_ceil(FRONT_COLUMNS);
-        for (k, modes) in curves.keys().enumerate() {
-            let (x, y) = entry(k, 0);
-            let line = PathElement::new([(x, y), (x + size(28), y)], COLOURS[k % COLOURS.len()].stroke_width(2 * FINE));
-            area.draw(&line).map_err(failed)?;
-            area.draw(&Text::new(format!("{modes} modes"), (x + size(34), y), text())).map_err(failed)?;
-        }
+        let curve_names: Vec<String> = curves.keys().map(|modes| format!("{modes} modes")).collect();
+        let entries: Vec<(u32, &str)> = (0..).zip(curve_names.iter().map(String::as_str)).collect();
+        legend(area, &entries, FRONT_COLUMNS)?;
+        let rows_of_curves = entries.len().div_ceil(FRONT_COLUMNS);
         for (k, name) in names.iter().enumerate() {
-            let (x, y) = entry(k, rows_of_curves);
-            area.draw(&marker(k, (x + size(14), y), BLACK)).map_err(failed)?;
-            area.draw(&Text::new((*name).to_owned(), (x + size(34), y), text())).map_err(failed)?;
+            let (x, y) = legend_place(FRONT_COLUMNS * rows_of_curves + k, FRONT_COLUMNS);
+            area.draw(&marker(k, (x + 14 * FINE as i32, y), BLACK)).map_err(failed)?;
+            legend_text(area, (x, y), name)?;
         }
         let area = &area.margin(24 * (rows_of_curves + names.len().div_ceil(FRONT_COLUMNS)) as u32 * FINE, 0, 0, 0);
         let labels = ("run time per condition, us", "relative error of the squared eigenvalue");
@@ -537,8 +535,7 @@ fn power_of_ten(value: f64, _range: (f64, f64)) -> String {
     if (value - power).abs() > 1e-9 {
         return String::new();
     }
-    let raised =
-        format!("{}", power.abs()).chars().filter_map(|c| digits.get(c.to_digit(10)? as usize)).collect::<String>();
+    let raised: String = power.abs().to_string().chars().filter_map(|c| digits.get(c.to_digit(10)? as usize)).collect();
     format!("10{}{raised}", if power < 0.0 { "⁻" } else { "" })
 }
 

@@ -81,7 +81,7 @@ fn the_embedded_rigs_stand_for_the_default_tribometer() {
     let path = folder.join("tribometer.toml");
     let full = FullModelFile::load(&path).unwrap();
     assert_eq!(full.model.dimension(), 22_032);
-    // Limits of the issue that asked for them: 60 vectors within 1e-4 % and 0.05 %; 80+80 within 0.005 % and 0.5 %.
+    // 60 vectors within 1e-4 % and 0.05 %; 80+80 within 0.005 % and 0.5 %.
     for (name, most, frequency, critical) in [("tribometer", 60, 1e-6, 5e-4), ("tribometer-80+80", 160, 5e-5, 5e-3)] {
         let rig = Rig::load(name).unwrap();
         let known = rig.reduction.clone().expect("a certificate");

@@ -215,7 +215,7 @@ fn conditions(plan: &Plan, merging: &[f64], reference: &OperatingPoint) -> Vec<O
                 friction_coefficient: share(),
             };
             let (which, off) = (share(), 1e-6 * (2.0 * share() - 1.0));
-            if k % 10 != 9 || merging.is_empty() {
+            if !is_near_merging(k, merging) {
                 return p;
             }
             // Where they merge depends on load and speed: these are kept.
@@ -223,6 +223,11 @@ fn conditions(plan: &Plan, merging: &[f64], reference: &OperatingPoint) -> Vec<O
             reference.with_friction((at + off).clamp(0.0, 1.0))
         })
         .collect()
+}
+
+/// Whether the k-th condition is near a merging point: one of ten, where there are any.
+fn is_near_merging(k: usize, merging: &[f64]) -> bool {
+    k % 10 == 9 && !merging.is_empty()
 }
 
 /// Rigs are drawn until one has merging points, this many times at most.
@@ -397,7 +402,7 @@ pub fn measure(
         modes,
         seed,
         merging_points: merging.len(),
-        near_merging: if merging.is_empty() { 0 } else { points.len() / 10 },
+        near_merging: (0..points.len()).filter(|&k| is_near_merging(k, &merging)).count(),
         decoupled_modes: model.decoupled_count(),
         map_s,
         chart_s,

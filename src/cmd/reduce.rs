@@ -88,9 +88,7 @@ impl Options {
             eprintln!("\nstopped: nothing was written");
             std::process::exit(130);
         })?;
-        self.check_output()?;
-        let file = self.output.file_name().with_context(|| format!("{}: not a file", self.output.display()))?;
-        let file = file.to_string_lossy().into_owned();
+        let file = self.output_file()?;
         let mut steps = Steps::new(2);
         steps.say(&format!("reading {}", self.full.display()));
         let full = FullModelFile::load(&self.full)?;
@@ -136,19 +134,19 @@ impl Options {
         self.finish(steps, &unfinished, &full, limit, kept.join("; "), &make)
     }
 
-    /// That the rig file can be written, and is not what is read.
-    fn check_output(&self) -> anyhow::Result<()> {
+    /// The name of the rig file, which can be written and is not what is read.
+    fn output_file(&self) -> anyhow::Result<String> {
         let output = self.output.display();
         let folder = self.output.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        if self.output.is_dir() || !folder.is_dir() {
+        let Some(file) = self.output.file_name().filter(|_| folder.is_dir() && !self.output.is_dir()) else {
             bail!("{output}: cannot write; expected a file in a folder that is there");
-        }
+        };
         if let (Ok(read), Ok(written)) = (self.full.canonicalize(), self.output.canonicalize())
             && read == written
         {
             bail!("{output}: is the full model itself; expected another file for the rig");
         }
-        Ok(())
+        Ok(file.to_string_lossy().into_owned())
     }
 
     /// Compares what is left with the full model, and writes the files of the rig with what was found.

@@ -6,7 +6,7 @@ use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
 use super::events::{Event, Events, iso, seconds};
 use super::recorded::Recorded;
-use crate::html::{escaped, figure, page, section};
+use crate::html::{escaped, facts, figure, page, section};
 use crate::plot;
 use crate::wire::{SessionEvent, event_kind, level};
 
@@ -153,11 +153,7 @@ fn session(recorded: &Recorded, origin: &Origin, from_s: f64, to_s: f64) -> Stri
         })
         .collect();
     rows.push(("settings", told.join("; ")));
-    let cells: String = rows
-        .iter()
-        .map(|(name, value)| format!("<tr><th scope=\"row\">{name}</th><td>{}</td></tr>\n", escaped(value)))
-        .collect();
-    format!("<table class=\"facts\"><tbody>\n{cells}</tbody></table>\n")
+    facts(rows)
 }
 
 fn events(events: &Events, from_s: f64) -> String {
@@ -224,9 +220,7 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
         ("not judged", format!("{}: predicted squeals during which nothing was measured", found.unjudged.len())),
         ("lead", format!("{lead}, from the predicted to the measured onset")),
     ];
-    let cells: String =
-        rows.iter().map(|(name, value)| format!("<tr><th scope=\"row\">{name}</th><td>{value}</td></tr>\n")).collect();
-    let mut html = format!("<table class=\"facts\"><tbody>\n{cells}</tbody></table>\n");
+    let mut html = facts(rows);
     let _ = writeln!(
         html,
         "<p>A <em>measured squeal</em> is a stretch of measurements of at least {} dB, with interruptions shorter than \
@@ -372,16 +366,10 @@ fn skipped(recorded: &Recorded) -> String {
         recorded.reused
     );
     let counted = recorded.counted.iter().flat_map(|counted| &counted.status).flat_map(|status| &status.values);
-    let rows: String = counted
-        .map(|pair| {
-            format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escaped(&pair.key), escaped(&pair.value))
-        })
-        .collect();
-    if !rows.is_empty() {
-        let _ = writeln!(
-            html,
-            "<p>What the node counted by the end:</p>\n<table class=\"facts\"><tbody>\n{rows}</tbody></table>"
-        );
+    let counted: Vec<(&str, &str)> = counted.map(|pair| (&*pair.key, &*pair.value)).collect();
+    if !counted.is_empty() {
+        html += "<p>What the node counted by the end:</p>\n";
+        html += &facts(counted);
     }
     if recorded.damage.is_empty() {
         html += "<p>The recording is whole.</p>\n";

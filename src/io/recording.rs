@@ -19,6 +19,10 @@ use super::{
 };
 use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic, same_fields};
 
+/// Messages read at a time, and how many times ahead of their use.
+const BATCH: usize = 512;
+const BATCHES_AHEAD: usize = 4;
+
 /// Why a recording cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
@@ -170,10 +174,6 @@ impl Recording {
         }
     }
 }
-
-/// Messages read at a time, and how many times ahead of their use.
-const BATCH: usize = 512;
-const BATCHES_AHEAD: usize = 4;
 
 /// Messages that follow each other, and what was found wrong before, between and behind them.
 #[derive(Debug, Default)]
