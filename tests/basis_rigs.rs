@@ -8,7 +8,7 @@ use std::f64::consts::TAU;
 use std::fs;
 
 use faer::{Mat, c64};
-use program::{run, text};
+use program::{run, text, tribometer};
 use squealcast::export::{ModalSide, modal_rig};
 use squealcast::full_model::FullModelFile;
 use squealcast::physics::{OperatingPoint, Solver, Spectrum, Vectors};
@@ -153,8 +153,7 @@ fn a_system_on_its_basis_has_the_roots_it_has() {
 fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
     let temp = tempfile::tempdir().unwrap();
     let folder = temp.path().join("full");
-    run(["tribometer", "--dof", "5000", "-o", &text(&folder)]).exits(0);
-    let path = folder.join("tribometer.toml");
+    let path = tribometer(&folder, 5000);
     let banded = folder.join("banded.toml");
     let band_hz = 2700.0;
     let written = fs::read_to_string(&path).unwrap();
@@ -188,8 +187,7 @@ fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
 fn a_rig_made_at_one_load_and_used_at_another_is_caught() {
     let temp = tempfile::tempdir().unwrap();
     let folder = temp.path().join("full");
-    run(["tribometer", "--dof", "5000", "-o", &text(&folder)]).exits(0);
-    let path = folder.join("tribometer.toml");
+    let path = tribometer(&folder, 5000);
     let hertzian = folder.join("hertzian.toml");
     let written = fs::read_to_string(&path).unwrap().replace("max_hz = 4000.0", "max_hz = 2700.0");
     fs::write(&hertzian, written + "\n[load]\nexponent = 0.3333333333333333\nreference_n = 500.0\n").unwrap();

@@ -5,8 +5,13 @@ mod program;
 
 use std::f64::consts::TAU;
 use std::fs;
+use std::path::Path;
 
-use program::{json, launch, number, run, text, write};
+use program::{json, launch, number, run, text, tribometer, write};
+use squealcast::full_model::FullModelFile;
+use squealcast::physics::{Solver, Vectors};
+use squealcast::reduction::lowest_modes;
+use squealcast::rig::Rig;
 
 /// rad/s, without friction, contact springs of 1 N/m.
 const NINE_DOF_RAD_S: [f64; 9] =
@@ -31,10 +36,94 @@ fn the_stiffness_behind_known_frequencies_is_found() {
     let figure = fs::read_to_string(&svg).unwrap();
     assert!(figure.starts_with("<svg") && figure.contains("contact stiffness of a pair"), "{figure:.200}");
 
-    // Of the lowest alone, which hardly know the contact, less is known: the range widens.
     run(["identify", &rig, "--targets", &targets]).exits(0).says("1.000000e0 N/m a pair").says("0.8749");
     let few = json(["identify", &rig, "--targets", &targets, "--json", "--first", "5"]);
     assert!((number(&few, "stiffness_factor") - 8.0).abs() < 1e-5, "{few}");
+
+    // Of the lowest alone, which know the contact less, less is known: with the same relative errors in the frequencies
+    // the range widens. Where the fit is quadratic, errors that no stiffness removes double `sqrt(3) rms / S` away.
+    let sign = |index: usize| if index.is_multiple_of(2) { 1.0 } else { -1.0 };
+    let off = |(index, w): (usize, &f64)| format!("{}\n", w / TAU * (1.0 + 1e-3 * sign(index)));
+    let wrong: String = NINE_DOF_RAD_S.iter().enumerate().map(off).collect();
+    let wrong = write(temp.path(), "wrong.csv", &format!("frequency_hz\n{wrong}"));
+    let [all, few] = ["9", "5"].map(|first| {
+        let found = json(["identify", &rig, "--targets", &wrong, "--json", "--first", first]);
+        let width = (number(&found, "factor_to") / number(&found, "factor_from")).ln();
+        let expected = 2.0 * 3.0_f64.sqrt() * number(&found, "rms_error") / number(&found, "sensitivity");
+        // What is beyond the quadratic changes the width by its own square, if it is the same to both sides.
+        assert!((width / expected - 1.0).abs() < width.max(0.05), "{width} {expected} {found}");
+        width
+    });
+    assert!(few > 1.5 * all, "{few} {all}");
+}
+
+/// A rig of kind 2 with the residual of what it leaves out, against the full model's own frequencies with another
+/// stiffness; and against its own, where nothing is left out.
+#[test]
+fn the_stiffness_of_a_full_model_is_found_on_a_rig_with_residuals() {
+    const FACTOR: f64 = 0.6;
+    const COUNT: usize = 18;
+    let temp = tempfile::tempdir().unwrap();
+    let path = tribometer(temp.path(), 5000);
+    let rig_file = text(&temp.path().join("rig.toml"));
+    run(["reduce", &text(&path), "--modes", "40+40", "--points", "0", "-o", &rig_file])
+        .exits(0)
+        .says("residual   of pad");
+
+    let written = fs::read_to_string(&path).unwrap();
+    let frequencies = |factor: f64| -> Vec<f64> {
+        let other = written.replace("= 1.251e7", &format!("= {:?}", factor * 1.251e7));
+        assert_ne!(other, written);
+        let full = FullModelFile::load(Path::new(&write(temp.path(), "other.toml", &other))).unwrap();
+        let rest = full.settings.reference.with_friction(0.0);
+        let [mass, _, stiffness] = full.model.matrices_at(&rest).unwrap();
+        let modes = lowest_modes("full", &mass, &stiffness, COUNT).unwrap();
+        modes.omega_squared.iter().map(|square| square.sqrt() / TAU).collect()
+    };
+    let list = |name: &str, hz: &[f64]| {
+        let lines: String = hz.iter().map(|hz| format!("{hz}\n")).collect();
+        write(temp.path(), name, &format!("frequency_hz\n{lines}"))
+    };
+    let rms = |a: &[f64], b: &[f64]| {
+        let squares: f64 = a.iter().zip(b).map(|(a, b)| (a / b).ln().powi(2)).sum();
+        (squares / COUNT as f64).sqrt()
+    };
+    let (exact, stiffer) = (frequencies(FACTOR), frequencies(1.02 * FACTOR));
+    let found = json(["identify", &rig_file, "--targets", &list("full.csv", &exact), "--json"]);
+    eprintln!("{found}");
+    // The sensitivity by the full model's own frequencies; those of the rig are off by what the modes left out leave.
+    let sensitivity = rms(&stiffer, &exact) / 1.02_f64.ln();
+    assert!((number(&found, "sensitivity") / sensitivity - 1.0).abs() < 0.05, "{sensitivity} {found}");
+    let rig = Rig::load(&rig_file).unwrap().with_contact_stiffness_times(FACTOR).unwrap();
+    let at_rest = rig.reference.with_friction(0.0);
+    let spectrum = Solver::new(rig.model.dimension()).solve(&rig.model, &at_rest, Vectors::Right).unwrap();
+    let reduced: Vec<f64> = spectrum.modes().iter().map(|root| root.frequency_hz()).take(COUNT).collect();
+    let error = rms(&reduced, &exact);
+    // 40 + 40 modes with residuals are good to 0.0713 %; no least-squares fit is further off than those errors over S.
+    assert!(error < 7.13e-4, "{error:e}");
+    let off = (number(&found, "stiffness_factor") / FACTOR).ln().abs();
+    assert!(off < 1.1 * error / sensitivity, "{off:e}, {error:e} / {sensitivity}");
+    // Against the rig's own frequencies the error falls linearly to 0: rounding of 1e-12 and the last bracket are left.
+    let own = json(["identify", &rig_file, "--targets", &list("own.csv", &reduced), "--json"]);
+    assert!((number(&own, "stiffness_factor") / FACTOR - 1.0).abs() < 1e-7, "{own}");
+
+    // Of the first mode alone nothing bounds the stiffness from above; that is said.
+    let first = list("first.csv", &exact[..1]);
+    run(["identify", &rig_file, "--targets", &first]).exits(0).says("sensitivity        1 % more stiffness");
+}
+
+/// Frequencies that two stiffnesses fit about as well say so.
+#[test]
+fn stiffness_that_is_poorly_determined_is_called_so() {
+    let temp = tempfile::tempdir().unwrap();
+    // 20 % off, up and down in turn: the best fit is bad, and so are many others.
+    let sign = |index: usize| if index.is_multiple_of(2) { 1.2 } else { 0.8 };
+    let lines: String =
+        NINE_DOF_RAD_S.iter().enumerate().map(|(index, w)| format!("{}\n", w / TAU * sign(index))).collect();
+    let targets = write(temp.path(), "off.csv", &format!("frequency_hz\n{lines}"));
+    run(["identify", &launch("nine-dof.toml"), "--targets", &targets, "--first", "5"])
+        .exits(0)
+        .says("poorly determined: ");
 }
 
 #[test]

@@ -17,10 +17,9 @@ use squealcast::rig::Rig;
 const BAND_HZ: f64 = 4000.0;
 const BAND: &str = "[band]\nmax_hz = 4000.0\n";
 
-/// A tribometer of at least `dof` degrees of freedom: its full model.
+/// The tribometer's full model, whose band is the one judged here.
 fn tribometer(folder: &Path, dof: usize) -> String {
-    run(["tribometer", "--dof", &dof.to_string(), "-o", &text(folder)]).exits(0);
-    let path = folder.join("tribometer.toml");
+    let path = program::tribometer(folder, dof);
     let written = std::fs::read_to_string(&path).unwrap();
     assert!(written.contains(BAND), "{written}");
     text(&path)
@@ -246,7 +245,8 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     let entries: Vec<&str> = matrix.lines().filter(|line| !line.starts_with('%')).skip(1).collect();
     write(folder.path(), "cut.txt", &(entries[..7 * entries.len() / 10].join("\n") + "\n"));
     let cut = write(folder.path(), "cut.toml", &whole.replace("disc-stiffness.mtx", "cut.txt"));
-    run(["check", &cut]).exits(1).complains("cut.txt").complains("is missing; expected every row on the diagonal");
+    run(["check", &cut]).exits(1).complains(&format!("cut.txt, line {}: entry at row", 7 * entries.len() / 10));
+    run(["check", &cut]).exits(1).complains("is missing up to here; expected every row on the diagonal");
     for name in ["hertzian.toml", "cut.txt", "cut.toml"] {
         std::fs::remove_file(folder.path().join(name)).unwrap();
     }

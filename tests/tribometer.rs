@@ -6,7 +6,7 @@ mod program;
 
 use std::fs;
 
-use program::{run, text};
+use program::{Running, command, files_below, run, text, tribometer, until};
 use squealcast::full_model::FullModelFile;
 use squealcast::rig::Rig;
 
@@ -19,7 +19,7 @@ fn rows(text: &str) -> Vec<Vec<&str>> {
 fn its_files_agree_with_each_other() {
     let temp = tempfile::tempdir().unwrap();
     let folder = temp.path().join("rig");
-    run(["tribometer", "--dof", "5000", "-o", &text(&folder)]).exits(0).complains("degrees of freedom");
+    tribometer(&folder, 5000);
     let file = |name: &str| fs::read_to_string(folder.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"));
     let full: toml::Table = file("tribometer.toml").parse().unwrap();
     let (mut sizes, mut contact, mut node_count) = (vec![], vec![], 0);
@@ -69,6 +69,19 @@ fn its_files_agree_with_each_other() {
         assert!(file(part).contains("C3D8I"), "{part}");
     }
     run(["tribometer", "--dof", "10", "-o", &text(&folder)]).exits(2).complains("5000");
+}
+
+/// An interruption leaves no file that is not whole, and no `tribometer.toml`, which comes last.
+#[test]
+fn an_interruption_leaves_no_half_file() {
+    let temp = tempfile::tempdir().unwrap();
+    let folder = temp.path().join("rig");
+    let is_part = |path: &std::path::PathBuf| path.extension().is_some_and(|extension| extension == "part");
+    let begun = || folder.is_dir() && files_below(&folder).iter().any(is_part);
+    let writing = Running::start(command(["tribometer", "--dof", "200000", "-o", &text(&folder)]));
+    until("a file that is being written", begun);
+    writing.signal("INT").exits(130).complains("stopped");
+    assert!(!begun() && !folder.join("tribometer.toml").exists(), "{:?}", files_below(&folder));
 }
 
 /// The embedded rigs are what `reduce` makes of the full model that `squealcast tribometer` writes today, and say how far they are

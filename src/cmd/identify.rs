@@ -10,6 +10,9 @@ use crate::physics::{OperatingPoint, Solver, Vectors};
 use crate::plot;
 use crate::rig::Rig;
 
+/// Stiffness over more than this factor within twice the least error is called poorly determined.
+const WELL_DETERMINED: f64 = 2.0;
+
 /// Find the contact stiffness that fits measured or computed natural frequencies at rest
 #[derive(Debug, Args)]
 pub struct Options {
@@ -43,6 +46,8 @@ struct Report<'a> {
     /// Where the error stays below twice its minimum.
     factor_from: Option<f64>,
     factor_to: Option<f64>,
+    /// Relative change of the frequencies, rms, for a relative change of the stiffness.
+    sensitivity: f64,
     frequency_hz: &'a [f64],
     target_hz: &'a [f64],
 }
@@ -84,6 +89,7 @@ impl Options {
                 largest_error: found.best.largest_error,
                 factor_from: found.doubled[0],
                 factor_to: found.doubled[1],
+                sensitivity: found.sensitivity,
                 frequency_hz: &found.best.frequencies_hz,
                 target_hz: &targets,
             };
@@ -97,7 +103,7 @@ impl Options {
 
 /// Natural frequencies without sliding, the stiffness of every contact pair times `factor`.
 fn at_rest_hz(rig: &Rig, normal_load_n: f64, factor: f64) -> anyhow::Result<Vec<f64>> {
-    let model = rig.with_contact_stiffness_times(factor)?.model;
+    let model = rig.at_rest_with_contact_stiffness_times(factor)?;
     let at_rest = OperatingPoint { normal_load_n, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
     let spectrum = Solver::new(model.dimension()).solve(&model, &at_rest, Vectors::Right)?;
     Ok(spectrum.modes().iter().map(|root| root.frequency_hz()).collect())
@@ -129,6 +135,20 @@ fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
     Ok(targets)
 }
 
+/// A warning where the frequencies hardly know the stiffness; nothing where they do.
+fn poorly(found: &Identified) -> String {
+    match found.doubled {
+        [Some(from), Some(to)] if to / from <= WELL_DETERMINED => String::new(),
+        [Some(from), Some(to)] => format!(
+            "\npoorly determined: stiffness over a factor of {:.1} fits within twice the error; frequencies that the contact \
+             moves more are needed",
+            to / from
+        ),
+        _ => "\npoorly determined: the frequencies do not bound the stiffness; such that the contact moves more are needed"
+            .to_owned(),
+    }
+}
+
 fn text(found: &Identified, targets: &[f64], [low, high]: [f64; 2]) -> String {
     let best = &found.best;
     let stiffness = |factor: f64| {
@@ -140,7 +160,8 @@ fn text(found: &Identified, targets: &[f64], [low, high]: [f64; 2]) -> String {
     let mut text = format!(
         "contact stiffness  {} a pair, {:.6} times the rig's\n\
          error              mean {}, rms {}, largest {}, of {} frequencies\n\
-         determined         the rms error stays below twice that from {} to {}\n\n\
+         determined         the rms error stays below twice that from {} to {}\n\
+         sensitivity        1 % more stiffness moves the frequencies by {:.4} % (rms){}\n\n\
          {:>4}  {:>14}  {:>14}  {:>10}\n",
         stiffness(best.factor),
         best.factor,
@@ -150,6 +171,8 @@ fn text(found: &Identified, targets: &[f64], [low, high]: [f64; 2]) -> String {
         targets.len(),
         end(found.doubled[0]),
         end(found.doubled[1]),
+        found.sensitivity,
+        poorly(found),
         "mode",
         "target, Hz",
         "rig, Hz",

@@ -13,7 +13,7 @@ use crate::certificate::{Against, Certificate, verify_against};
 use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
 use crate::full_model::FullModelFile;
 use crate::io::memory::available_bytes;
-use crate::io::whole_file::{beside, write_whole};
+use crate::io::whole_file::{remove_begun, write_whole};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{Kept, Progress, Residual, Wanted};
 use crate::rig::{Rig, RigFile, SideResidual, between_patches};
@@ -84,6 +84,7 @@ impl Options {
         let unfinished = Unfinished::default();
         let to_remove = unfinished.clone();
         on_stop(move || {
+            remove_begun();
             to_remove.remove();
             eprintln!("\nstopped: nothing was written");
             std::process::exit(130);
@@ -325,7 +326,6 @@ impl Unfinished {
             if !path.exists() {
                 self.list().push(path.clone());
             }
-            self.list().push(beside(&path)?);
             let written = write_whole(&path, |out| std::io::Write::write_all(out, &file.bytes));
             if written.is_err() {
                 self.remove();

@@ -3,8 +3,10 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::Outcome;
+use super::signals::on_stop;
 use crate::export::write_full_model;
 use crate::fem::tribometer::{Dimensions, Tribometer};
+use crate::io::whole_file::remove_begun;
 
 /// Write the reference tribometer as a full finite-element model
 ///
@@ -22,6 +24,11 @@ pub struct Options {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        on_stop(|| {
+            remove_begun();
+            eprintln!("\nstopped: not all files were written");
+            std::process::exit(130);
+        })?;
         let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
         let (pad, disc) = (tribometer.pad.structure.dof(), tribometer.disc.structure.dof());
         eprintln!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());

@@ -55,8 +55,9 @@ pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Res
         let squares = &kept.modes.omega_squared;
         let limit = -ROUNDING * squares.iter().fold(0.0_f64, |largest, square| largest.max(square.abs()));
         if let Some(square) = squares.iter().find(|square| **square < limit) {
-            let (path, name) = (full.path.display(), &part.name);
-            bail!("{path}: `{name}.stiffness` has a mode of {square:.3e} rad^2/s^2; expected at least {limit:.1e}");
+            let field = format!("{}.stiffness", part.name);
+            let file = full.file_of(&field);
+            bail!("{file}: `{field}` has a mode of {square:.3e} rad^2/s^2; expected at least {limit:.1e}");
         }
     }
     let side = |((part, geometry), kept): ((&'a FullPart, &PartGeometry), &'a Kept)| {

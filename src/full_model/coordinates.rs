@@ -8,7 +8,7 @@
 //! Source: Dhondt, "CalculiX CrunchiX user's manual version 2.20", *FREQUENCY, parameter SOLVER=MATRIXSTORAGE; Abaqus
 //! analysis user's guide, "Generating structural matrices".
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::io::BufRead;
 
 use super::entries::{Entries, MOST_ROWS};
@@ -35,6 +35,7 @@ fn scan(
     mut each: impl FnMut(usize, Listed) -> Result<(), RigError>,
 ) -> Result<(), RigError> {
     let mut lines = Lines::new(file, input);
+    let mut form = None;
     while let Some((line, content)) = lines.advance()? {
         if content.is_empty() || content.starts_with('*') {
             continue;
@@ -58,6 +59,11 @@ fn scan(
             Ok(number @ 1..=6) => Ok(number - 1),
             _ => Err(refuse("direction", word, "1 to 6")),
         };
+        // A last line of labels that was cut could pass for one of numbers.
+        let first = *form.get_or_insert(count);
+        if count != first {
+            return Err(refuse("entry", content, &format!("{first} values, as in the first line")));
+        }
         let listed = match count {
             3 => Listed::Numbers(number("row", words[0])? - 1, number("column", words[1])? - 1, value(words[2])?),
             5 => {
@@ -94,17 +100,20 @@ pub fn rows_of(file: &str, input: impl BufRead) -> Result<Vec<Label>, RigError> 
     Ok(held.into_iter().filter(|(_, held)| !held).map(|(label, _)| label).collect())
 }
 
-/// Reads a matrix of `n` rows; `row_of` says which row a label is, `None` where it is held.
+/// Reads a matrix of `n` rows; `row_of` says which row a label is. Labels without a row must be `held`, to which those
+/// that this matrix holds are added: others stand for rows that a file cut short no longer has.
 ///
 /// # Errors
-/// [`RigError::Line`].
+/// [`RigError::Line`]; a label that `rows_file` does not know.
 pub fn read(
     file: &str,
     input: impl BufRead,
-    n: usize,
+    (n, rows_file): (usize, &str),
     row_of: &HashMap<Label, usize>,
+    held: &mut HashSet<Label>,
 ) -> Result<(Entries, Option<i8>), RigError> {
     let mut entries = Entries::default();
+    let mut without_row: HashMap<Label, usize> = HashMap::new();
     let (mut below, mut above) = (false, false);
     scan(file, input, |line, listed| {
         let (row, column, value) = match listed {
@@ -118,8 +127,18 @@ pub fn read(
             }
             Listed::Labels(row, column, value) => match (row_of.get(&row), row_of.get(&column)) {
                 (Some(&row), Some(&column)) => (row, column, value),
-                // What is held does not move.
-                _ => return Ok(()),
+                (row_known, column_known) => {
+                    if row == column && value >= HELD {
+                        held.insert(row);
+                    }
+                    for (label, known) in [(row, row_known), (column, column_known)] {
+                        if known.is_none() {
+                            without_row.entry(label).or_insert(line);
+                        }
+                    }
+                    // What is held does not move.
+                    return Ok(());
+                }
             },
         };
         below |= row > column;
@@ -127,10 +146,17 @@ pub fn read(
         entries.push(row, column, value);
         Ok(())
     })?;
+    // By line: an error should not depend on the order in which labels are kept.
+    let unknown = without_row.into_iter().filter(|(label, _)| !held.contains(label)).min_by_key(|&(_, line)| line);
+    if let Some(((node, direction), line)) = unknown {
+        let value = format!("is at node {node}, direction {}", direction + 1);
+        let limit = format!("a row of {rows_file}, or one that the stiffness holds; are the files whole?");
+        return Err(refuse(file, line, "entry", value, &limit));
+    }
     Ok((entries, if below && above { None } else { Some(1) }))
 }
 
-/// The line of an entry, either way round; 1 where it is not listed.
+/// The line of an entry, either way round; the last one where it is not listed.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -140,18 +166,19 @@ pub fn line_of(
     row_of: &HashMap<Label, usize>,
     (row, column): (usize, usize),
 ) -> Result<usize, RigError> {
-    let mut found = 1;
+    let (mut found, mut last) = (None, 1);
     scan(file, input, |line, listed| {
         let place = match listed {
             Listed::Numbers(row, column, _) => (Some(row), Some(column)),
             Listed::Labels(row, column, _) => (row_of.get(&row).copied(), row_of.get(&column).copied()),
         };
-        if found == 1 && (place == (Some(row), Some(column)) || place == (Some(column), Some(row))) {
-            found = line;
+        if found.is_none() && (place == (Some(row), Some(column)) || place == (Some(column), Some(row))) {
+            found = Some(line);
         }
+        last = line;
         Ok(())
     })?;
-    Ok(found)
+    Ok(found.unwrap_or(last))
 }
 
 /// Reads a `.dof` file of CalculiX: `node.direction` of every row.

@@ -11,7 +11,7 @@ mod part;
 mod raw;
 mod tables;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use crate::physics::ContactLaw;
@@ -46,6 +46,8 @@ pub struct FullModelFile {
     pub common_tables: toml::Table,
     /// `[[contact_patch]]` as it is written; none for a system.
     pub contact_patches: Option<toml::Value>,
+    /// The file of each matrix of a part, by its field: `pad.mass`.
+    matrix_files: Vec<(String, String)>,
     /// Where its TOML file is.
     pub path: PathBuf,
     /// SHA-256 of the TOML file and everything it refers to, hexadecimal.
@@ -121,13 +123,14 @@ impl FullModelFile {
         let mut contents = read.contents;
         contents.push(format!("files      {}", files.names().join(", ")));
         Ok(Self {
-            name: own.name,
+            name: own.name.clone(),
             model: read.model,
             geometry: read.geometry,
             pairs: read.pairs,
             settings,
             common_tables,
             contact_patches,
+            matrix_files: matrix_files(&own),
             path: path.to_owned(),
             content_hash: files.content_hash(),
             contents,
@@ -157,14 +160,14 @@ impl FullModelFile {
     /// `progress` hears which part does what.
     ///
     /// # Errors
-    /// Those of [`keep_modes`].
+    /// [`RigError::Reduction`] with those of [`keep_modes`], naming the file of a matrix that is at fault.
     pub fn keep_modes(
         &self,
         wanted: &[Wanted],
         with_residual: bool,
         memory_limit_bytes: Option<usize>,
         progress: &mut dyn FnMut(usize, Progress),
-    ) -> Result<Vec<Kept>, ReductionError> {
+    ) -> Result<Vec<Kept>, RigError> {
         let rows: Vec<Vec<Option<usize>>> = self.geometry.iter().map(PartGeometry::interface_rows).collect();
         let parts: Vec<Substructure<'_>> = (self.model.parts.iter().zip(&rows).zip(wanted))
             .map(|((part, rows), &wanted)| Substructure {
@@ -175,7 +178,24 @@ impl FullModelFile {
                 wanted,
             })
             .collect();
-        keep_modes(&parts, with_residual, memory_limit_bytes, progress)
+        keep_modes(&parts, with_residual, memory_limit_bytes, progress).map_err(|source| {
+            let file = match &source {
+                ReductionError::Indefinite { what, .. }
+                | ReductionError::NegativeStiffness { what, .. }
+                | ReductionError::Unsymmetric { what, .. } => self.file_of(what),
+                _ => self.path.display().to_string(),
+            };
+            RigError::Reduction { file, source }
+        })
+    }
+
+    /// The full model's file and, in brackets, that of the matrix which `field` names, such as `pad.mass`.
+    pub fn file_of(&self, field: &str) -> String {
+        let path = self.path.display();
+        match self.matrix_files.iter().find(|(known, _)| known == field) {
+            Some((_, file)) => format!("{path} ({file})"),
+            None => path.to_string(),
+        }
     }
 
     /// What the full model is and holds, a few lines for people.
@@ -209,6 +229,18 @@ impl PartGeometry {
     pub fn interface_m(&self) -> Vec<[f64; 3]> {
         self.interface.iter().map(|&node| self.nodes_m[node]).collect()
     }
+}
+
+/// The file of each matrix of pad and disc.
+fn matrix_files(raw: &raw::Own) -> Vec<(String, String)> {
+    let parts = [("pad", &raw.pad), ("disc", &raw.disc)];
+    let named = parts.into_iter().filter_map(|(name, part)| Some((name, part.as_ref()?)));
+    named
+        .flat_map(|(name, part)| {
+            [("stiffness", &part.stiffness), ("mass", &part.mass)]
+                .map(|(key, file)| (format!("{name}.{key}"), file.clone()))
+        })
+        .collect()
 }
 
 /// What each kind of full model gives.
@@ -324,7 +356,8 @@ fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Resul
         for (index, raw) in raw.iter().enumerate() {
             let field = |name: &str| format!("system.{key}[{index}].{name}");
             let (law, _) = system::checked_law(&file, &field("scale"), &raw.scale, &settings.reference)?;
-            let expected = part::Expected { rows: n, told: "system.mass", row_of: &HashMap::new() };
+            let (row_of, held) = (&HashMap::new(), &mut HashSet::new());
+            let expected = part::Expected { rows: n, told: "system.mass", row_of, held };
             let matrix = part::matrix(files, &field("matrix"), &raw.matrix, 1.0, Some(expected))?;
             let symmetry = if crate::reduction::is_symmetric(&matrix) { "symmetric" } else { "unsymmetric" };
             let entries = matrix.compute_nnz();

@@ -1,6 +1,6 @@
 //! `[pad]` and `[disc]`: matrices, nodes and rows of a substructure.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::io::BufRead;
 use std::path::Path;
 
@@ -31,13 +31,14 @@ struct Read<'a> {
 }
 
 /// What is known of a matrix before it is read.
-#[derive(Clone, Copy)]
 pub struct Expected<'a> {
     pub rows: usize,
     /// What says so.
     pub told: &'a str,
     /// The row of every label.
     pub row_of: &'a HashMap<Label, usize>,
+    /// Labels that are held, as far as they are known, and have no row.
+    pub held: &'a mut HashSet<Label>,
 }
 
 /// Reads the part called `name`.
@@ -63,9 +64,10 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
     let row_of_label: HashMap<Label, usize> = labels.iter().enumerate().map(|(row, label)| (*label, row)).collect();
     let internal = extension(rows_file) == "dof";
     let (rows, row_of) = placed(rows_file, &labels, &nodes, &raw.nodes, internal)?;
+    let mut held = HashSet::new();
     let mut matrix = |key: &str, file: &str| -> Result<SparseMatrix, RigError> {
         let field = field(key);
-        let expected = Expected { rows: rows.len(), told: rows_file, row_of: &row_of_label };
+        let expected = Expected { rows: rows.len(), told: rows_file, row_of: &row_of_label, held: &mut held };
         let matrix = self::matrix(files, &field, file, raw.units.of_matrices(), Some(expected))?;
         let read = Read { field, file, matrix, row_of: &row_of_label };
         read.check(files, key == "mass")?;
@@ -153,12 +155,13 @@ pub fn matrix(
 ) -> Result<SparseMatrix, RigError> {
     let toml = files.toml.clone();
     files.read(field, file, |input| {
-        if !is_matrix_market(input)
-            && let Some(expected) = expected
-        {
-            let (entries, mirrored) = coordinates::read(file, input, expected.rows, expected.row_of)?;
-            return Ok(entries.compress(expected.rows, mirrored, factor));
-        }
+        let expected = match expected {
+            Some(Expected { rows, told, row_of, held }) if !is_matrix_market(input) => {
+                let (entries, mirrored) = coordinates::read(file, input, (rows, told), row_of, held)?;
+                return Ok(entries.compress(rows, mirrored, factor));
+            }
+            expected => expected,
+        };
         let mut entries = Entries::default();
         let size = matrix_market::read_entries(file, input, |row, column, value| {
             if row.max(column) < MOST_ROWS {
@@ -205,8 +208,8 @@ impl Read<'_> {
         let view = self.matrix.as_ref();
         for row in 0..self.matrix.nrows() {
             let listed = view.get(row, row).copied();
-            if listed.is_none() && !mass {
-                let told = format!("at row {}, column {} is missing", row + 1, row + 1);
+            if listed.is_none() {
+                let told = format!("at row {}, column {} is missing up to here", row + 1, row + 1);
                 return Err(self.at_line(files, (row, row), told, "every row on the diagonal; is the file whole?"));
             }
             let value = listed.unwrap_or(0.0);
@@ -253,14 +256,15 @@ impl Read<'_> {
     }
 }
 
-/// The line in which an entry of a Matrix Market file stands; 1 where it is not listed at all.
+/// The line in which an entry of a Matrix Market file stands; the last one where it is not listed at all.
 fn line_of(file: &str, input: impl BufRead, (row, column): (usize, usize)) -> Result<usize, RigError> {
     let mut lines = lines::Lines::new(file, input);
-    let mut size_seen = false;
+    let (mut size_seen, mut last) = (false, 1);
     while let Some((line, content)) = lines.advance()? {
         if content.is_empty() || content.starts_with('%') {
             continue;
         }
+        last = line;
         let mut words = content.split_whitespace().map(|word| word.parse::<usize>().ok());
         let place = (words.next().flatten(), words.next().flatten());
         if size_seen && place == (Some(row + 1), Some(column + 1)) {
@@ -268,5 +272,5 @@ fn line_of(file: &str, input: impl BufRead, (row, column): (usize, usize)) -> Re
         }
         size_seen = true;
     }
-    Ok(1)
+    Ok(last)
 }

@@ -49,6 +49,45 @@ impl Model {
         residual: &ResidualFlexibility,
         range: f64,
     ) -> Result<Self, ModelError> {
+        let contact = self.flexible_contact(pairs, residual)?;
+        let at_rest = contact.at(0.0)?;
+        let expansion = contact.expansion(&at_rest, range)?;
+        self.add_at_rest(at_rest)?;
+        for (degree, [stiffness, damping]) in expansion.into_iter().enumerate() {
+            let law = Law::FrictionChebyshev { degree, range };
+            self.add_stiffness("friction stiffness", stiffness, law.clone())?;
+            self.add_damping("friction damping", damping, law)?;
+        }
+        self.with_friction_damping(pairs)
+    }
+
+    /// The same without friction, and nothing fitted: a model for a friction coefficient of 0 alone.
+    ///
+    /// # Errors
+    /// Those of [`Model::with_contact`]; [`ModelError::FlexibleLoadExponent`], [`ModelError::IllConditioned`].
+    pub fn with_flexible_contact_at_rest(
+        mut self,
+        pairs: &ContactPairs,
+        residual: &ResidualFlexibility,
+    ) -> Result<Self, ModelError> {
+        let at_rest = self.flexible_contact(pairs, residual)?.at(0.0)?;
+        self.add_at_rest(at_rest)?;
+        self.has_contact = true;
+        self.drop_zero_terms();
+        Ok(self)
+    }
+
+    fn add_at_rest(&mut self, [stiffness, damping]: [Mat<f64>; 2]) -> Result<(), ModelError> {
+        self.add_stiffness("contact stiffness", stiffness, Law::ContactStiffness)?;
+        self.add_damping("contact damping", damping, Law::ContactDamping)
+    }
+
+    /// The contact, checked, between what the model has so far.
+    fn flexible_contact<'a>(
+        &self,
+        pairs: &'a ContactPairs,
+        residual: &'a ResidualFlexibility,
+    ) -> Result<FlexibleContact<'a>, ModelError> {
         self.check_pairs(pairs)?;
         let exponent = self.contact_law.exponent;
         if exponent != 0.0 {
@@ -63,18 +102,7 @@ impl Model {
                 return Err(ModelError::Shape { what, rows, columns, expected: count });
             }
         }
-        let contact = FlexibleContact { pairs, residual, free: self.constant_terms() };
-        let at_rest = contact.at(0.0)?;
-        let expansion = contact.expansion(&at_rest, range)?;
-        let [stiffness, damping] = at_rest;
-        self.add_stiffness("contact stiffness", stiffness, Law::ContactStiffness)?;
-        self.add_damping("contact damping", damping, Law::ContactDamping)?;
-        for (degree, [stiffness, damping]) in expansion.into_iter().enumerate() {
-            let law = Law::FrictionChebyshev { degree, range };
-            self.add_stiffness("friction stiffness", stiffness, law.clone())?;
-            self.add_damping("friction damping", damping, law)?;
-        }
-        self.with_friction_damping(pairs)
+        Ok(FlexibleContact { pairs, residual, free: self.constant_terms() })
     }
 
     /// `K` and `C` without contact.
@@ -310,9 +338,12 @@ mod tests {
                 assert!(error < 1e-8, "mu {mu}: {error:e}");
             }
         }
-        // At rest exactly symmetric, as the solver looks for it.
+        // At rest exactly symmetric, as the solver looks for it; and the same where nothing was fitted.
         let [k, _] = assembled(&without, 0.0);
         assert_eq!(k, k.transpose().to_owned());
+        let at_rest = free(KEPT).with_flexible_contact_at_rest(&pairs(KEPT), &residual()).unwrap();
+        assert_eq!(assembled(&at_rest, 0.0), assembled(&with_inertia, 0.0));
+        assert_eq!(assembled(&with_inertia.without_contact(), 0.0), assembled(&free(KEPT), 0.0));
     }
 
     #[test]

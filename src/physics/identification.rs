@@ -5,7 +5,11 @@
 //! ```
 //!
 //! over the first `m` natural frequencies at rest, ascending on both sides. The curve over decades of `k` is kept: its
-//! bottom is flat where the frequencies hardly know the stiffness.
+//! bottom is flat where the frequencies hardly know the stiffness. How well they know it is their sensitivity
+//!
+//! ```text
+//! S = sqrt(Σ (d ln f_i / d ln k)² / m):   frequencies wrong by ε leave k open by about ε / S
+//! ```
 //!
 //! Source: the paper's Figs. 12 and 13.
 
@@ -13,6 +17,8 @@
 const DECADES: f64 = 4.0;
 /// Points of the curve to a decade.
 const PER_DECADE: usize = 10;
+/// Change of `ln k` to both sides over which the sensitivity is taken.
+const SENSITIVITY_STEP: f64 = 0.01;
 /// Width of the last bracket of the minimiser, decades: a smooth minimum is found to half of the digits anyway.
 const BRACKET: f64 = 1e-9;
 /// `(3 - sqrt 5) / 2`.
@@ -39,6 +45,8 @@ pub struct Identified {
     pub best: Trial,
     /// Factors between which the error stays below twice its minimum; `None` where the search ended before it rose.
     pub doubled: [Option<f64>; 2],
+    /// `S`: by how much the frequencies move, relatively, for a relative change of the stiffness.
+    pub sensitivity: f64,
     /// Ascending in the factor.
     pub curve: Vec<Trial>,
 }
@@ -127,7 +135,14 @@ pub fn identify<E>(
         crossing((0..=count).rev().filter(|&index| exponent(index) < at).find(above))?,
         crossing((0..=count).filter(|&index| exponent(index) > at).find(above))?,
     ];
-    Ok(Identified { best, doubled, curve })
+    let sensitivity = {
+        let step = SENSITIVITY_STEP / std::f64::consts::LN_10;
+        let (softer, stiffer) = (trial(at - step)?, trial(at + step)?);
+        let moved = stiffer.frequencies_hz.iter().zip(&softer.frequencies_hz);
+        let squares = moved.map(|(stiff, soft)| ((stiff / soft).ln() / (2.0 * SENSITIVITY_STEP)).powi(2));
+        (squares.sum::<f64>() / targets_hz.len() as f64).sqrt()
+    };
+    Ok(Identified { best, doubled, sensitivity, curve })
 }
 
 #[cfg(test)]
@@ -149,6 +164,12 @@ mod tests {
         // The error falls linearly to 0 here: the last bracket decides, and rounding of 1e-16 in the frequencies.
         assert!((found.best.factor / 7.3 - 1.0).abs() < 1e-6, "{}", found.best.factor);
         assert!(found.best.rms_error < 1e-7 && found.curve.len() == 81);
+        // d ln f / d ln k of f² = 2.5 + k ∓ sqrt(1.5² + k²), by hand; differences over 1 % are good to its square.
+        let k = 3.0_f64 * 7.3;
+        let root = (2.25 + k * k).sqrt();
+        let slope = |sign: f64| 0.5 * k * (1.0 + sign * k / root) / (2.5 + k + sign * root);
+        let expected = ((slope(-1.0).powi(2) + slope(1.0).powi(2)) / 2.0).sqrt();
+        assert!((found.sensitivity / expected - 1.0).abs() < 1e-4, "{} {expected}", found.sensitivity);
     }
 
     #[test]

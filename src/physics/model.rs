@@ -396,6 +396,21 @@ impl Model {
         self.pad_mass.as_ref()
     }
 
+    /// The same coordinates without contact: the terms that hold whatever the conditions.
+    pub fn without_contact(&self) -> Self {
+        let constant = |terms: &[KnownTerm]| -> Vec<KnownTerm> {
+            terms.iter().filter(|known| matches!(known.term.law, Law::Constant)).cloned().collect()
+        };
+        Self {
+            stiffness: constant(&self.stiffness),
+            damping: constant(&self.damping),
+            has_contact: false,
+            parts: OnceLock::new(),
+            pad_mass: self.pad_mass.clone(),
+            ..*self
+        }
+    }
+
     /// Whether the model has contact pairs of its own, which open without load.
     pub fn has_contact(&self) -> bool {
         self.has_contact

@@ -6,7 +6,7 @@ use super::modal::Part;
 use super::patch::Pair;
 use super::raw::RawBasis;
 use super::settings::{Settings, within};
-use super::{Built, RigError, SideShapes};
+use super::{Built, Contact, RigError, SideShapes};
 use crate::physics::{ContactPairs, Law, Model, Term};
 
 /// Builds the model of pad and disc that move with the same `k` coordinates:
@@ -99,7 +99,8 @@ pub(super) fn build(
     let shapes = ["pad", "disc"]
         .map(|name| SideShapes { name, first_coordinate: 0, phi: Mat::zeros(0, k), nodes_m: vec![] })
         .into();
-    Ok(Built { model, contents, shapes, band_max_hz: settings.band_max_hz })
+    let contact = Some(Contact { pairs: contact, residual: None });
+    Ok(Built { model, contact, contents, shapes, band_max_hz: settings.band_max_hz })
 }
 
 impl RawBasis {

@@ -4,7 +4,7 @@ use faer::Mat;
 
 use super::raw::{RawContact, RawSubstructure};
 use super::settings::{Settings, finite, spread, within};
-use super::{Built, RigError, SideShapes};
+use super::{Built, Contact, RigError, SideShapes};
 use crate::physics::{ContactPairs, Law, Model, ResidualFlexibility, Term};
 use crate::reduction::{Modes, free_interface_modes};
 
@@ -28,7 +28,7 @@ pub(super) fn build(
     let pad = substructure(file, "pad", pad)?;
     let disc = disc.map(|disc| substructure(file, "disc", disc)).transpose()?;
     let pairs = contact_pairs(file, contacts, &pad.modes, disc.as_ref().map(|disc| &disc.modes))?;
-    assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), &pairs, settings, None)
+    assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), pairs, settings, None)
 }
 
 /// `K = diag(ω²)`, `C = diag(2 ζ ω)` of both sides and the contact between them, through what the modes left out do
@@ -38,9 +38,9 @@ pub(super) fn assemble(
     kind: &str,
     pad: &Side,
     disc: Option<&Side>,
-    pairs: &ContactPairs,
+    pairs: ContactPairs,
     settings: &Settings,
-    residual: Option<&ResidualFlexibility>,
+    residual: Option<ResidualFlexibility>,
 ) -> Result<Built, RigError> {
     let contact_law = settings.contact_law;
     let sides: Vec<&Side> = std::iter::once(pad).chain(disc).collect();
@@ -55,9 +55,9 @@ pub(super) fn assemble(
     let damping = diagonal(&|k| 2.0 * zeta[k] * omega[k]);
     let pad_modes = pad.modes.omega_rad_s.len();
     let model = Model::new(n, vec![stiffness], vec![damping], contact_law, Some(pad_modes))
-        .and_then(|model| match residual {
-            Some(residual) => model.with_flexible_contact(pairs, residual, settings.largest_friction()),
-            None => model.with_contact(pairs),
+        .and_then(|model| match &residual {
+            Some(residual) => model.with_flexible_contact(&pairs, residual, settings.largest_friction()),
+            None => model.with_contact(&pairs),
         })
         .map_err(|source| RigError::Model { file: file.to_owned(), source })?;
 
@@ -93,7 +93,8 @@ pub(super) fn assemble(
         shapes.push(SideShapes { name, first_coordinate, phi: side.modes.phi.clone(), nodes_m: vec![] });
         first_coordinate += side.modes.omega_rad_s.len();
     }
-    Ok(Built { model, contents, shapes, band_max_hz: settings.band_max_hz })
+    let contact = Some(Contact { pairs, residual });
+    Ok(Built { model, contact, contents, shapes, band_max_hz: settings.band_max_hz })
 }
 
 /// Modes of one inline side.

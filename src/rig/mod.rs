@@ -27,7 +27,7 @@ pub mod uff;
 use faer::Mat;
 
 use crate::certificate::Certificate;
-use crate::physics::{Model, OperatingPoint};
+use crate::physics::{ContactPairs, Model, OperatingPoint, ResidualFlexibility};
 
 pub use embedded::{EMBEDDED, Embedded};
 pub use error::RigError;
@@ -45,6 +45,8 @@ pub struct Rig {
     pub name: String,
     /// Its equation of motion, mass-normalised.
     pub model: Model,
+    /// What touches; none for a system of matrices.
+    pub contact: Option<Contact>,
     /// `[reference]`: the operating point used where none is given.
     pub reference: OperatingPoint,
     /// `[band] max_hz`: modes above are neither listed nor judged. At most the cut-off of a rig with residual flexibility.
@@ -73,6 +75,15 @@ pub struct Rig {
     pub basis_tolerance: Option<f64>,
     /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
     pub shapes: Vec<SideShapes>,
+}
+
+/// The contact that a model of substructures was built with.
+#[derive(Clone, Debug)]
+pub struct Contact {
+    /// The pairs, in the coordinates of the model.
+    pub pairs: ContactPairs,
+    /// What truncated modes do between them, where it is used.
+    pub residual: Option<ResidualFlexibility>,
 }
 
 /// How a stretch of the model's coordinates moves one side of the rig.
@@ -190,6 +201,7 @@ impl Rig {
         Ok(Self {
             name: raw.name,
             model: built.model,
+            contact: built.contact,
             reference: settings.reference,
             band_max_hz: built.band_max_hz,
             mu_max: settings.mu_max,
@@ -226,6 +238,23 @@ impl Rig {
         let mut files = self.files.clone();
         files[0].bytes = text.into_bytes();
         Self::from_files(&files)
+    }
+
+    /// Its model at a friction coefficient of 0, and no other, with the stiffness of every contact pair multiplied by
+    /// `factor`: nothing is read or fitted again.
+    ///
+    /// # Errors
+    /// [`RigError::Model`]: `factor` takes the contact out of range.
+    pub fn at_rest_with_contact_stiffness_times(&self, factor: f64) -> Result<Model, RigError> {
+        let Some(Contact { pairs, residual }) = &self.contact else { return Ok(self.model.clone()) };
+        let mut pairs = pairs.clone();
+        pairs.stiffness_n_per_m.iter_mut().for_each(|stiffness| *stiffness *= factor);
+        let free = self.model.without_contact();
+        match residual {
+            Some(residual) => free.with_flexible_contact_at_rest(&pairs, residual),
+            None => free.with_contact(&pairs),
+        }
+        .map_err(|source| RigError::Model { file: self.name.clone(), source })
     }
 
     /// The text of the rig file with every contact stiffness replaced by what `change` makes of it.
@@ -274,6 +303,7 @@ fn change_numbers(value: &mut toml::Value, change: &mut dyn FnMut(f64) -> f64) {
 /// What each kind of rig builds.
 struct Built {
     model: Model,
+    contact: Option<Contact>,
     contents: Vec<String>,
     shapes: Vec<SideShapes>,
     /// `[band] max_hz`, lower where the model ends below.

@@ -104,7 +104,7 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
     });
     contents.extend(stiffness.iter().map(|term| format!("stiffness  {}", term.told)));
     contents.extend(damping.iter().map(|term| format!("damping    {}", term.told)));
-    Ok(Built { model, contents, shapes: vec![], band_max_hz: settings.band_max_hz })
+    Ok(Built { model, contact: None, contents, shapes: vec![], band_max_hz: settings.band_max_hz })
 }
 
 /// Reads `[[system.stiffness]]` or `[[system.damping]]`.

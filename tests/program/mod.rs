@@ -111,6 +111,12 @@ pub fn python() -> PathBuf {
     }
 }
 
+/// Writes the tribometer's full model, of at least `dof` degrees of freedom, into `folder` and says where its TOML file is.
+pub fn tribometer(folder: &Path, dof: usize) -> PathBuf {
+    run(["tribometer", "--dof", &dof.to_string(), "-o", &text(folder)]).exits(0).complains("degrees of freedom");
+    folder.join("tribometer.toml")
+}
+
 /// A path as an argument.
 pub fn text(path: &Path) -> String {
     path.to_str().expect("a path of a test is UTF-8").to_owned()
