@@ -48,13 +48,17 @@ fn no_mode_of_40_changes_its_name() {
     eprintln!("{}", said.unwrap_or_else(|said| panic!("{said}")));
 }
 
-/// 80 modes of the pad and 80 of the disc, 100 000 friction coefficients from 0 to 1: ten minutes.
+/// The tribometer on its basis and in 80 + 80 modes, 100 000 friction coefficients from 0 to 1: many minutes.
+#[cfg(feature = "node")]
 #[test]
-fn every_window_of_an_80_80_rig_is_found_and_no_mode_changes_its_name() {
+fn every_window_of_the_tribometer_is_found_and_no_mode_changes_its_name() {
     if std::env::var_os("SQUEALCAST_MEASURE").is_none() {
-        return eprintln!("skipped: takes ten minutes, with SQUEALCAST_MEASURE=1");
+        return eprintln!("skipped: takes many minutes, with SQUEALCAST_MEASURE=1");
     }
-    scan_and_follow("synthetic, 80 + 80", &synthetic(160, 294, 1), &AT, 1.0, 500);
+    for name in ["tribometer", "tribometer-80+80"] {
+        let rig = squealcast::rig::Rig::load(name).expect("it is embedded");
+        scan_and_follow(name, &rig.model, &rig.reference, 1.0, 500);
+    }
 }
 
 /// `Σ zᵢ^m = tr(A^m)` for `m` up to the dimension determines every eigenvalue (Newton's identities), and powers of a matrix need no

@@ -8,6 +8,9 @@ use super::spectrum::Spectrum;
 /// Overlap of shapes from which two roots count as the same mode without a closer look.
 pub const CLEAR_OVERLAP: f64 = 0.8;
 
+/// Overlap above which pairs are tried before all others.
+const LARGE_OVERLAP: f64 = 0.5;
+
 /// `|z1 - z2|` relative to `|z1| + |z2|` below which two roots are one multiple root, whose shapes are arbitrary within
 /// their span.
 const MULTIPLE: f64 = 1e-10;
@@ -35,32 +38,35 @@ pub fn continue_roots(from: &Spectrum, to: &Spectrum) -> Continuation {
     let overlap = from.shapes.get(.., ..count_from).adjoint() * to.shapes.get(.., ..count_to);
     let predicted = extrapolated(from, to.point.friction_coefficient);
 
-    let mut scores: Vec<(f64, usize, usize)> = Vec::with_capacity(count_from * count_to);
-    for j in 0..count_to {
+    let score = |i: usize, j: usize| {
         let z = to.roots[j].square;
-        for (i, &candidate) in predicted.iter().enumerate() {
-            // A sensitivity grows without bound near a merging point: there the plain value predicts better.
-            let off = relative_distance(candidate, z).min(relative_distance(from.roots[i].square, z));
-            scores.push((overlap[(i, j)].norm_sqr() - off, i, j));
-        }
-    }
-    scores.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-
+        // A sensitivity grows without bound near a merging point: there the plain value predicts better.
+        let off = relative_distance(predicted[i], z).min(relative_distance(from.roots[i].square, z));
+        (overlap[(i, j)].norm_sqr() - off, i, j)
+    };
     let mut source = vec![None; to.roots.len()];
     let mut taken = vec![false; count_from];
     let mut clear = count_from == count_to;
     let mut left = count_from.min(count_to);
-    for (_, i, j) in scores {
+    // Scores are at most the overlap: nearly always the pairs of a large one settle it, and few have one.
+    for large in [true, false] {
+        let pairs = (0..count_to).flat_map(|j| (0..count_from).map(move |i| (i, j)));
+        let considered = pairs.filter(|&(i, j)| !large || overlap[(i, j)].norm_sqr() > LARGE_OVERLAP);
+        let mut scores: Vec<(f64, usize, usize)> = considered.map(|(i, j)| score(i, j)).collect();
+        scores.retain(|&(score, ..)| (score > LARGE_OVERLAP) == large);
+        scores.sort_unstable_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+        for (_, i, j) in scores {
+            if taken[i] || source[j].is_some() {
+                continue;
+            }
+            source[j] = Some(i);
+            taken[i] = true;
+            left -= 1;
+            clear &= overlap[(i, j)].norm_sqr() > CLEAR_OVERLAP || span_overlap(from, i, to, j) > CLEAR_OVERLAP;
+        }
         if left == 0 {
             break;
         }
-        if taken[i] || source[j].is_some() {
-            continue;
-        }
-        source[j] = Some(i);
-        taken[i] = true;
-        left -= 1;
-        clear &= overlap[(i, j)].norm_sqr() > CLEAR_OVERLAP || span_overlap(from, i, to, j) > CLEAR_OVERLAP;
     }
     Continuation { source, clear }
 }

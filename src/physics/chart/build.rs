@@ -6,6 +6,9 @@
 //! next. So most conditions are charted early and the hard corners last, and a build that was interrupted goes on from
 //! its last such unit of work to the same chart.
 
+use std::panic::resume_unwind;
+use std::sync::{Mutex, PoisonError};
+
 use super::chebyshev::{Basis, Fit};
 use super::hold_out::within_bounds;
 use super::leaf::Branches;
@@ -52,6 +55,8 @@ pub enum ChartError {
 const HELD_OUT: usize = 3;
 /// Boxes split off a unit of work that are smaller than it by this factor wait.
 const UNIT: f64 = 0.04;
+/// Boxes that are tried side by side, whatever the number of threads: what is tried next depends on it.
+const SIDE_BY_SIDE: usize = 4;
 
 /// How far a build has come.
 pub struct Progress<'a> {
@@ -147,11 +152,32 @@ fn domain(model: &Model, options: &ChartOptions) -> Result<(Vec<Axis>, Corner, C
 /// A box to be charted.
 struct Work {
     slot: usize,
-    low: [f64; MAX_AXES],
-    high: [f64; MAX_AXES],
+    low: Corner,
+    high: Corner,
     /// Share of the conditions that it holds.
     share: f64,
     samples: Vec<Sample>,
+}
+
+impl Work {
+    /// The lower and the upper half along an axis, each with what was solved there, pending in `chart`; and where they meet.
+    fn halves(self, axis: usize, chart: &mut Chart) -> (f64, [Self; 2]) {
+        let Self { low, high, samples, .. } = self;
+        let at = 0.5 * (low[axis] + high[axis]);
+        let slot = chart.branches.len();
+        chart.branches.extend([Branch::Pending, Branch::Pending]);
+        let (mut middle_high, mut middle_low) = (high, low);
+        (middle_high[axis], middle_low[axis]) = (at, at);
+        let (below, above) = samples.into_iter().partition(|sample| sample.at[axis] < at);
+        let half = |slot, low: Corner, high: Corner, samples| Self {
+            slot,
+            low,
+            high,
+            share: chart.share(&low, &high),
+            samples,
+        };
+        (at, [half(slot, low, middle_high, below), half(slot + 1, middle_low, high, above)])
+    }
 }
 
 enum Outcome {
@@ -183,43 +209,61 @@ impl Builder<'_> {
     fn unit(&mut self, unit: Work, go_on: &mut dyn FnMut(&Progress<'_>) -> bool) -> Result<(), ChartError> {
         let smallest = (UNIT * unit.share).max(self.options.smallest_share);
         let mut stack = vec![unit];
-        while let Some(mut work) = stack.pop() {
-            let unit_finished = stack.is_empty() && work.samples.is_empty();
-            let progress = Progress { chart: &self.chart, share: self.chart.settled_share(), unit_finished };
-            if !go_on(&progress) {
+        let mut unit_finished = true;
+        while !stack.is_empty() {
+            if !go_on(&Progress { chart: &self.chart, share: self.chart.settled_share(), unit_finished }) {
                 return Err(ChartError::Stopped);
             }
-            let outcome = self.leaf(&work.low, &work.high, &mut work.samples);
-            self.chart.branches[work.slot] = match outcome {
-                Outcome::Converged(leaf) => {
-                    self.chart.leaves.push(leaf);
-                    Branch::Leaf(self.chart.leaves.len() - 1)
-                }
-                Outcome::Split(axis) => {
-                    let Work { low, high, samples, .. } = work;
-                    let at = 0.5 * (low[axis] + high[axis]);
-                    let slot = self.chart.branches.len();
-                    self.chart.branches.extend([Branch::Pending, Branch::Pending]);
-                    let (mut middle_high, mut middle_low) = (high, low);
-                    (middle_high[axis], middle_low[axis]) = (at, at);
-                    let (left, right) = samples.into_iter().partition(|sample| sample.at[axis] < at);
-                    for (slot, low, high, samples) in
-                        [(slot + 1, middle_low, high, right), (slot, low, middle_high, left)]
-                    {
-                        let share = self.chart.share(&low, &high);
-                        if share >= smallest {
-                            stack.push(Work { slot, low, high, share, samples });
-                        }
+            unit_finished = false;
+            let mut boxes = stack.split_off(stack.len().saturating_sub(SIDE_BY_SIDE));
+            let outcomes = self.side_by_side(&mut boxes);
+            for (work, (outcome, solves)) in boxes.into_iter().zip(outcomes) {
+                self.chart.solves += solves;
+                let slot = work.slot;
+                self.chart.branches[slot] = match outcome {
+                    Outcome::Converged(leaf) => {
+                        self.chart.leaves.push(leaf);
+                        Branch::Leaf(self.chart.leaves.len() - 1)
                     }
-                    Branch::Split { axis, at, below: slot, above: slot + 1 }
-                }
-            };
+                    Outcome::Split(axis) => {
+                        let (at, halves) = work.halves(axis, &mut self.chart);
+                        let [below, above] = [0, 1].map(|k| halves[k].slot);
+                        stack.extend(halves.into_iter().rev().filter(|half| half.share >= smallest));
+                        Branch::Split { axis, at, below, above }
+                    }
+                };
+            }
         }
         Ok(())
     }
 
-    /// Tries to chart a box; `samples` gains what was solved.
-    fn leaf(&mut self, low: &[f64; MAX_AXES], high: &[f64; MAX_AXES], samples: &mut Vec<Sample>) -> Outcome {
+    /// Tries to chart some boxes, the solvers spread over them; with each outcome the number of solves it took.
+    fn side_by_side(&mut self, boxes: &mut [Work]) -> Vec<(Outcome, usize)> {
+        let mut solvers = std::mem::take(&mut self.solvers);
+        let each = solvers.len().div_ceil(boxes.len());
+        let (this, queue) = (&*self, &Mutex::new(boxes.iter_mut().enumerate()));
+        let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+        let work = |solvers: &mut [Solver]| -> Vec<_> {
+            std::iter::from_fn(next)
+                .map(|(k, work)| {
+                    let mut solves = 0;
+                    (k, this.leaf(work, solvers, &mut solves), solves)
+                })
+                .collect()
+        };
+        let mut outcomes: Vec<(usize, Outcome, usize)> = std::thread::scope(|scope| {
+            let workers: Vec<_> = solvers.chunks_mut(each).map(|solvers| scope.spawn(move || work(solvers))).collect();
+            let joined = workers.into_iter().map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic)));
+            joined.flatten().collect()
+        });
+        self.solvers = solvers;
+        outcomes.sort_by_key(|(k, ..)| *k);
+        outcomes.into_iter().map(|(_, outcome, solves)| (outcome, solves)).collect()
+    }
+
+    /// Tries to chart a box; its samples gain what was solved, and `solves` how much that was.
+    fn leaf(&self, work: &mut Work, solvers: &mut [Solver], solves: &mut usize) -> Outcome {
+        let Work { low, high, samples, .. } = work;
         let axes = self.chart.axes.len();
         let share = |k: usize| (high[k] - low[k]) / (self.chart.high[k] - self.chart.low[k]);
         let longest = (0..axes).max_by(|&a, &b| share(a).total_cmp(&share(b))).unwrap_or(0);
@@ -232,9 +276,9 @@ impl Builder<'_> {
         let fresh = spread(axes, &taken, wanted.saturating_sub(taken.len()) + HELD_OUT);
         let fresh: Vec<[f64; MAX_AXES]> =
             fresh.iter().map(|unit| std::array::from_fn(|k| low[k] + half[k] * (unit[k] + 1.0))).collect();
-        self.chart.solves += fresh.len();
+        *solves += fresh.len();
         // Where a solve fails there is nothing to chart; what is around it may converge.
-        let Ok(solved) = self.sampler.solve_all(&mut self.solvers, &fresh) else { return Outcome::Split(longest) };
+        let Ok(solved) = self.sampler.solve_all(solvers, &fresh) else { return Outcome::Split(longest) };
         samples.extend(solved);
         let undamped = self.chart.undamped;
         if samples.iter().any(|s| s.spectrum.undamped != undamped) || may_diverge(samples.iter().map(|s| &s.spectrum)) {
@@ -263,7 +307,9 @@ impl Builder<'_> {
             Err(axis) => return Outcome::Split(axis),
         };
         // Identities last: they take solves of their own.
-        let Some(ids) = self.identify(&fitted[start].spectrum) else { return Outcome::Split(longest) };
+        let Some(ids) = self.identify(&mut solvers[0], &fitted[start].spectrum, solves) else {
+            return Outcome::Split(longest);
+        };
         branches.ids = ids;
         let leaf = match self.assemble(&branches, settled, low, high) {
             Ok(leaf) => leaf,
@@ -273,7 +319,7 @@ impl Builder<'_> {
     }
 
     /// Identities of the tracked roots of a spectrum, as [`StabilityMap`] gives them at its load and speed.
-    fn identify(&mut self, spectrum: &Spectrum) -> Option<Vec<u32>> {
+    fn identify(&self, solver: &mut Solver, spectrum: &Spectrum, solves: &mut usize) -> Option<Vec<u32>> {
         let mu = spectrum.point.friction_coefficient;
         let options = MapOptions {
             mu_min: mu.min(0.0),
@@ -282,8 +328,8 @@ impl Builder<'_> {
             instability_threshold: 1e-6,
             windows: false,
         };
-        let map = StabilityMap::build(self.sampler.model, &mut self.solvers[0], &spectrum.point, &options).ok()?;
-        self.chart.solves += map.nodes.len();
+        let map = StabilityMap::build(self.sampler.model, solver, &spectrum.point, &options).ok()?;
+        *solves += map.nodes.len();
         map.identify(spectrum).into_iter().take(tracked(spectrum)).collect()
     }
 
