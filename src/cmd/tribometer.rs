@@ -31,8 +31,8 @@ impl Options {
         })?;
         let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
         let (pad, disc) = (tribometer.pad.structure.dof(), tribometer.disc.structure.dof());
-        eprintln!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());
-        write_full_model(&tribometer, &self.output, |file| eprintln!("{}", self.output.join(file).display()))?;
+        note!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());
+        write_full_model(&tribometer, &self.output, |file| note!("{}", self.output.join(file).display()))?;
         Ok(Outcome::Done)
     }
 }
