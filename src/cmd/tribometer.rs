@@ -26,7 +26,7 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         on_stop(|| {
             remove_begun();
-            eprintln!("\nstopped: not all files were written");
+            note!("\nstopped: not all files were written");
             std::process::exit(130);
         })?;
         let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;

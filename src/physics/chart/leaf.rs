@@ -11,7 +11,7 @@ use super::samples::Sample;
 use super::{Channels, Cluster, Leaf, MAX_AXES};
 
 /// Bounds are this many times what was estimated or seen.
-const SAFETY: f64 = 4.0;
+const SAFETY: f64 = 6.0;
 /// Error of a charted share of the pad; where it is not reached the share is NaN.
 pub const SHARE_TOLERANCE: f64 = 1e-4;
 /// Distance of two roots, relative to their size, below which they count as merging.
