@@ -11,7 +11,7 @@ use super::samples::Sample;
 use super::{Channels, Cluster, Leaf, MAX_AXES};
 
 /// Bounds are this many times what was estimated or seen.
-const SAFETY: f64 = 6.0;
+const SAFETY: f64 = 4.0;
 /// Error of a charted share of the pad; where it is not reached the share is NaN.
 pub const SHARE_TOLERANCE: f64 = 1e-4;
 /// Distance of two roots, relative to their size, below which they count as merging.
@@ -168,7 +168,8 @@ impl Builder<'_> {
             }
         }
         expansion.channels = fitted.into_iter().map(|fitted| fitted.coefficients).collect();
-        // What is not needed is cut off, for all functions of the cluster alike.
+        // What is not needed is cut off, for all functions of the cluster alike. The sum of the sizes of what is cut bounds it, and is
+        // reached where one coefficient outweighs the others: errors of 1.00 of a bound are seen, and at most 0.1 of what is allowed.
         let basis = &self.chart.basis;
         let beyond = |column: usize, degree: usize| basis.beyond(&expansion.channels[column], degree);
         let enough =
