@@ -12,7 +12,7 @@ use crate::reduction::{
 use crate::rig::Rig;
 
 /// Band where neither rig nor full model names one, Hz.
-const DEFAULT_BAND_HZ: f64 = 5000.0;
+pub const DEFAULT_BAND_HZ: f64 = 5000.0;
 /// Roots that decay faster are not compared, 1/s.
 const DECAY_PER_S: f64 = 20.0;
 
@@ -85,7 +85,6 @@ pub struct Against {
     pub seed: u64,
     /// Highest frequency, Hz, in place of the rig's or the full model's.
     pub band_hz: Option<f64>,
-    pub memory_limit_bytes: Option<usize>,
     /// Whether windows of instability are compared too.
     pub windows: bool,
 }
@@ -132,13 +131,14 @@ pub struct Verified {
 }
 
 /// Compares a rig with its full model at held-out operating points of the rig's range, and their windows of instability
-/// at the reference and at the corners of that range. `progress` hears what is done.
+/// at the reference and at the corners of that range. `full_solver` solves the full model; `progress` hears what is done.
 ///
 /// # Errors
 /// A full model that cannot be solved, or a rig.
 pub fn verify_against(
     rig: &Rig,
     full: &FullModelFile,
+    full_solver: &mut FullSolver<'_>,
     against: &Against,
     progress: &mut dyn FnMut(&str, FullProgress),
 ) -> anyhow::Result<Verified> {
@@ -147,9 +147,6 @@ pub fn verify_against(
     let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
     let band_rad_s = std::f64::consts::TAU * band_hz;
     let judged = Judged { band_rad_s, instability_threshold: rig.instability_threshold, decay_per_s: DECAY_PER_S };
-    let mut full_solver =
-        FullSolver::new(&full.name, &full.model, against.memory_limit_bytes, &mut |p| progress("analysis", p))
-            .with_context(|| full.path.display().to_string())?;
     let mut solver = Solver::new(rig.model.dimension());
     let mut points = vec![];
     for (index, p) in held_out(rig, against).into_iter().enumerate() {
@@ -185,7 +182,7 @@ pub fn verify_against(
     for p in places(rig).into_iter().filter(|_| against.windows) {
         let told = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
         let of_full =
-            full_windows(&full.model, &mut full_solver, &p, band_rad_s, &options, &mut |step| progress(&told, step))?;
+            full_windows(&full.model, full_solver, &p, band_rad_s, &options, &mut |step| progress(&told, step))?;
         let of_rig = StabilityMap::build(&rig.model, &mut solver, &p, &options)?.windows;
         let compared = compare_windows(&of_full, &of_rig);
         if !compared.pairs.is_empty() {

@@ -775,7 +775,7 @@ fn help_states_units() {
         ("identify", &["--targets <FREQ.csv>", "`frequency_hz`", "--load <N> Normal load in N"]),
         ("full", &["--load <N> Normal load in N", "--speed <RAD_S> Disc speed in rad/s", "--band-hz <HZ>"]),
         ("verify", &["--against <FULL>", "Highest frequency in Hz"]),
-        ("reduce", &["--modes <I+J>", "--cutoff-hz <HZ>", "--range <mu=A:B,speed=A:B,load=A:B>"]),
+        ("reduce", &["--modes <I+J>", "--cutoff-hz [<HZ>]", "--range <mu=A:B,speed=A:B,load=A:B>"]),
         ("tribometer", &["--dof <N> Degrees of freedom"]),
         ("reproduce", &["--dof <N> Degrees of freedom of the tribometer", "--output <DIR>"]),
         ("completions", &["bash", "fish", "zsh"]),

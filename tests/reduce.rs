@@ -222,8 +222,13 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     let to = text(&folder.path().join("rig.toml"));
     run(["reduce", &path, "--modes", "40+40", "--memory-gib", "0.01", "-o", &to])
         .exits(1)
-        .complains("it needs 0.")
+        .complains("reading it took 0.")
         .complains("more than the 0.01 GiB allowed");
+    // Enough to read it by, and no more: either way refuses before it factors anything.
+    for way in [&["--modes", "40+40"][..], &[]] {
+        let run = run(["reduce", &path, "--memory-gib", "0.05", "-o", &to].into_iter().chain(way.iter().copied()));
+        run.exits(1).complains("it needs 0.").complains("beside what is held already, more than the 0.0");
+    }
     run(["reduce", &path, "--modes", "40", "-o", &to])
         .exits(1)
         .complains("--modes has 1 counts, expected one for each of 2");
@@ -235,7 +240,13 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     let nowhere = text(&folder.path().join("none/rig.toml"));
     run(["reduce", &path, "--modes", "5+5", "--points", "0", "-o", &nowhere]).exits(1).complains("cannot write");
     run(["reduce", &path, "--modes", "5+5", "-o", &path]).exits(1).complains("is the full model itself");
-    run(["reduce", &path, "--no-residual", "--range", "mu=0:1", "-o", &to]).exits(2).complains("--range");
+    for way in [&["--no-residual"][..], &["--compact"]] {
+        let run = run(["reduce", &path, "-o", &to].into_iter().chain(way.iter().copied()));
+        run.exits(2).complains("--modes <I+J>|--cutoff-hz [<HZ>]");
+    }
+    run(["reduce", &path, "--cutoff-hz", "--range", "mu=0:1", "-o", &to]).exits(2).complains("--range");
+    run(["reduce", &bandless, "--cutoff-hz", "-o", &to]).exits(1).complains("or a value of --cutoff-hz");
+    run(["reduce", &path, "--range", "mu=0.4", "-o", &to]).exits(1).complains("a single operating point");
     let whole = std::fs::read_to_string(&path).unwrap();
     let hertzian = whole.clone() + "\n[load]\nexponent = 0.3333\nreference_n = 500.0\n";
     let hertzian = write(folder.path(), "hertzian.toml", &hertzian);

@@ -1,19 +1,16 @@
 use std::path::PathBuf;
-use std::time::Instant;
 
 use anyhow::Context;
 use clap::Args;
 use serde::Serialize;
 
+use super::memory::{room, solver};
+use super::steps::Steps;
 use super::{Outcome, finite, positive, print};
+use crate::certificate::DEFAULT_BAND_HZ;
 use crate::full_model::FullModelFile;
 use crate::physics::OperatingPoint;
-use crate::reduction::{FullProgress, FullSolver, FullSpectrum, FullVectors};
-
-/// Bytes in a GiB.
-pub const GIB: f64 = (1_u64 << 30) as f64;
-/// Band where the full model names none, Hz.
-const DEFAULT_BAND_HZ: f64 = 5000.0;
+use crate::reduction::{FullSpectrum, FullVectors};
 
 /// Find the complex eigenvalues of a full model under one set of conditions
 ///
@@ -34,7 +31,7 @@ pub struct Options {
     /// Highest frequency in Hz [default: the model's band, else 5000]
     #[arg(long, value_name = "HZ", value_parser = positive)]
     band_hz: Option<f64>,
-    /// Refuse to start where more memory than this is needed
+    /// Memory that may be used [default: what the machine has to spare]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Print JSON
@@ -76,10 +73,10 @@ struct RootReport {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let started = Instant::now();
+        let mut steps = Steps::new(1);
         let full = FullModelFile::load(&self.full)?;
         full.refuse_modal_damping()?;
-        eprintln!("{} degrees of freedom read ({:.1} s)", full.model.dimension(), started.elapsed().as_secs_f64());
+        steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
         let reference = full.settings.reference;
         let p = OperatingPoint {
             normal_load_n: self.load.unwrap_or(reference.normal_load_n),
@@ -87,37 +84,19 @@ impl Options {
             friction_coefficient: self.mu.unwrap_or(reference.friction_coefficient),
         };
         let band_hz = self.band_hz.or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
-        let mut said = |step: FullProgress| {
-            eprintln!("{} ({:.1} s)", told(step), started.elapsed().as_secs_f64());
-        };
-        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize);
-        let mut solver = FullSolver::new(&full.name, &full.model, limit, &mut said)
-            .with_context(|| self.full.display().to_string())?;
+        let room = room(self.memory_gib, &self.full)?;
+        let mut said = |step| steps.full("full model", step);
+        let mut solver = solver(&full, room, &mut said)?;
         let found = solver
             .roots(&p, std::f64::consts::TAU * band_hz, FullVectors::None, &mut said)
             .with_context(|| self.full.display().to_string())?;
+        drop(steps);
         if self.json {
             print(&(serde_json::to_string(&report(&full, &p, band_hz, &found))? + "\n"))?;
         } else {
             print(&table(&full, &p, band_hz, &found))?;
         }
         Ok(Outcome::Done)
-    }
-}
-
-/// What a full solve is doing, in words.
-pub fn told(step: FullProgress) -> String {
-    let hz = |omega: f64| omega / std::f64::consts::TAU;
-    match step {
-        FullProgress::Analysed { bytes } => format!("ordered and analysed: needs {:.2} GiB", bytes as f64 / GIB),
-        FullProgress::Factored { shift_rad_s } => format!("factored at {:.1} Hz", hz(shift_rad_s)),
-        FullProgress::Iterated { shift_rad_s, vectors, converged } => {
-            format!("around {:.1} Hz: {vectors} vectors, {converged} roots", hz(shift_rad_s))
-        }
-        FullProgress::Covered { disc, roots } => {
-            let [from, to] = disc.stretch_rad_s();
-            format!("covered {:.1} to {:.1} Hz with {roots} roots", hz(from), hz(to))
-        }
     }
 }
 

@@ -1,5 +1,10 @@
 //! The commands, one file each; exit codes and output in one place.
 
+/// A line on standard error; that nobody is there to read it is no error.
+macro_rules! note {
+    ($($text:tt)*) => { drop(std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("{}\n", format_args!($($text)*)))) };
+}
+
 mod bench;
 mod buses;
 mod check;
@@ -12,6 +17,7 @@ mod full;
 mod identify;
 mod import;
 mod live;
+mod memory;
 mod on_basis;
 mod predict;
 mod recover;
@@ -84,7 +90,7 @@ pub fn main() -> ExitCode {
     let (ros_args, args) = match RosArgs::split(std::env::args()) {
         Ok(split) => split,
         Err(error) => {
-            eprintln!("error: {error}");
+            note!("error: {error}");
             return ExitCode::from(2);
         }
     };
@@ -115,7 +121,7 @@ pub fn main() -> ExitCode {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::Differences) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("error: {}", told(&error));
+            note!("error: {}", told(&error));
             ExitCode::FAILURE
         }
     }

@@ -4,9 +4,10 @@ use std::f64::consts::TAU;
 
 use anyhow::bail;
 
+use super::steps::Steps;
 use crate::full_model::FullModelFile;
 use crate::reduction::{
-    Counted, FullSolver, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
+    Counted, FullSolver, GIB, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
 };
 
 /// Largest `|Δλ|/|λ|` where nothing else is asked for.
@@ -58,7 +59,7 @@ pub fn ranges(text: &str) -> Result<Ranges, String> {
     Ok(ranges)
 }
 
-/// What is asked of a basis of `full`, and the basis; `say` hears what is being done.
+/// What is asked of a basis of `full`, which `solver` solves, and the basis.
 ///
 /// # Errors
 /// A full model that is no case for it, a tolerance that cannot be held.
@@ -66,8 +67,8 @@ pub fn basis_of(
     full: &FullModelFile,
     tolerance: f64,
     ranges: Ranges,
-    memory_limit_bytes: Option<usize>,
-    say: &mut dyn FnMut(&str),
+    solver: &mut FullSolver<'_>,
+    steps: &mut Steps,
 ) -> anyhow::Result<(ParametricRequest, ParametricBasis)> {
     let path = full.path.display();
     let Some(band_hz) = full.settings.band_max_hz else {
@@ -95,25 +96,31 @@ pub fn basis_of(
     };
     asked.check()?;
     let (load, speed) = full.model.depends_on_load_and_speed();
-    let matters = 1 + usize::from(load) + usize::from(speed);
+    let range = asked.without(!load, !speed);
+    // A single value is no range: nothing to train on, and nothing to hold out.
+    let matters = range.widths();
+    if matters == 0 {
+        bail!(
+            "{path}: the range is a single operating point; expected two values of mu, load or speed where they matter"
+        );
+    }
     let request = ParametricRequest {
-        range: asked.without(!load, !speed),
+        range,
         counted: Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: GROWTH_FLOOR_PER_S },
         tolerance,
         training: TRAINING * matters,
         held_out: HELD_OUT * matters,
         most_samples: MOST_SAMPLES,
         most_vectors: MOST_VECTORS,
-        split: false,
     };
-    say("ordering and analysing");
-    let mut solver = FullSolver::new(&full.name, &full.model, memory_limit_bytes, &mut |_| {})?;
-    let basis = parametric_basis(&full.model, &mut solver, &request, &mut |step| say(&told(step)))?;
+    let basis = parametric_basis(&full.model, solver, &request, &mut |step| tell(steps, step))?;
+    let vectors = &basis.projected.basis;
+    solver.held_elsewhere(size_of::<f64>() * vectors.nrows() * vectors.ncols());
     // What does not matter holds over all of the range that was asked for.
     Ok((ParametricRequest { range: asked, ..request }, basis))
 }
 
-fn told(step: ParametricStep) -> String {
+fn tell(steps: &mut Steps, step: ParametricStep) {
     let at = |point: crate::physics::OperatingPoint| {
         format!(
             "{:.4} N, {:.4} rad/s, friction coefficient {:.4}",
@@ -121,15 +128,25 @@ fn told(step: ParametricStep) -> String {
         )
     };
     match step {
+        ParametricStep::Planned { bytes } => {
+            steps.say(&format!("{:.2} GiB needed beside the matrices, for two operating points", bytes as f64 / GIB));
+        }
         ParametricStep::Sampling { point, sample } => {
-            format!("sample {sample}: solving the full model at {}", at(point))
+            steps.say(&format!("sample {sample}: solving the full model at {}", at(point)));
         }
-        ParametricStep::Sampled { roots, vectors, .. } => format!("{roots} roots there, {vectors} vectors in all"),
+        ParametricStep::Solving(step) => steps.full("full model", step),
+        ParametricStep::Sampled { roots, vectors, .. } => {
+            steps.say(&format!("{roots} roots there, {vectors} vectors in all"));
+        }
+        ParametricStep::Estimating { done, of } => steps.at(0, "estimating errors at operating points", done, of),
         ParametricStep::Estimated { worst, vectors } => {
-            format!("worst estimate of |dlambda|/|lambda| with {vectors} vectors: {worst:.1e}")
+            steps.done(0);
+            steps.say(&format!("worst estimate of |dlambda|/|lambda| with {vectors} vectors: {worst:.1e}"));
         }
-        ParametricStep::Cut { vectors, worst } => format!("cut to {vectors} vectors: {worst:.1e}"),
-        ParametricStep::HeldOut { point, worst } => format!("held out {}: {worst:.1e}", at(point)),
+        ParametricStep::Cut { vectors, worst } => steps.say(&format!("cut to {vectors} vectors: {worst:.1e}")),
+        ParametricStep::HeldOut { point, worst, done, of } => {
+            steps.say(&format!("held out, {done} of {of}, {}: {worst:.1e}", at(point)));
+        }
     }
 }
 

@@ -5,20 +5,20 @@ use std::sync::{Arc, Mutex};
 use anyhow::{Context, bail};
 use clap::Args;
 
+use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
-use super::steps::{GIB, Steps};
+use super::steps::Steps;
 use super::{Outcome, positive, print};
-use crate::certificate::{Against, Certificate, verify_against};
+use crate::certificate::{Against, Certificate, Verified, verify_against};
 use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
 use crate::full_model::FullModelFile;
-use crate::io::memory::available_bytes;
 use crate::io::whole_file::{remove_begun, write_whole};
 use crate::physics::ResidualFlexibility;
-use crate::reduction::{Kept, Progress, Residual, Wanted};
+use crate::reduction::{FullSolver, GIB, Kept, Progress, Residual, Wanted};
 use crate::rig::{Rig, RigFile, SideResidual, between_patches};
 
-/// The cut-off of the modes kept, relative to the band, where nothing else is asked for.
+/// The cut-off of the modes kept, relative to the band, where `--cutoff-hz` has no value.
 const CUTOFF: f64 = 2.5;
 
 /// Reduce a full model to a rig file the node can run
@@ -33,23 +33,23 @@ pub struct Options {
     /// Full model
     full: PathBuf,
     /// Largest relative error of a root on the basis, over the range [default: 1e-6]
-    #[arg(long, value_name = "ERROR", value_parser = positive, conflicts_with_all = ["modes", "cutoff_hz"])]
+    #[arg(long, value_name = "ERROR", value_parser = positive, conflicts_with = "of_modes")]
     tolerance: Option<f64>,
     /// Conditions the basis holds for [default: those of [search] and [chart]]
     #[arg(long, value_name = "mu=A:B,speed=A:B,load=A:B", value_parser = ranges,
-          conflicts_with_all = ["modes", "cutoff_hz"])]
+          conflicts_with = "of_modes")]
     range: Option<Ranges>,
     /// Modes of pad and disc to keep
-    #[arg(long, value_name = "I+J", value_parser = mode_counts, conflicts_with = "cutoff_hz")]
+    #[arg(long, value_name = "I+J", value_parser = mode_counts, group = "of_modes")]
     modes: Option<ModeCounts>,
-    /// Keep the modes of pad and disc below this frequency; 2.5 times the band is a good choice
-    #[arg(long, value_name = "HZ", value_parser = positive)]
-    cutoff_hz: Option<f64>,
+    /// Keep the modes of pad and disc below this frequency [without a value: 2.5 times the band]
+    #[arg(long, value_name = "HZ", value_parser = positive, num_args = 0..=1, group = "of_modes")]
+    cutoff_hz: Option<Option<f64>>,
     /// Leave out what the modes left out do at the contact
-    #[arg(long, conflicts_with_all = ["tolerance", "range"])]
+    #[arg(long, requires = "of_modes")]
     no_residual: bool,
     /// Keep what the modes left out do between this model's contact pairs alone: a twelfth of the size, for these patches only
-    #[arg(long, conflicts_with_all = ["no_residual", "tolerance", "range"])]
+    #[arg(long, conflicts_with = "no_residual", requires = "of_modes")]
     compact: bool,
     /// Held-out operating points at which the rig is compared with the full model; 0 leaves the comparison out
     #[arg(long, value_name = "N", default_value_t = 3)]
@@ -86,7 +86,7 @@ impl Options {
         on_stop(move || {
             remove_begun();
             to_remove.remove();
-            eprintln!("\nstopped: nothing was written");
+            note!("\nstopped: nothing was written");
             std::process::exit(130);
         })?;
         let file = self.output_file()?;
@@ -94,8 +94,8 @@ impl Options {
         steps.say(&format!("reading {}", self.full.display()));
         let full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
-        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
-        if self.modes.is_none() && self.cutoff_hz.is_none() && !self.no_residual && !self.compact {
+        let room = room(self.memory_gib, &self.full)?;
+        if self.modes.is_none() && self.cutoff_hz.is_none() {
             if full.geometry.len() == 1 {
                 bail!(
                     "{}: a pad on a rigid disc has no basis of its own; expected --modes or --cutoff-hz",
@@ -103,10 +103,12 @@ impl Options {
                 );
             }
             let (tolerance, range) = (self.tolerance.unwrap_or(TOLERANCE), self.range.unwrap_or_default());
-            let (request, basis) = basis_of(&full, tolerance, range, limit, &mut |text| steps.say(text))?;
+            steps.say("ordering and analysing");
+            let mut solver = solver(&full, room, &mut |step| steps.full("full model", step))?;
+            let (request, basis) = basis_of(&full, tolerance, range, &mut solver, &mut steps)?;
             let method = format!("{} vectors of the full model", basis.projected.omega_squared.len());
             let make = |known: Option<&Certificate>| basis_rig(&file, &full, &request, &basis, known);
-            return self.finish(steps, &unfinished, &full, limit, method, &make);
+            return self.finish(steps, &unfinished, &full, Some(solver), method, &make);
         }
         if full.geometry.is_empty() {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
@@ -121,7 +123,7 @@ impl Options {
         }
         let wanted = self.wanted(&full)?;
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
-        let kept = full.keep_modes(&wanted, !self.no_residual, limit, &mut |part, what| {
+        let kept = full.keep_modes(&wanted, !self.no_residual, room, &mut |part, what| {
             tell(&mut steps, part, names[part], what)
         })?;
         let mut sides = modal_sides(&full, &kept)?;
@@ -132,7 +134,7 @@ impl Options {
             let patches = full.contact_patches.as_ref();
             modal_rig(&file, &remarks, &full.common_tables, patches, known, &sides, residual.as_ref())
         };
-        self.finish(steps, &unfinished, &full, limit, kept.join("; "), &make)
+        self.finish(steps, &unfinished, &full, None, kept.join("; "), &make)
     }
 
     /// The name of the rig file, which can be written and is not what is read.
@@ -156,7 +158,7 @@ impl Options {
         mut steps: Steps,
         unfinished: &Unfinished,
         full: &FullModelFile,
-        limit: Option<usize>,
+        solver: Option<FullSolver<'_>>,
         method: String,
         files_of: &dyn Fn(Option<&Certificate>) -> anyhow::Result<Vec<RigFile>>,
     ) -> anyhow::Result<Outcome> {
@@ -171,11 +173,18 @@ impl Options {
             if full.geometry.iter().any(|geometry| geometry.damping_ratio.is_some_and(|ratio| ratio != 0.0)) {
                 steps.say("not compared: a damping ratio of modes has no meaning for the full model");
             } else {
-                let against =
-                    Against { points: self.points, seed: 1, band_hz: None, memory_limit_bytes: limit, windows: true };
-                let found = verify_against(&rig, full, &against, &mut |what, step| {
-                    steps.say(&format!("compared with the full model, {what}: {}", super::full::told(step)));
-                });
+                let against = Against { points: self.points, seed: 1, band_hz: None, windows: true };
+                let mut tell = |what: &str, step| steps.full(&format!("compared with the full model, {what}"), step);
+                let compare = || -> anyhow::Result<Verified> {
+                    let mut solver = match solver {
+                        Some(solver) => solver,
+                        None => {
+                            self::solver(full, room(self.memory_gib, &self.full)?, &mut |step| tell("analysis", step))?
+                        }
+                    };
+                    verify_against(&rig, full, &mut solver, &against, &mut tell)
+                };
+                let found = compare();
                 match found {
                     Ok(found) => {
                         if !found.certificate.is_complete() {
@@ -210,10 +219,9 @@ impl Options {
             }
             return Ok(counts.iter().map(|&count| Wanted::Lowest(count)).collect());
         }
-        let band = full.settings.band_max_hz.map(|band_hz| CUTOFF * band_hz);
-        let Some(cutoff_hz) = self.cutoff_hz.or(band) else {
-            let field = "band.max_hz";
-            bail!("{}: `{field}` is missing; expected it, --cutoff-hz or --modes", self.full.display());
+        let of_band = full.settings.band_max_hz.map(|band_hz| CUTOFF * band_hz);
+        let Some(cutoff_hz) = self.cutoff_hz.flatten().or(of_band) else {
+            bail!("{}: `band.max_hz` is missing; expected it, or a value of --cutoff-hz", self.full.display());
         };
         Ok(vec![Wanted::Below(TAU * cutoff_hz); parts])
     }
@@ -263,7 +271,7 @@ pub fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
     match what {
         Progress::Analysing => steps.say(&format!("{name}: ordering and analysing")),
         Progress::Analysed { factor_entries, bytes } => steps.say(&format!(
-            "{name}: {:.1} million numbers in the factor, {:.2} GiB needed in all for this part",
+            "{name}: {:.1} million numbers in the factor, {:.2} GiB needed for this part beside the matrices",
             factor_entries as f64 / 1e6,
             bytes as f64 / GIB
         )),

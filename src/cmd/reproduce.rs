@@ -3,16 +3,16 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
+use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of};
 use super::reduce::tell;
-use super::steps::{GIB, Steps};
+use super::steps::Steps;
 use super::{Outcome, positive, write_file};
 use crate::export::write_full_model;
 use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::full_model::FullModelFile;
-use crate::io::memory::available_bytes;
 use crate::reduction::Wanted;
-use crate::reproduce::{Item, MODES, Study, index, nine_dof};
+use crate::reproduce::{Heard, Item, MODES, PartModes, Study, index, nine_dof};
 
 /// Make the paper's tables and figures again: CSV, SVG and one page beside the paper's numbers
 ///
@@ -48,19 +48,29 @@ impl Options {
     /// Section 4 of the paper.
     fn tribometer(&self) -> anyhow::Result<Vec<Item>> {
         let mut steps = Steps::new(2);
-        let limit = self.memory_gib.map(|gib| (gib * GIB) as usize).or_else(available_bytes);
         let folder = self.output.join("tribometer");
         write_full_model(&Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?, &folder, |_| ())?;
         steps.say(&format!("{} written", folder.display()));
         let full = FullModelFile::load(&folder.join("tribometer.toml"))?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
+        let toml = folder.join("tribometer.toml");
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
         let most = Wanted::Lowest(MODES.into_iter().max().unwrap_or(0));
-        let kept = full.keep_modes(&vec![most; names.len()], true, limit, &mut |part, what| {
-            tell(&mut steps, part, names[part], what);
-        })?;
-        let (_, basis) = basis_of(&full, TOLERANCE, Ranges::default(), limit, &mut |text| steps.say(text))?;
-        Study { full: &full, kept: &kept, basis: &basis, memory_limit_bytes: limit }.items(&mut |text| steps.say(text))
+        let kept =
+            full.keep_modes(&vec![most; names.len()], true, room(self.memory_gib, &toml)?, &mut |part, what| {
+                tell(&mut steps, part, names[part], what);
+            })?;
+        // Vectors of the whole parts are not needed any more.
+        let modes = PartModes::new(&full, &kept)?;
+        drop(kept);
+        steps.say("ordering and analysing");
+        let mut solver = solver(&full, room(self.memory_gib, &toml)?, &mut |step| steps.full("full model", step))?;
+        let (_, basis) = basis_of(&full, TOLERANCE, Ranges::default(), &mut solver, &mut steps)?;
+        let mut hear = |heard: Heard<'_>| match heard {
+            Heard::Said(text) => steps.say(text),
+            Heard::Solving(what, step) => steps.full(what, step),
+        };
+        Study { full: &full, modes: &modes, basis: &basis }.items(&mut solver, &mut hear)
     }
 
     fn write(&self, item: &Item) -> anyhow::Result<()> {
@@ -74,7 +84,7 @@ impl Options {
     fn file(&self, name: &str, content: &str) -> anyhow::Result<()> {
         let path = self.output.join(name);
         write_file(&path, content.as_bytes())?;
-        eprintln!("{}", path.display());
+        note!("{}", path.display());
         Ok(())
     }
 }

@@ -4,13 +4,12 @@ use std::io::{IsTerminal, Write};
 
 use crate::io::clock::monotonic_ns;
 use crate::io::memory::resident_bytes;
+use crate::reduction::{FullProgress, GIB};
 
 /// Characters of a bar.
 const WIDTH: usize = 24;
 /// Plain lines are written at every such part of a step.
 const PLAIN_PARTS: usize = 4;
-/// Bytes in a GiB.
-pub const GIB: f64 = (1_u64 << 30) as f64;
 
 /// How far a step has come.
 #[derive(Clone, Debug, PartialEq)]
@@ -56,8 +55,29 @@ impl Steps {
         self.bars[task] = None;
     }
 
+    /// What a solve of a full model is doing, `what` it is for, as the first task.
+    pub fn full(&mut self, what: &str, step: FullProgress) {
+        let hz = |omega: f64| omega / std::f64::consts::TAU;
+        match step {
+            FullProgress::Analysed { bytes } => {
+                self.say(&format!("{what}: ordered and analysed, needs {:.2} GiB at least", bytes as f64 / GIB));
+            }
+            FullProgress::Factored { shift_rad_s } => {
+                self.say(&format!("{what}: factored at {:.1} Hz", hz(shift_rad_s)));
+            }
+            FullProgress::Iterated { shift_rad_s, converged, wanted, .. } => {
+                self.at(0, &format!("{what}: roots around {:.1} Hz", hz(shift_rad_s)), converged.min(wanted), wanted);
+            }
+            FullProgress::Covered { disc, roots } => {
+                let [from, to] = disc.stretch_rad_s();
+                self.done(0);
+                self.say(&format!("{what}: {roots} roots cover {:.1} to {:.1} Hz", hz(from), hz(to)));
+            }
+        }
+    }
+
     /// Seconds since the beginning.
-    pub fn seconds(&self) -> f64 {
+    fn seconds(&self) -> f64 {
         monotonic_ns().saturating_sub(self.started_ns) as f64 / 1e9
     }
 

@@ -26,13 +26,13 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         on_stop(|| {
             remove_begun();
-            eprintln!("\nstopped: not all files were written");
+            note!("\nstopped: not all files were written");
             std::process::exit(130);
         })?;
         let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
         let (pad, disc) = (tribometer.pad.structure.dof(), tribometer.disc.structure.dof());
-        eprintln!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());
-        write_full_model(&tribometer, &self.output, |file| eprintln!("{}", self.output.join(file).display()))?;
+        note!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());
+        write_full_model(&tribometer, &self.output, |file| note!("{}", self.output.join(file).display()))?;
         Ok(Outcome::Done)
     }
 }

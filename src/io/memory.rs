@@ -5,6 +5,11 @@ pub fn resident_bytes() -> Option<usize> {
     kilobytes("/proc/self/status", "VmRSS:")
 }
 
+/// The most bytes this process has had in memory; `None` where the system does not say.
+pub fn peak_bytes() -> Option<usize> {
+    kilobytes("/proc/self/status", "VmHWM:")
+}
+
 /// Bytes the machine can still give without swapping; `None` where the system does not say.
 pub fn available_bytes() -> Option<usize> {
     kilobytes("/proc/meminfo", "MemAvailable:")

@@ -10,6 +10,7 @@ use faer::{Mat, c64};
 use super::ReductionError;
 use super::full_model::FullModel;
 use super::full_order::{FullProgress, FullSolver, FullSpectrum, FullVectors};
+use super::matching::pair_off;
 use crate::physics::{
     MapError, MapOptions, Model, ModelError, OperatingPoint, SolveError, Solver, StabilityMap, Vectors, Window,
 };
@@ -97,14 +98,7 @@ pub fn compare_roots(full: &[c64], reduced: &[c64], judged: &Judged) -> Comparis
             }
         }
     }
-    distances.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let (mut of_full, mut of_reduced) = (vec![None; full.len()], vec![None; reduced.len()]);
-    for (_, i, j) in distances {
-        if of_full[i].is_none() && of_reduced[j].is_none() {
-            of_full[i] = Some(j);
-            of_reduced[j] = Some(i);
-        }
-    }
+    let of_full = pair_off(distances, full.len());
     let mut comparison = Comparison::default();
     for (i, &lambda) in full.iter().enumerate().filter(|(_, lambda)| lambda.im <= judged.band_rad_s) {
         let partner = of_full[i].map(|j| reduced[j]);
@@ -121,7 +115,7 @@ pub fn compare_roots(full: &[c64], reduced: &[c64], judged: &Judged) -> Comparis
     }
     for (j, &lambda) in reduced.iter().enumerate() {
         // One just above the band may belong to a full root that was not looked for.
-        let partner = of_reduced[j].map(|i| full[i]);
+        let partner = of_full.iter().position(|partner| *partner == Some(j)).map(|i| full[i]);
         if unstable(lambda) && !partner.is_some_and(unstable) && (partner.is_some() || lambda.im <= judged.band_rad_s) {
             comparison.invented.push(lambda);
         }
@@ -178,14 +172,7 @@ pub fn compare_windows(full: &[Window], reduced: &[Window]) -> WindowComparison 
             }
         }
     }
-    distances.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let (mut of_full, mut of_reduced) = (vec![None; full.len()], vec![false; reduced.len()]);
-    for (_, i, j) in distances {
-        if of_full[i].is_none() && !of_reduced[j] {
-            of_full[i] = Some(j);
-            of_reduced[j] = true;
-        }
-    }
+    let of_full = pair_off(distances, full.len());
     let mut comparison = WindowComparison::default();
     for (window, partner) in full.iter().zip(&of_full) {
         match partner {
@@ -193,8 +180,8 @@ pub fn compare_windows(full: &[Window], reduced: &[Window]) -> WindowComparison 
             None => comparison.missed.push(window.clone()),
         }
     }
-    let left = reduced.iter().zip(of_reduced).filter(|(_, paired)| !paired);
-    comparison.invented = left.map(|(window, _)| window.clone()).collect();
+    let alone = |(j, _): &(usize, &Window)| !of_full.contains(&Some(*j));
+    comparison.invented = reduced.iter().enumerate().filter(alone).map(|(_, window)| window.clone()).collect();
     comparison
 }
 
@@ -215,10 +202,14 @@ pub fn full_windows(
     let mut sampled: Vec<f64> = vec![];
     let mut next: Vec<f64> = [0.0, 0.5, 1.0].iter().map(|share| share * options.mu_max).collect();
     let mut ends: Vec<f64> = vec![];
-    let mut moved = f64::INFINITY;
+    let (mut moved, mut roots) = (f64::INFINITY, 0);
     for _ in 0..MOST_ROUNDS {
         for mu in std::mem::take(&mut next) {
+            // Vectors found join the columns, which grow into another place; then there are these, products and a new basis.
+            let columns = size_of::<f64>() * model.dimension() * (basis.columns.ncols() + 4 * roots);
+            solver.make_room(FullVectors::Both, roots, 2 * columns, 3 * columns)?;
             let found = solver.roots(&p.with_friction(mu), 1.1 * band_rad_s, FullVectors::Both, progress)?;
+            roots = roots.max(found.roots.len());
             basis.add(&found);
             sampled.push(mu);
         }

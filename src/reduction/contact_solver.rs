@@ -42,12 +42,29 @@ impl<'a> Parts<'a> {
         Ok(Self { pencils, offsets, touched })
     }
 
-    /// Bytes that factors at one shift hold, and those that everything else does.
-    pub(super) fn bytes(&self) -> (usize, usize) {
-        let dense = |rows: &Vec<usize>| 3 * size_of::<f64>() * rows.len() * rows.len();
-        let factors = self.pencils.iter().map(Pencil::factor_bytes).sum::<usize>();
-        let held = self.pencils.iter().map(Pencil::held_bytes).sum();
-        (factors + self.touched.iter().map(dense).sum::<usize>(), held)
+    /// Bytes that are needed.
+    pub(super) fn bytes(&self) -> PartBytes {
+        let float = size_of::<f64>();
+        let dense = |rows: &Vec<usize>| float * rows.len() * rows.len();
+        let pencils = self.pencils.iter();
+        // Beside a factor, its pivots; `L` and `A⁻¹` of what the contact touches, and as much again to find them.
+        let (factors, pivots) = pencils.clone().fold((0, 0), |(bytes, pivots), pencil| {
+            (bytes + pencil.factor_bytes(), pivots + float * pencil.dimension())
+        });
+        PartBytes {
+            held: pencils.clone().map(Pencil::held_bytes).sum(),
+            factors: factors + pivots + 2 * self.touched.iter().map(dense).sum::<usize>(),
+            factoring: pencils
+                .map(Pencil::factoring_bytes)
+                .chain(self.touched.iter().map(|rows| 3 * dense(rows)))
+                .max()
+                .unwrap_or(0),
+        }
+    }
+
+    /// How many `ω²` of the parts, apart from each other, lie below `square`.
+    pub(super) fn count_below(&self, square: f64) -> Result<usize, ReductionError> {
+        self.pencils.iter().map(|pencil| pencil.count_below(square)).sum()
     }
 
     /// The factors of `K - ω² M`.
@@ -58,6 +75,17 @@ impl<'a> Parts<'a> {
         }
         Ok(Shifted { square, parts })
     }
+}
+
+/// Bytes that parts need.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct PartBytes {
+    /// Of the analysis.
+    pub held: usize,
+    /// Of the factors at one shift.
+    pub factors: usize,
+    /// While a factor is made, beside it.
+    pub factoring: usize,
 }
 
 /// One part, factored.
@@ -109,6 +137,11 @@ pub(super) struct Coupled<'a, T: Number> {
 }
 
 impl Shifted {
+    /// Whether the parts are positive definite there.
+    pub(super) fn is_definite(&self) -> bool {
+        self.parts.iter().flat_map(|part| &part.pivots).all(|pivot| *pivot > 0.0)
+    }
+
     /// Joins the parts by the pairs of `low_rank`; `weights` are `k + s c`. `transposed` gives `Q(s)ᵀ`.
     pub(super) fn couple<T: Number>(&self, low_rank: &LowRank, weights: Vec<T>, transposed: bool) -> Coupled<'_, T>
     where

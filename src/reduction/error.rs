@@ -3,7 +3,7 @@
 use crate::physics::SolveError;
 
 /// Bytes in a GiB.
-const GIB: f64 = (1_u64 << 30) as f64;
+pub const GIB: f64 = (1_u64 << 30) as f64;
 
 /// What went wrong, where, with which value against which limit. Rows, columns and modes are counted from 0.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -44,7 +44,7 @@ pub enum ReductionError {
     #[error("{what}: shifts covered the band up to {covered:.6e} rad/s only, expected {band:.6e} rad/s")]
     NotCovered { what: String, covered: f64, band: f64 },
     #[error(
-        "{what}: it needs {:.2} GiB of memory, more than the {:.2} GiB allowed",
+        "{what}: it needs {:.2} GiB of memory beside what is held already, more than the {:.2} GiB allowed",
         *bytes as f64 / GIB, *limit as f64 / GIB
     )]
     Memory { what: String, bytes: usize, limit: usize },

@@ -12,7 +12,7 @@ use faer::sparse::Triplet;
 use faer::{Mat, MatRef};
 
 use super::dense::symmetric_eigen;
-use super::sparse::{SparseMatrix, entries, is_symmetric, times};
+use super::sparse::{SparseMatrix, entries, is_symmetric, times, times_transposed};
 use super::{ReductionError, project_dense, project_sparse, whiten};
 use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Term};
 
@@ -125,6 +125,13 @@ impl FullModel {
             speed |= law.lateral_damping;
         }
         (load, speed)
+    }
+
+    /// Whether `C` vanishes at every operating point.
+    pub(super) fn is_undamped(&self) -> bool {
+        let rubs = self.contact_law.slope_s_per_m != 0.0 || self.contact_law.lateral_damping;
+        let dampers = |contact: &FullContact| contact.damping_n_s_per_m.iter().any(|damping| *damping != 0.0);
+        self.damping.is_empty() && !self.contact.as_ref().is_some_and(|contact| rubs || dampers(contact))
     }
 
     /// What `law` is at `p`; a model without contact pairs never opens.
@@ -276,14 +283,60 @@ impl FullModel {
         Ok(Projected { basis, omega_squared, contact, stiffness, damping })
     }
 
-    /// `M x` over all parts.
-    pub fn mass_times(&self, x: MatRef<'_, f64>) -> Mat<f64> {
+    /// `M X`.
+    pub(super) fn mass_times(&self, x: MatRef<'_, f64>) -> Mat<f64> {
+        self.parts_times(|part| &part.mass, x)
+    }
+
+    /// `C(p) X`, or `C(p)ᵀ X`; nothing is assembled.
+    pub(super) fn damping_times(&self, p: &OperatingPoint, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
+        let mut product = Mat::zeros(x.nrows(), x.ncols());
+        let [_, contact] = self.contact_terms(p);
+        self.add_terms(&self.damping, &contact, p, x, transposed, &mut product);
+        product
+    }
+
+    /// `K(p) X`, or `K(p)ᵀ X`; nothing is assembled.
+    pub(super) fn stiffness_times(&self, p: &OperatingPoint, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
+        let mut product = self.parts_times(|part| &part.stiffness, x);
+        let [contact, _] = self.contact_terms(p);
+        self.add_terms(&self.stiffness, &contact, p, x, transposed, &mut product);
+        product
+    }
+
+    /// `diag(A_part) X`, every `A_part` symmetric.
+    fn parts_times(&self, of: fn(&FullPart) -> &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
         let mut product = Mat::zeros(x.nrows(), x.ncols());
         for (part, offset) in self.parts.iter().zip(self.offsets()) {
             let n = part.mass.nrows();
-            product.subrows_mut(offset, n).copy_from(times(&part.mass, x.subrows(offset, n)));
+            product.subrows_mut(offset, n).copy_from(times(of(part), x.subrows(offset, n)));
         }
         product
+    }
+
+    /// Adds what terms and contact do to `X`, or what their transposes do.
+    fn add_terms(
+        &self,
+        terms: &[SparseTerm],
+        contact: &[ContactTerm<'_>],
+        p: &OperatingPoint,
+        x: MatRef<'_, f64>,
+        transposed: bool,
+        product: &mut Mat<f64>,
+    ) {
+        for term in terms {
+            let of_term = if transposed { times_transposed(&term.matrix, x) } else { times(&term.matrix, x) };
+            *product += faer::Scale(self.value(&term.law, p)) * of_term;
+        }
+        for term in contact {
+            for ((left, weight), right) in term.left.iter().zip(&term.weights).zip(term.right) {
+                let (from, to) = if transposed { (left, right) } else { (right, left) };
+                for j in 0..x.ncols() {
+                    let along: f64 = from.iter().map(|&(i, value)| value * x[(i, j)]).sum();
+                    to.iter().for_each(|&(i, value)| product[(i, j)] += weight * along * value);
+                }
+            }
+        }
     }
 }
 

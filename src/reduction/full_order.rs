@@ -23,12 +23,12 @@
 use faer::{Mat, c64};
 
 use super::ReductionError;
-use super::contact_solver::{Parts, Shifted};
+use super::contact_solver::{PartBytes, Parts, Shifted};
 pub use super::coverage::CoveredDisc;
 use super::coverage::{Found, agree, assemble, first_gap};
 use super::full_model::FullModel;
 use super::full_problem::{Problem, unit};
-use super::krylov_schur::capacity;
+use super::krylov_schur::{BLOCK, capacity, most_found};
 use crate::physics::{self, OperatingPoint, Vectors};
 
 /// Roots that are sought around each shift.
@@ -41,6 +41,11 @@ const GROWTH: f64 = 0.02;
 const MOST_SHIFTS: usize = 200;
 /// Shifts whose factors are kept for other operating points.
 const MOST_KEPT: usize = 4;
+/// Copies of a block that a step of the iteration holds: of the basis, its products with matrices in two layouts, both ways
+/// of complex numbers, before and after the factors, in either order.
+const WORKING: usize = 12;
+/// Vectors of `n` complex numbers that residuals are found with.
+const CHECKING: usize = 64;
 /// Below this many degrees of freedom a dense solve is faster.
 const DENSE_BELOW: usize = 240;
 
@@ -48,9 +53,7 @@ const DENSE_BELOW: usize = 240;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FullVectors {
     None,
-    /// `x`: `(λ² M + λ C + K) x = 0`.
-    Right,
-    /// `y` too: `yᴴ (λ² M + λ C + K) = 0`.
+    /// `x` and `y`: `(λ² M + λ C + K) x = 0`, `yᴴ (λ² M + λ C + K) = 0`.
     Both,
 }
 
@@ -82,12 +85,12 @@ pub struct FullSpectrum {
 /// What a full solve is doing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FullProgress {
-    /// Ordered and analysed: the bytes that will be needed in all.
+    /// Ordered and analysed: the bytes that will be needed at least, beside what was held before.
     Analysed { bytes: usize },
     /// Factored at this shift, rad/s.
     Factored { shift_rad_s: f64 },
-    /// Vectors built so far around the shift, and roots converged.
-    Iterated { shift_rad_s: f64, vectors: usize, converged: usize },
+    /// Vectors built so far around the shift, and roots converged of those wanted.
+    Iterated { shift_rad_s: f64, vectors: usize, converged: usize, wanted: usize },
     /// A disc with so many roots.
     Covered { disc: CoveredDisc, roots: usize },
 }
@@ -101,10 +104,15 @@ pub struct FullSolver<'a> {
     parts: Option<Parts<'a>>,
     kept: Vec<Shifted>,
     memory_limit_bytes: Option<usize>,
+    /// Bytes that are held for something else for good.
+    elsewhere_bytes: usize,
+    /// Factors that there is room for.
+    most_kept: usize,
 }
 
 impl<'a> FullSolver<'a> {
-    /// `what` is how errors name the model; `memory_limit_bytes` is compared with an estimate before the work starts.
+    /// `what` is how errors name the model; `memory_limit_bytes` is what may be taken beside what is held, compared with the
+    /// need before the work starts.
     ///
     /// # Errors
     /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `Memory`, `Factorisation`.
@@ -114,27 +122,132 @@ impl<'a> FullSolver<'a> {
         memory_limit_bytes: Option<usize>,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Self, ReductionError> {
-        let n = model.dimension();
         let by_parts = model.stiffness.is_empty() && model.damping.is_empty() && model.contact.is_some();
         let parts = if by_parts { Some(Parts::new(model)?) } else { None };
-        // A complex basis of twice the size, the vectors of the roots, and what they are made from.
-        let vectors = size_of::<c64>() * 2 * n * (capacity(2 * n, WANTED) + 3 * WANTED);
-        let factors = match &parts {
-            Some(parts) => {
-                let (factors, held) = parts.bytes();
-                factors + held
-            }
+        let what = what.to_owned();
+        let mut solver =
+            Self { what, model, parts, kept: vec![], memory_limit_bytes, elsewhere_bytes: 0, most_kept: 1 };
+        progress(FullProgress::Analysed { bytes: solver.bytes(FullVectors::None, 0) });
+        solver.make_room(FullVectors::None, 0, 0, 0)?;
+        Ok(solver)
+    }
+
+    /// Counts so many bytes, taken since the solver was made, as held from now on.
+    pub fn held_elsewhere(&mut self, bytes: usize) {
+        self.elsewhere_bytes = bytes;
+    }
+
+    /// Bytes that solves need beside what was held before: one factor, `roots` of them in the band.
+    pub fn bytes(&self, vectors: FullVectors, roots: usize) -> usize {
+        let PartBytes { held, factors, factoring } = self.factor_bytes();
+        held + factors + factoring.max(self.vector_bytes(vectors, roots))
+    }
+
+    fn factor_bytes(&self) -> PartBytes {
+        let n = self.model.dimension();
+        match &self.parts {
+            Some(parts) => parts.bytes(),
             // Columns of a sparse LU fill up unforeseeably: as many entries as a tenth of all places, at most.
-            None => size_of::<c64>() * (n * n / 10).min(400 * n),
-        };
-        let bytes = factors + vectors;
-        progress(FullProgress::Analysed { bytes });
-        if let Some(limit) = memory_limit_bytes
-            && bytes > limit
-        {
-            return Err(ReductionError::Memory { what: what.to_owned(), bytes, limit });
+            None => PartBytes { held: 0, factors: size_of::<c64>() * (n * n / 10).min(400 * n), factoring: 0 },
         }
-        Ok(Self { what: what.to_owned(), model, parts, kept: vec![], memory_limit_bytes })
+    }
+
+    /// Bytes of the vectors that a solve holds at most: a basis for the roots wanted and those found, one way round, then, with
+    /// the roots found, a basis for as many the other way round, then residuals; and roots of all discs, every one of which
+    /// brings half as many as are wanted at least.
+    fn vector_bytes(&self, vectors: FullVectors, roots: usize) -> usize {
+        let (n, complex) = (self.model.dimension(), size_of::<c64>());
+        // Real of `n`, or complex of `2n`.
+        let undamped = self.parts.is_some() && self.model.is_undamped();
+        let (rows, each) = if undamped { (n, size_of::<f64>() * n) } else { (2 * n, complex * 2 * n) };
+        let both = vectors == FullVectors::Both;
+        let right = most_found(WANTED);
+        let left = if both { most_found(right) } else { 0 };
+        let forward = each * capacity(rows, WANTED) + complex * rows * right;
+        let backward = if both { each * capacity(rows, right) + complex * (n * right + rows * left) } else { 0 };
+        let checked = complex * n * (2 * right + left + CHECKING);
+        let discs = 1 + 2 * roots / WANTED;
+        let found = if both { complex * n * (2 * right * (discs - 1) + 2 * roots) } else { 0 };
+        (WORKING * BLOCK * each + forward.max(backward)).max(checked) + found
+    }
+
+    /// Makes room for solves of `roots` in the band while `beside` bytes are held for something else, and for `other` bytes at
+    /// other times, with one factor; as many factors are kept as there is room for. The bytes that are needed.
+    ///
+    /// # Errors
+    /// [`ReductionError::Memory`].
+    pub(super) fn make_room(
+        &mut self,
+        vectors: FullVectors,
+        roots: usize,
+        beside: usize,
+        other: usize,
+    ) -> Result<usize, ReductionError> {
+        let PartBytes { held, factors, factoring } = self.factor_bytes();
+        let held = held + self.elsewhere_bytes;
+        let work = (factoring.max(self.vector_bytes(vectors, roots)) + beside).max(other);
+        let bytes = held + factors + work;
+        self.most_kept = MOST_KEPT;
+        if let Some(limit) = self.memory_limit_bytes {
+            if bytes > limit {
+                return Err(ReductionError::Memory { what: self.what.clone(), bytes, limit });
+            }
+            self.most_kept = MOST_KEPT.min((limit - held - work) / factors.max(1));
+        }
+        while self.kept.len() > self.most_kept {
+            self.kept.remove(0);
+        }
+        Ok(bytes)
+    }
+
+    /// How many roots the parts have up to `band_rad_s` with their contact open; it closed, there are no more without friction.
+    /// As many as are sought around a shift where the model has no such parts.
+    ///
+    /// # Errors
+    /// [`ReductionError::Factorisation`].
+    pub(super) fn count_below(&self, band_rad_s: f64) -> Result<usize, ReductionError> {
+        self.parts.as_ref().map_or(Ok(WANTED), |parts| parts.count_below(band_rad_s * band_rad_s))
+    }
+
+    /// Factors `K + sigma M` of the parts, if the model has them; the factors are kept with those at shifts.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Factorisation`, also where that is not positive definite.
+    pub(super) fn factor_at(&mut self, sigma: f64) -> Result<(), ReductionError> {
+        let Some(parts) = &self.parts else { return Ok(()) };
+        let index = Self::keep(&mut self.kept, self.most_kept, parts, -sigma)?.0;
+        if self.kept[index].is_definite() {
+            return Ok(());
+        }
+        let reason = "the symmetric stiffness with its shift is not positive definite".to_owned();
+        Err(ReductionError::Factorisation { what: self.what.clone(), reason })
+    }
+
+    /// The factors that [`Self::factor_at`] made last.
+    pub(super) fn factors_at(&self, sigma: f64) -> Option<&Shifted> {
+        self.kept.iter().find(|shifted| shifted.square == -sigma)
+    }
+
+    /// Whether the model is of parts that touch, and nothing else.
+    pub(super) fn has_parts(&self) -> bool {
+        self.parts.is_some()
+    }
+
+    /// Where in `kept` the factors of `K - square M` are, and whether they were made for it.
+    fn keep(
+        kept: &mut Vec<Shifted>,
+        most: usize,
+        parts: &Parts<'_>,
+        square: f64,
+    ) -> Result<(usize, bool), ReductionError> {
+        if let Some(index) = kept.iter().position(|shifted| shifted.square == square) {
+            return Ok((index, false));
+        }
+        if kept.len() >= most {
+            kept.remove(0);
+        }
+        kept.push(parts.at(square)?);
+        Ok((kept.len() - 1, true))
     }
 
     /// Every root with a frequency from 0 to `band_rad_s` at `p`, as far as discs around shifts on the imaginary axis
@@ -162,8 +275,7 @@ impl<'a> FullSolver<'a> {
             let middle = if problem.undamped { (0.5 * (low * low + high * high)).sqrt() } else { 0.5 * (low + high) };
             let new = match &self.parts {
                 Some(parts) => {
-                    let index =
-                        Self::factored(&mut self.kept, parts, &problem, middle, self.memory_limit_bytes, progress)?;
+                    let index = Self::factored(&mut self.kept, parts, &problem, middle, self.most_kept, progress)?;
                     problem.around_parts(&self.kept[index], gap, progress)?
                 }
                 None => problem.around_system(middle, gap, progress)?,
@@ -182,26 +294,16 @@ impl<'a> FullSolver<'a> {
         parts: &Parts<'_>,
         problem: &Problem<'_>,
         omega: f64,
-        memory_limit_bytes: Option<usize>,
+        most_kept: usize,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<usize, ReductionError> {
         let mut worst = 0.0;
         for attempt in 0..6 {
             let square = omega * omega * (1.0 + 0.002 * f64::from(attempt));
-            let known = kept.iter().position(|shifted| shifted.square == square);
-            let index = match known {
-                Some(index) => index,
-                None => {
-                    let (each, held) = parts.bytes();
-                    let full = memory_limit_bytes.is_some_and(|limit| (kept.len() + 1) * each + held > limit);
-                    if kept.len() == MOST_KEPT || (full && !kept.is_empty()) {
-                        kept.remove(0);
-                    }
-                    kept.push(parts.at(square)?);
-                    progress(FullProgress::Factored { shift_rad_s: square.sqrt() });
-                    kept.len() - 1
-                }
-            };
+            let (index, made) = Self::keep(kept, most_kept, parts, square)?;
+            if made {
+                progress(FullProgress::Factored { shift_rad_s: square.sqrt() });
+            }
             let residual = problem.solve_residual(&kept[index]);
             if residual < SOLVE_LIMIT {
                 return Ok(index);

@@ -10,8 +10,8 @@ use super::contact_solver::{Coupled, Shifted};
 use super::coverage::{CoveredDisc, Found, SAME};
 use super::full_model::{FullModel, LowRank};
 use super::full_order::{FullProgress, FullRoot, FullVectors, WANTED};
-use super::krylov_schur::{Iteration, Largest, random};
-use super::sparse::{entries, one_norm, times};
+use super::krylov_schur::{Iteration, Largest, Number, random};
+use super::sparse::{entries, one_norm, times, times_transposed};
 use super::{ReductionError, SparseMatrix};
 use crate::physics::OperatingPoint;
 
@@ -33,6 +33,7 @@ const ZERO: c64 = c64::new(0.0, 0.0);
 pub(super) struct Problem<'a> {
     pub what: &'a str,
     model: &'a FullModel,
+    p: OperatingPoint,
     vectors: FullVectors,
     pub undamped: bool,
     low_rank: LowRank,
@@ -71,12 +72,22 @@ impl<'a> Problem<'a> {
                 largest(&|part| one_norm(&model.parts[part].stiffness)) + pairs(&low_rank.stiffness),
             ];
             let undamped = low_rank.damping.iter().all(|value| *value == 0.0);
-            return Ok(Self { what, model, vectors, undamped, low_rank, matrices: None, norms, growth_per_s });
+            return Ok(Self { what, model, p: *p, vectors, undamped, low_rank, matrices: None, norms, growth_per_s });
         }
         let matrices = model.matrices_at(p)?;
         let norms = [one_norm(&matrices[0]), one_norm(&matrices[1]), one_norm(&matrices[2])];
         let low_rank = LowRank::default();
-        Ok(Self { what, model, vectors, undamped: false, low_rank, matrices: Some(matrices), norms, growth_per_s })
+        Ok(Self {
+            what,
+            model,
+            p: *p,
+            vectors,
+            undamped: false,
+            low_rank,
+            matrices: Some(matrices),
+            norms,
+            growth_per_s,
+        })
     }
 
     /// `(a M + b C + c K) X`, or with the transposed matrices.
@@ -84,42 +95,19 @@ impl<'a> Problem<'a> {
         let k = x.ncols();
         // Real matrices times real and imaginary parts side by side.
         let parts = Mat::from_fn(x.nrows(), 2 * k, |i, j| if j < k { x[(i, j)].re } else { x[(i, j - k)].im });
-        let complex = |of: &Mat<f64>, i: usize, j: usize| c64::new(of[(i, j)], of[(i, k + j)]);
-        let mut sum = Mat::<c64>::zeros(x.nrows(), k);
-        let mut add = |factor: c64, product: &Mat<f64>, offset: usize| {
-            for j in 0..k {
-                for i in 0..product.nrows() {
-                    sum[(offset + i, j)] += factor * complex(product, i, j);
-                }
-            }
+        let product = |which: usize| match (&self.matrices, which) {
+            (Some(matrices), _) if transposed => times_transposed(&matrices[which], parts.as_ref()),
+            (Some(matrices), _) => times(&matrices[which], parts.as_ref()),
+            (None, 0) => self.model.mass_times(parts.as_ref()),
+            (None, 1) => self.model.damping_times(&self.p, parts.as_ref(), transposed),
+            (None, _) => self.model.stiffness_times(&self.p, parts.as_ref(), transposed),
         };
-        match &self.matrices {
-            Some(matrices) => {
-                for (factor, matrix) in [a, b, c].into_iter().zip(matrices) {
-                    if factor != ZERO {
-                        let product =
-                            if transposed { times_transposed(matrix, &parts) } else { times(matrix, parts.as_ref()) };
-                        add(factor, &product, 0);
-                    }
-                }
-            }
-            None => {
-                for (part, offset) in self.model.parts.iter().zip(self.model.offsets()) {
-                    let rows = parts.subrows(offset, part.mass.nrows());
-                    for (factor, matrix) in [(a, &part.mass), (c, &part.stiffness)] {
-                        if factor != ZERO {
-                            add(factor, &times(matrix, rows), offset);
-                        }
-                    }
-                }
-                let LowRank { left, right, stiffness, damping } = &self.low_rank;
-                let (left, right) = if transposed { (right, left) } else { (left, right) };
-                for (pair, row) in right.iter().enumerate() {
-                    let weight = c * stiffness[pair] + b * damping[pair];
-                    for j in 0..k {
-                        let along: c64 = row.iter().map(|&(i, value)| x[(i, j)] * value).sum();
-                        left[pair].iter().for_each(|&(i, value)| sum[(i, j)] += weight * along * value);
-                    }
+        let mut sum = Mat::<c64>::zeros(x.nrows(), k);
+        for (which, factor) in [a, b, c].into_iter().enumerate().filter(|(_, factor)| *factor != ZERO) {
+            let of = product(which);
+            for j in 0..k {
+                for i in 0..x.nrows() {
+                    sum[(i, j)] += factor * c64::new(of[(i, j)], of[(i, k + j)]);
                 }
             }
         }
@@ -177,32 +165,13 @@ impl<'a> Problem<'a> {
             let (forward, backward) = (self.coupled(shifted, s, false), self.coupled(shifted, s, true));
             let solve =
                 |b: MatRef<'_, c64>, transposed: bool| if transposed { backward.solve(b) } else { forward.solve(b) };
-            return self.around(omega, gap, &solve, progress);
+            return self.linearised(omega, gap, &solve, progress);
         }
-        let run = |transposed: bool, count: usize, progress: &mut dyn FnMut(FullProgress)| {
-            let coupled = shifted.couple::<f64>(&self.low_rank, self.low_rank.stiffness.clone(), transposed);
-            let iteration = Iteration {
-                what: self.what,
-                dimension: self.model.dimension(),
-                count,
-                residual_limit: KRYLOV_LIMIT,
-                seed: if transposed { 2 } else { 1 },
-            };
-            let enough = |theta: &[c64]| {
-                theta.last().is_some_and(|last| {
-                    let disc = CoveredDisc { shift_rad_s: omega, radius: 1.0 / last.norm(), squared: true };
-                    !transposed && disc.covers(gap, self.growth_per_s)
-                })
-            };
-            iteration.run::<f64>(
-                &|x| coupled.solve(self.model.mass_times(x.as_ref()).as_ref()),
-                &enough,
-                &mut |vectors, converged| progress(FullProgress::Iterated { shift_rad_s: omega, vectors, converged }),
-            )
+        let coupled = [false, true]
+            .map(|transposed| shifted.couple::<f64>(&self.low_rank, self.low_rank.stiffness.clone(), transposed));
+        let inverse = |x: Mat<f64>, transposed: bool| {
+            coupled[usize::from(transposed)].solve(self.model.mass_times(x.as_ref()).as_ref())
         };
-        let found = run(false, WANTED.min(self.model.dimension() / 4), progress)?;
-        let radius = found.theta.last().map_or(0.0, |last| 1.0 / last.norm());
-        let disc = CoveredDisc { shift_rad_s: omega, radius, squared: true };
         // Both of ±λ have the same vector; those that oscillate are listed once.
         let lambdas_of = |theta: c64| {
             let kappa = 1.0 / theta + square;
@@ -217,11 +186,7 @@ impl<'a> Problem<'a> {
                 vec![c64::new(root.re, 0.0), c64::new(-root.re, 0.0)]
             }
         };
-        let left = match self.vectors {
-            FullVectors::Both => Some(run(true, found.theta.len(), progress)?),
-            _ => None,
-        };
-        self.finish(disc, found, left, &lambdas_of)
+        self.around(omega, gap, &inverse, &lambdas_of, progress)
     }
 
     /// The roots nearest to a shift of a system.
@@ -253,11 +218,11 @@ impl<'a> Problem<'a> {
             }
             x
         };
-        self.around(omega, gap, &solve, progress)
+        self.linearised(omega, gap, &solve, progress)
     }
 
-    /// The roots nearest to `iω` by the linearised problem.
-    fn around(
+    /// The roots nearest to `iω` by the linearised problem, `solve` giving `Q(iω)⁻¹ b` or `Q(iω)⁻ᵀ b`.
+    fn linearised(
         &self,
         omega: f64,
         gap: [f64; 2],
@@ -265,50 +230,63 @@ impl<'a> Problem<'a> {
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
         let n = self.model.dimension();
-        let s = c64::new(0.0, omega);
-        let one = c64::new(1.0, 0.0);
-        let run = |transposed: bool, count: usize, progress: &mut dyn FnMut(FullProgress)| {
-            // Velocities are divided by ω, so that both halves of a vector weigh alike.
-            let apply = |v: Mat<c64>| {
-                let (x, y) = (v.subrows(0, n), v.subrows(n, n));
-                let b = self.times([c64::new(-omega, 0.0), ZERO, ZERO], y, transposed)
-                    + self.times([-s, -one, ZERO], x, transposed);
-                let next = solve(b.as_ref(), transposed);
-                Mat::from_fn(2 * n, v.ncols(), |i, j| {
-                    if i < n { next[(i, j)] } else { (x[(i - n, j)] + s * next[(i - n, j)]) / omega }
-                })
-            };
-            let iteration = Iteration {
-                what: self.what,
-                dimension: 2 * n,
-                count,
-                residual_limit: KRYLOV_LIMIT,
-                seed: if transposed { 2 } else { 1 },
-            };
-            let enough = |theta: &[c64]| {
-                theta.last().is_some_and(|last| {
-                    let disc = CoveredDisc { shift_rad_s: omega, radius: 1.0 / last.norm(), squared: false };
-                    !transposed && disc.covers(gap, self.growth_per_s)
-                })
-            };
-            let found = iteration.run::<c64>(&apply, &enough, &mut |vectors, converged| {
-                progress(FullProgress::Iterated { shift_rad_s: omega, vectors, converged });
-            })?;
-            let vectors = found.vectors.subrows(0, n).to_owned();
-            Ok::<_, ReductionError>(Largest { theta: found.theta, vectors })
-        };
-        let found = run(false, WANTED.min(n / 2), progress)?;
-        let radius = found.theta.last().map_or(0.0, |last| 1.0 / last.norm());
-        let disc = CoveredDisc { shift_rad_s: omega, radius, squared: false };
-        let left = match self.vectors {
-            FullVectors::Both => Some(run(true, found.theta.len(), progress)?),
-            _ => None,
+        let (s, one) = (c64::new(0.0, omega), c64::new(1.0, 0.0));
+        // Velocities are divided by ω, so that both halves of a vector weigh alike.
+        let inverse = |v: Mat<c64>, transposed: bool| {
+            let (x, y) = (v.subrows(0, n), v.subrows(n, n));
+            let b = self.times([c64::new(-omega, 0.0), ZERO, ZERO], y, transposed)
+                + self.times([-s, -one, ZERO], x, transposed);
+            let next = solve(b.as_ref(), transposed);
+            Mat::from_fn(2 * n, v.ncols(), |i, j| {
+                if i < n { next[(i, j)] } else { (x[(i - n, j)] + s * next[(i - n, j)]) / omega }
+            })
         };
         let lambdas_of = |theta: c64| {
             let lambda = s + 1.0 / theta;
             if lambda.im < -REAL * lambda.norm() { vec![] } else { vec![c64::new(lambda.re, lambda.im.max(0.0))] }
         };
-        self.finish(disc, found, left, &lambdas_of)
+        self.around(omega, gap, &inverse, &lambdas_of, progress)
+    }
+
+    /// The roots nearest to `iω`, `lambdas_of` the largest `θ` of `inverse`: real of size `n`, in `κ`, or complex of size
+    /// `2n`, in `λ`. Left vectors are those of the transposed problem.
+    fn around<T: Number>(
+        &self,
+        omega: f64,
+        gap: [f64; 2],
+        inverse: &dyn Fn(Mat<T>, bool) -> Mat<T>,
+        lambdas_of: &dyn Fn(c64) -> Vec<c64>,
+        progress: &mut dyn FnMut(FullProgress),
+    ) -> Result<Found, ReductionError> {
+        let n = self.model.dimension();
+        let dimension = if T::REAL { n } else { 2 * n };
+        let disc_of = |theta: &[c64]| {
+            let radius = theta.last().map_or(0.0, |last| 1.0 / last.norm());
+            CoveredDisc { shift_rad_s: omega, radius, squared: T::REAL }
+        };
+        let mut run = |transposed: bool, wanted: usize| {
+            let iteration = Iteration {
+                what: self.what,
+                dimension,
+                count: wanted,
+                residual_limit: KRYLOV_LIMIT,
+                seed: if transposed { 2 } else { 1 },
+            };
+            let enough = |theta: &[c64]| !transposed && disc_of(theta).covers(gap, self.growth_per_s);
+            let Largest { theta, vectors } =
+                iteration.run::<T>(&|x| inverse(x, transposed), &enough, &mut |vectors, converged| {
+                    progress(FullProgress::Iterated { shift_rad_s: omega, vectors, converged, wanted });
+                })?;
+            let vectors = if T::REAL { vectors } else { vectors.subrows(0, n).to_owned() };
+            Ok::<_, ReductionError>(Largest { theta, vectors })
+        };
+        let found = run(false, WANTED.min(dimension / 4))?;
+        let disc = disc_of(&found.theta);
+        let left = match self.vectors {
+            FullVectors::Both => Some(run(true, found.theta.len())?),
+            FullVectors::None => None,
+        };
+        self.finish(disc, found, left, lambdas_of)
     }
 
     /// Roots with residuals and the vectors that are wanted.
@@ -333,6 +311,7 @@ impl<'a> Problem<'a> {
         };
         let columns: Vec<usize> = roots.iter().map(|(_, k)| *k).collect();
         let right = gathered(&found.vectors, &columns);
+        drop(found);
         let lambdas: Vec<c64> = roots.iter().map(|(lambda, _)| *lambda).collect();
         let residuals = self.checked(&lambdas, &right, false)?;
         let left = match left {
@@ -361,10 +340,12 @@ impl<'a> Problem<'a> {
                         }
                     }
                 }
-                let vectors = gathered(&left.vectors, &columns);
+                let mut vectors = gathered(&left.vectors, &columns);
+                drop(left);
                 self.checked(&own, &vectors, true)?;
                 // uᵀ Q = 0: yᴴ Q = 0 with y the conjugate of u.
-                Mat::from_fn(n, vectors.ncols(), |i, j| vectors[(i, j)].conj())
+                vectors.col_iter_mut().for_each(|column| column.iter_mut().for_each(|value| *value = value.conj()));
+                vectors
             }
         };
         let roots =
@@ -383,14 +364,6 @@ impl<'a> Problem<'a> {
             }
         }
     }
-}
-
-/// `Aᵀ X`.
-fn times_transposed(matrix: &SparseMatrix, x: &Mat<f64>) -> Mat<f64> {
-    let view = matrix.as_ref();
-    Mat::from_fn(matrix.ncols(), x.ncols(), |column, j| {
-        view.row_idx_of_col(column).zip(view.val_of_col(column)).map(|(row, value)| value * x[(row, j)]).sum()
-    })
 }
 
 /// Columns scaled to norm 1.

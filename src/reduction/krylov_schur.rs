@@ -119,8 +119,13 @@ pub(super) fn capacity(dimension: usize, count: usize) -> usize {
     (3 * count + 4 * BLOCK).min(dimension / BLOCK * BLOCK)
 }
 
+/// Pairs that are handed back at most where `count` are wanted.
+pub(super) fn most_found(count: usize) -> usize {
+    count + count / 2
+}
+
 impl Iteration<'_> {
-    /// The largest pairs of `apply`: `count` of them, or fewer where `enough` is content with the converged `θ`, or where
+    /// The largest pairs of `apply`: `count` of them or some more, or fewer where `enough` is content with the converged `θ`, or where
     /// the whole space is at hand. `progress` is told how many vectors were built and how many pairs converged.
     pub(super) fn run<T: Number>(
         &self,
@@ -148,7 +153,8 @@ impl Iteration<'_> {
                 progress(built, converged);
                 let theta: Vec<c64> = (0..converged).map(|k| ritz.schur.value(k)).collect();
                 if converged >= self.count || whole || (converged > 0 && enough(&theta)) {
-                    return Ok(Largest { vectors: space.vectors(&ritz, converged), theta });
+                    let found = converged.min(most_found(self.count));
+                    return Ok(Largest { vectors: space.vectors(&ritz, found), theta: theta[..found].to_vec() });
                 }
                 if full && restarts == MOST_RESTARTS {
                     return Err(ReductionError::NotConverged {

@@ -42,34 +42,40 @@ impl RootMatch {
     }
 }
 
+/// Pairs off, nearest first: of distances between one of `full` and one of others, `(distance, one, other)`, the other of
+/// each.
+pub(super) fn pair_off(mut near: Vec<(f64, usize, usize)>, full: usize) -> Vec<Option<usize>> {
+    near.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let mut partners = vec![None; full];
+    for (_, one, other) in near {
+        if partners[one].is_none() && !partners.contains(&Some(other)) {
+            partners[one] = Some(other);
+        }
+    }
+    partners
+}
+
 /// Compares roots one to one, nearest first.
 ///
 /// `full`, `reduced`: all roots with `ω > 0` of each; those of the full model a little beyond the band too, so that one
 /// near its end is found again on the other side.
 pub fn match_roots(full: &[c64], reduced: &[c64], counted: Counted) -> RootMatch {
     let distance = |i: usize, j: usize| (full[i] - reduced[j]).norm() / full[i].norm();
-    let mut near: Vec<(usize, usize, f64)> = (0..full.len())
-        .flat_map(|i| (0..reduced.len()).map(move |j| (i, j, distance(i, j))))
-        .filter(|(_, _, error)| *error <= SAME)
+    let near = (0..full.len())
+        .flat_map(|i| (0..reduced.len()).map(move |j| (distance(i, j), i, j)))
+        .filter(|(error, ..)| *error <= SAME)
         .collect();
-    near.sort_by(|a, b| a.2.total_cmp(&b.2));
-    let mut partner: Vec<Option<f64>> = vec![None; full.len()];
-    let mut taken = vec![false; reduced.len()];
-    for (i, j, error) in near {
-        if partner[i].is_none() && !taken[j] {
-            (partner[i], taken[j]) = (Some(error), true);
-        }
-    }
+    let partners = pair_off(near, full.len());
     let mut comparison = RootMatch::default();
-    for (&lambda, partner) in full.iter().zip(partner) {
+    for (i, (&lambda, partner)) in full.iter().zip(&partners).enumerate() {
         match partner {
             _ if !counted.counts(lambda) => {}
-            Some(error) => comparison.errors.push((lambda, error)),
+            Some(j) => comparison.errors.push((lambda, distance(i, *j))),
             None => comparison.missed.push(lambda),
         }
     }
-    let alone = reduced.iter().zip(taken).filter(|(lambda, taken)| counted.counts(**lambda) && !taken);
-    comparison.invented.extend(alone.map(|(lambda, _)| *lambda));
+    let alone = |(j, lambda): &(usize, &c64)| counted.counts(**lambda) && !partners.contains(&Some(*j));
+    comparison.invented.extend(reduced.iter().enumerate().filter(alone).map(|(_, lambda)| *lambda));
     comparison
 }
 

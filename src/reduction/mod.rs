@@ -9,8 +9,8 @@
 //! by [`free_interface_modes`]; [`whiten`] makes `M = I` of a whole system without leaving anything out. Sparse, for
 //! systems of finite-element matrices: [`normal_modes`] by nested dissection, a supernodal `L Lᵀ` and shift-invert block
 //! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
-//! to the basis; [`residual()`] finds what the modes left out still do at the contact; [`keep_modes`] does both for
-//! all parts of a model.
+//! to the basis; [`Analysed::residual`] finds what the modes left out still do at the contact; [`keep_modes`] does both
+//! for all parts of a model.
 //! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare
 //! with and to make a [`parametric_basis`] of, on which it keeps them.
 //!
@@ -46,7 +46,7 @@ pub use compare::{
     CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
 };
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
-pub use error::ReductionError;
+pub use error::{GIB, ReductionError};
 pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
 pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
 pub use matching::{Counted, RootMatch, match_roots};
@@ -54,7 +54,7 @@ pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, no
 pub use operating_box::OperatingBox;
 pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
 pub use project::{project_dense, project_sparse};
-pub use residual::{InertiaBy, Residual, residual};
+pub use residual::{InertiaBy, Residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 pub use substructures::{Kept, Substructure, keep_modes};
 

@@ -42,7 +42,7 @@ pub enum Wanted {
 pub enum Progress {
     /// The system is being ordered and analysed.
     Analysing,
-    /// Ordered and analysed: the numbers in a factor and the bytes that will be needed in all.
+    /// Ordered and analysed: the numbers in a factor and the bytes that will be needed beside what is held already.
     Analysed { factor_entries: usize, bytes: usize },
     /// `K + s M` is factored, `s` in rad²/s².
     Factored { shift: f64 },
@@ -80,7 +80,7 @@ pub fn lowest_modes(
 
 /// The lowest modes of `K φ = ω² M φ`, both sparse, symmetric, `n×n`, `M` positive definite.
 ///
-/// `what` is how errors name the system; `memory_limit_bytes` is compared with an estimate before the work starts;
+/// `what` is how errors name the system; `memory_limit_bytes` is what may be taken beside what is held, compared with the need before the work starts;
 /// `progress` hears what is done.
 ///
 /// # Errors
@@ -111,15 +111,19 @@ impl<'a> Analysed<'a> {
         Ok(Self { pencil: Pencil::new(what, mass, stiffness)? })
     }
 
-    /// Bytes that are held already: both matrices as they came, and their lower triangles here.
+    /// Bytes that are held beside both matrices as they came.
     pub fn held_bytes(&self) -> usize {
         self.pencil.held_bytes()
     }
 
-    /// Bytes that `count` modes need beside that: the factor and the vectors of the iteration.
+    /// Bytes that `count` modes need beside that: a factor and, while it is made, what that takes, or the vectors of the iteration.
     pub fn bytes_for(&self, count: usize) -> usize {
         let n = self.pencil.dimension();
-        self.pencil.factor_bytes() + size_of::<f64>() * n * (capacity(n, count) + count)
+        // The basis; a block, its products and what they are made from, or as much of the vectors at the end.
+        let vectors = size_of::<f64>() * n * (capacity(n, count) + AT_A_TIME * TOGETHER);
+        // Beside all modes, when the factor has gone: they themselves again, K and M times them.
+        let finished = size_of::<f64>() * n * 4 * count;
+        (self.pencil.factor_bytes() + vectors.max(self.pencil.factoring_bytes())).max(finished)
     }
 
     /// Numbers the factor holds.
@@ -220,6 +224,8 @@ impl<'a> Analysed<'a> {
 
 /// Vectors that are solved for together at the end.
 const TOGETHER: usize = 24;
+/// Copies of them at a time: before, in the order of elimination, while solving, and back.
+const AT_A_TIME: usize = 4;
 
 /// Modes before their residuals are known.
 struct Found {

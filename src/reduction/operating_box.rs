@@ -61,6 +61,11 @@ impl OperatingBox {
         smaller
     }
 
+    /// How many of its ranges are more than a single value.
+    pub fn widths(&self) -> usize {
+        self.ranges().iter().filter(|(_, [low, high])| low < high).count()
+    }
+
     /// The point at `unit`, each coordinate from 0 to 1: friction, load, speed.
     pub fn at(&self, unit: [f64; 3]) -> OperatingPoint {
         let along = |[low, high]: [f64; 2], u: f64| {

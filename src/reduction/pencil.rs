@@ -96,19 +96,25 @@ impl<'a> Pencil<'a> {
         self.symbolic.len_val()
     }
 
-    /// Bytes a factorisation needs: the factor, the shifted matrix, and what faer works in.
-    pub(super) fn factor_bytes(&self) -> usize {
-        let float = size_of::<f64>();
-        let llt = self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default());
-        let ldlt = self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default());
-        float * (self.factor_entries() + self.lower_mass.len()) + llt.size_bytes().max(ldlt.size_bytes())
+    /// Bytes held once it is analysed, beside both matrices as they came: their lower triangles, and what the analysis found.
+    pub(super) fn held_bytes(&self) -> usize {
+        let (index, float) = (size_of::<usize>(), size_of::<f64>());
+        let supernodes = supernodal(&self.symbolic);
+        // Rows of every supernode, by columns and by rows; the order both ways, and where columns and supernodes begin.
+        let analysis = 2 * supernodes.row_idx().len() + 6 * self.dimension();
+        (index + 2 * float) * self.lower_mass.len() + index * analysis
     }
 
-    /// Bytes held already: both matrices as they came, and their lower triangles here.
-    pub(super) fn held_bytes(&self) -> usize {
-        let entry = size_of::<usize>() + size_of::<f64>();
-        entry * (self.mass.compute_nnz() + self.stiffness.compute_nnz())
-            + (entry + size_of::<f64>()) * self.lower_mass.len()
+    /// Bytes of a factor.
+    pub(super) fn factor_bytes(&self) -> usize {
+        size_of::<f64>() * self.factor_entries()
+    }
+
+    /// Bytes that making a factor needs beside it: the shifted matrix, and what faer works in.
+    pub(super) fn factoring_bytes(&self) -> usize {
+        let llt = self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default());
+        let ldlt = self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default());
+        size_of::<f64>() * self.lower_mass.len() + llt.size_bytes().max(ldlt.size_bytes())
     }
 
     /// The lower triangle of `k K + m M`.

@@ -20,9 +20,9 @@
 
 use faer::Mat;
 
+use super::ReductionError;
 use super::normal_modes::{Analysed, Progress, SparseModes};
 use super::sparse::times;
-use super::{ReductionError, SparseMatrix};
 
 /// The shift, relative to the last kept `ω²`.
 const SHIFT: f64 = 1e-6;
@@ -49,38 +49,23 @@ pub struct Residual {
     pub inertia: Mat<f64>,
 }
 
-/// Residual flexibility and inertia of the modes beyond `modes` between the degrees of freedom `rows`; `None` is one
-/// that is held, whose rows and columns are 0.
-///
-/// `what` is how errors name the part; `mass`, `stiffness`: `n×n`, as they were given to
-/// [`super::normal_modes`].
-///
-/// # Errors
-/// [`ReductionError`]: `NegativeStiffness` where a kept mode is unstable, `NoShift`, `Factorisation`.
-pub fn residual(
-    what: &str,
-    mass: &SparseMatrix,
-    stiffness: &SparseMatrix,
-    modes: &SparseModes,
-    rows: &[Option<usize>],
-    progress: &mut dyn FnMut(Progress),
-) -> Result<Residual, ReductionError> {
-    Analysed::new(what, mass, stiffness)?.residual(modes, rows, InertiaBy::SecondSolve, progress)
-}
-
 impl Analysed<'_> {
     /// Bytes that residuals for so many `loads` need beside what is held already, `count` modes included.
     pub fn bytes_for_residual(&self, count: usize, loads: usize, inertia_by: InertiaBy) -> usize {
         // The modes, their inertia, and loads, answers, products and room to permute them of one set of loads.
         let columns = 2 * count + 5 * TOGETHER;
         let kept = if inertia_by == InertiaBy::KeptAnswers { size_of::<f32>() * loads } else { 0 };
-        self.pencil.factor_bytes() + self.pencil.dimension() * (size_of::<f64>() * columns + kept)
+        let vectors = self.pencil.dimension() * (size_of::<f64>() * columns + kept);
+        // Both results, and once more where they are put in order.
+        let between = 4 * size_of::<f64>() * loads * loads;
+        self.pencil.factor_bytes() + between + vectors.max(self.pencil.factoring_bytes())
     }
 
-    /// Residual flexibility and inertia of the modes beyond `modes`; see [`residual`].
+    /// Residual flexibility and inertia of the modes beyond `modes` between the degrees of freedom `rows`; `None` is one
+    /// that is held, whose rows and columns are 0.
     ///
     /// # Errors
-    /// [`ReductionError`]: `NegativeStiffness`, `NoShift`, `Factorisation`.
+    /// [`ReductionError`]: `NegativeStiffness` where a kept mode is unstable, `NoShift`, `Factorisation`.
     pub fn residual(
         &self,
         modes: &SparseModes,
@@ -186,7 +171,7 @@ fn product_of(left: &Mat<f32>, right: &Mat<f64>) -> Mat<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{ModeSelection, free_interface_modes, lowest_modes};
+    use super::super::{ModeSelection, SparseMatrix, free_interface_modes, lowest_modes};
     use super::*;
     use faer::sparse::Triplet;
 

@@ -79,6 +79,14 @@ pub(super) fn times(matrix: &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
     product
 }
 
+/// `Aᵀ X`, `A` sparse.
+pub(super) fn times_transposed(matrix: &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
+    let view = matrix.as_ref();
+    Mat::from_fn(matrix.ncols(), x.ncols(), |column, j| {
+        view.row_idx_of_col(column).zip(view.val_of_col(column)).map(|(row, value)| value * x[(row, j)]).sum()
+    })
+}
+
 /// `Aᵀ`.
 pub(super) fn transposed(matrix: &SparseMatrix) -> Result<SparseMatrix, ReductionError> {
     matrix.as_ref().transpose().to_col_major().map_err(|error| ReductionError::Factorisation {

@@ -28,8 +28,8 @@ pub struct Kept {
     pub residual: Option<Residual>,
 }
 
-/// Modes of every part, and residuals `with_residual`: one thread for each part where all of them together stay below
-/// `memory_limit_bytes`, else one part after the other; answers to contact forces kept where there is room for them. The
+/// Modes of every part, and residuals `with_residual`: one thread for each part where all of them together take no more than
+/// `memory_limit_bytes` beside the matrices themselves, else one part after the other; answers to contact forces kept where there is room for them. The
 /// result depends on that by rounding alone: 1e-7 of the residual inertia.
 ///
 /// `progress` hears which part does what.

@@ -6,7 +6,7 @@ mod tribometer;
 use crate::html::{figure, page, section};
 
 pub use nine_dof::nine_dof;
-pub use tribometer::{MODES, Study};
+pub use tribometer::{Heard, MODES, PartModes, Study};
 
 /// A table or figure of the paper, made again.
 #[derive(Clone, Debug)]

@@ -14,7 +14,6 @@ use crate::physics::{MapOptions, Model, OperatingPoint, Solver, StabilityMap, Ve
 use crate::plot::{self, Point, Unit};
 use crate::reduction::{
     FullProgress, FullSolver, FullVectors, Kept, ParametricBasis, ReductionError, compare_windows, full_windows,
-    lowest_modes,
 };
 use crate::rig::{Rig, RigFile};
 
@@ -57,12 +56,45 @@ const DOTS: usize = 10;
 /// Friction coefficients go up to this, as the paper's do.
 const MU_MAX: f64 = 1.0;
 
+/// The most [`MODES`] of pad and disc, as far as the contact feels them.
+pub struct PartModes {
+    omega_squared: Vec<Vec<f64>>,
+    /// A rig of all of them, without and with the residual of the others.
+    plain: Vec<RigFile>,
+    with_residual: Vec<RigFile>,
+}
+
+impl PartModes {
+    /// What the contact feels of what was `kept`.
+    ///
+    /// # Errors
+    /// Modes that make no rig.
+    pub fn new(full: &FullModelFile, kept: &[Kept]) -> anyhow::Result<Self> {
+        let files = |residual: bool| {
+            let mut sides = modal_sides(full, kept)?;
+            if !residual {
+                sides.iter_mut().for_each(|side| side.residual = None);
+            }
+            let (common, patches) = (&full.common_tables, full.contact_patches.as_ref());
+            modal_rig("tribometer.toml", &[], common, patches, None, &sides, None)
+        };
+        let omega_squared = kept.iter().map(|kept| kept.modes.omega_squared.clone()).collect();
+        Ok(Self { omega_squared, plain: files(false)?, with_residual: files(true)? })
+    }
+}
+
 /// A full model of the tribometer, the [`MODES`] of its parts with residuals, and a parametric basis of it.
 pub struct Study<'a> {
     pub full: &'a FullModelFile,
-    pub kept: &'a [Kept],
+    pub modes: &'a PartModes,
     pub basis: &'a ParametricBasis,
-    pub memory_limit_bytes: Option<usize>,
+}
+
+/// What is being done.
+pub enum Heard<'a> {
+    Said(&'a str),
+    /// The full model is being solved, for this.
+    Solving(&'a str, FullProgress),
 }
 
 /// What the full model itself says.
@@ -90,28 +122,27 @@ struct Mapped {
 }
 
 impl Study<'_> {
-    /// Tables 3 and 4, Figs. 13 to 15 and the critical friction coefficients; `say` hears what is being done.
+    /// Tables 3 and 4, Figs. 13 to 15 and the critical friction coefficients; `solver` solves the full model, `hear` is told
+    /// what is being done.
     ///
     /// # Errors
     /// A model that cannot be solved, a figure that cannot be drawn.
-    pub fn items(&self, say: &mut dyn FnMut(&str)) -> anyhow::Result<Vec<Item>> {
-        let truth = self.truth(say)?;
+    pub fn items(&self, solver: &mut FullSolver<'_>, hear: &mut dyn FnMut(Heard<'_>)) -> anyhow::Result<Vec<Item>> {
+        let truth = self.truth(solver, hear)?;
+        let mut say = |text: &str| hear(Heard::Said(text));
         say("identifying contact stiffnesses");
-        let plain = self.files(false)?;
         let (mut paper, mut fits) = (vec![], vec![]);
         for (k, &modes) in MODES.iter().enumerate() {
-            let (model, found) = self.identified(&plain, modes, &truth)?;
+            let (model, found) = self.identified(modes, &truth)?;
             paper.push(Reduced { name: format!("RM {}, {modes}+{modes}", k + 1), ..model });
             fits.push(found);
         }
         say("reducing with residual flexibility and inertia");
         let mut ours = vec![];
-        let with_residual = self.files(true)?;
         for modes in MODES {
-            let rig = with_modes(&with_residual, modes, 1.0)?;
+            let rig = with_modes(&self.modes.with_residual, modes, 1.0)?;
             ours.push(self.reduced(format!("{modes}+{modes} with residual"), rig.model, rig.band_max_hz, 1.0)?);
         }
-        drop((plain, with_residual));
         let model = self.basis.projected.model(self.full.model.contact_law)?;
         let name = format!("basis of {} vectors", model.dimension());
         let basis = self.reduced(name, model, None, 1.0)?;
@@ -141,22 +172,25 @@ impl Study<'_> {
     }
 
     /// The full model at rest, its windows of instability, and its modes here and there.
-    fn truth(&self, say: &mut dyn FnMut(&str)) -> anyhow::Result<Truth> {
+    fn truth(&self, solver: &mut FullSolver<'_>, hear: &mut dyn FnMut(Heard<'_>)) -> anyhow::Result<Truth> {
         let (full, reference) = (self.full, self.full.settings.reference);
         let band_hz = full.settings.band_max_hz.context("the full model has no band")?;
-        let [mass, _, stiffness] = full.model.matrices_at(&self.at_rest())?;
-        let modes = lowest_modes("full model at rest", &mass, &stiffness, FREQUENCIES)?;
-        let at_rest_hz = modes.omega_squared.iter().map(|square| square.max(0.0).sqrt() / TAU).collect();
-        let quiet = &mut |_: FullProgress| ();
-        let mut solver = FullSolver::new(&full.name, &full.model, self.memory_limit_bytes, quiet)?;
-        say("windows of instability of the full model");
-        let options = map_options(full.settings.instability_threshold, band_hz);
-        let windows = full_windows(&full.model, &mut solver, &reference, TAU * band_hz, &options, quiet)?;
+        let mut roots = |what: &str, p: &OperatingPoint, hear: &mut dyn FnMut(Heard<'_>)| {
+            solver.roots(p, TAU * band_hz, FullVectors::None, &mut |step| hear(Heard::Solving(what, step)))
+        };
+        let at_rest = roots("at rest", &self.at_rest(), hear)?;
+        let at_rest_hz: Vec<f64> =
+            at_rest.roots.iter().map(|root| root.lambda.im / TAU).filter(|hz| *hz > 0.0).take(FREQUENCIES).collect();
+        let count = at_rest_hz.len();
+        ensure!(
+            count == FREQUENCIES,
+            "{}: {count} frequencies below {band_hz} Hz, {FREQUENCIES} are compared",
+            full.name
+        );
         let mut dots = vec![];
         for k in 0..=DOTS {
             let mu = MU_MAX * k as f64 / DOTS as f64;
-            say(&format!("solving the full model at a friction coefficient of {mu}"));
-            let found = solver.roots(&reference.with_friction(mu), TAU * band_hz, FullVectors::None, quiet)?;
+            let found = roots(&format!("friction coefficient {mu}"), &reference.with_friction(mu), hear)?;
             dots.extend(found.roots.iter().filter(|root| root.lambda.im > 0.0).enumerate().map(|(id, root)| Point {
                 mu,
                 id: id as u32,
@@ -164,21 +198,15 @@ impl Study<'_> {
                 growth_rate_per_s: root.lambda.re,
             }));
         }
+        let options = map_options(full.settings.instability_threshold, band_hz);
+        let mut told = |step: FullProgress| hear(Heard::Solving("windows of instability", step));
+        let windows = full_windows(&full.model, solver, &reference, TAU * band_hz, &options, &mut told)?;
         Ok(Truth { at_rest_hz, windows, dots, band_hz })
     }
 
-    /// The rig of all modes kept.
-    fn files(&self, residual: bool) -> anyhow::Result<Vec<RigFile>> {
-        let mut sides = modal_sides(self.full, self.kept)?;
-        if !residual {
-            sides.iter_mut().for_each(|side| side.residual = None);
-        }
-        let (common, patches) = (&self.full.common_tables, self.full.contact_patches.as_ref());
-        modal_rig("tribometer.toml", &[], common, patches, None, &sides, None)
-    }
-
     /// So many modes of each part with the contact stiffness that fits the full model at rest best.
-    fn identified(&self, files: &[RigFile], modes: usize, truth: &Truth) -> anyhow::Result<(Reduced, Identified)> {
+    fn identified(&self, modes: usize, truth: &Truth) -> anyhow::Result<(Reduced, Identified)> {
+        let files = &self.modes.plain;
         let rig = with_modes(files, modes, 1.0)?;
         // K = K_open + factor (K_closed - K_open): contact springs alone.
         let n = rig.model.dimension();
@@ -198,7 +226,7 @@ impl Study<'_> {
         })?;
         let rig = with_modes(files, modes, found.best.factor)?;
         // Without residuals a rig does not say where its modes end.
-        let highest = self.kept.iter().map(|kept| kept.modes.omega_squared[modes - 1].max(0.0).sqrt() / TAU);
+        let highest = self.modes.omega_squared.iter().map(|squares| squares[modes - 1].max(0.0).sqrt() / TAU);
         let cutoff_hz = highest.fold(f64::INFINITY, f64::min);
         let reduced = self.reduced(String::new(), rig.model, Some(cutoff_hz.min(truth.band_hz)), found.best.factor)?;
         Ok((reduced, found))
@@ -234,7 +262,7 @@ impl Study<'_> {
     }
 
     fn table_3(&self, truth: &Truth) -> Item {
-        let first = |part: usize| self.kept[part].modes.omega_squared[0].max(0.0).sqrt() / TAU;
+        let first = |part: usize| self.modes.omega_squared[part][0].max(0.0).sqrt() / TAU;
         let ours = [first(0), first(1), truth.at_rest_hz[0]];
         let mut csv = "what,frequency_hz,paper_full_model_hz,paper_measured_hz\n".to_owned();
         let mut rows = vec![];

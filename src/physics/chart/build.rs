@@ -347,7 +347,7 @@ impl Builder<'_> {
 
 /// Points of a fit: a half more data than coefficients.
 fn points_wanted(basis: &Basis, axes: usize) -> usize {
-    (3 * basis.len()).div_ceil(2 * (1 + axes))
+    (3 * basis.len()).div_ceil(2 * Basis::orders(axes).len())
 }
 
 /// Whether a static root of a damped model, which is not charted, grows at one of the nodes or may grow between them:

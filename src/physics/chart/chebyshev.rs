@@ -1,4 +1,4 @@
-//! Chebyshev polynomials of bounded total degree on a box, fitted to values and slopes at scattered points.
+//! Chebyshev polynomials of bounded total degree on a box, fitted to values, slopes and curvatures at scattered points.
 
 use faer::prelude::*;
 use faer::{Mat, linalg::solvers::Qr};
@@ -74,25 +74,20 @@ impl Basis {
         out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| tables[k][usize::from(d[k])]).product::<f64>()));
     }
 
-    /// Their slopes along `axis` at `unit`, by recurrence `T'_n = n U_{n-1}`.
-    fn slopes(&self, unit: &[f64; MAX_AXES], axis: usize, out: &mut Vec<f64>) {
-        let tables = unit.map(table);
-        let mut slope = [0.0; MAX_DEGREE + 1];
-        let mut second = [0.0; MAX_DEGREE + 1]; // U_n
-        for n in 0..=MAX_DEGREE {
-            second[n] = match n {
-                0 => 1.0,
-                1 => 2.0 * unit[axis],
-                _ => 2.0 * unit[axis] * second[n - 1] - second[n - 2],
-            };
-            slope[n] = if n == 0 { 0.0 } else { n as f64 * second[n - 1] };
-        }
-        let factor = |d: &[u8; MAX_AXES], k: usize| {
-            let table = if k == axis { &slope } else { &tables[k] };
-            table[usize::from(d[k])]
-        };
+    /// What is known of a function at a point, as how often it is derived along each axis: its value, its slopes, its curvatures
+    /// (those of axes `a` and `b`, `a` up to `b`, at `b (b + 1) / 2 + a`).
+    pub fn orders(axes: usize) -> Vec<[usize; MAX_AXES]> {
+        let along = |axes: &[usize]| std::array::from_fn(|k| axes.iter().filter(|&&axis| axis == k).count());
+        let slopes = (0..axes).map(|axis| along(&[axis]));
+        let curvatures = (0..axes).flat_map(|b| (0..=b).map(move |a| along(&[a, b])));
+        std::iter::once([0; MAX_AXES]).chain(slopes).chain(curvatures).collect()
+    }
+
+    /// Their derivatives at `unit`, `orders` times along each axis, at most twice in all.
+    fn derivatives(&self, unit: &[f64; MAX_AXES], orders: &[usize; MAX_AXES], out: &mut Vec<f64>) {
+        let tables: [_; MAX_AXES] = std::array::from_fn(|k| derivatives(unit[k])[orders[k]]);
         out.clear();
-        out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| factor(d, k)).product::<f64>()));
+        out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| tables[k][usize::from(d[k])]).product::<f64>()));
     }
 
     /// The axis along which the two highest degrees of `coefficients` weigh most.
@@ -135,6 +130,19 @@ fn polynomials(x: f64, out: &mut [f64]) {
     }
 }
 
+/// `T_n(x)`, `T_n'(x)` and `T_n''(x)`, by the recurrence and its derivatives.
+fn derivatives(x: f64) -> [[f64; MAX_DEGREE + 1]; 3] {
+    let mut out = [table(x), [0.0; MAX_DEGREE + 1], [0.0; MAX_DEGREE + 1]];
+    for order in 1..=2 {
+        for n in 1..=MAX_DEGREE {
+            let before = if n >= 2 { out[order][n - 2] } else { 0.0 };
+            let doubled = if n == 1 { 1.0 } else { 2.0 };
+            out[order][n] = doubled * (x * out[order][n - 1] + order as f64 * out[order - 1][n - 1]) - before;
+        }
+    }
+    out
+}
+
 fn table(x: f64) -> [f64; MAX_DEGREE + 1] {
     let mut out = [0.0; MAX_DEGREE + 1];
     polynomials(x, &mut out);
@@ -145,7 +153,7 @@ fn table(x: f64) -> [f64; MAX_DEGREE + 1] {
 /// across the end are still taken.
 pub fn beside_zero(x: f64, degree: usize, range: f64) -> f64 {
     let scaled = x / range;
-    if scaled.abs() > 1.0 + 1e-4 {
+    if scaled.abs() > 1.0 + 1e-3 {
         return f64::NAN;
     }
     let mut values = [0.0; MOST_DEGREES];
@@ -156,7 +164,7 @@ pub fn beside_zero(x: f64, degree: usize, range: f64) -> f64 {
 /// Derivative of [`beside_zero`] with respect to `x`: `T_k(y) + k y U_{k-1}(y)`, `y = x / range`.
 pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
     let y = x / range;
-    if y.abs() > 1.0 + 1e-4 {
+    if y.abs() > 1.0 + 1e-3 {
         return f64::NAN;
     }
     // T and U of the degrees so far: U_k = y U_{k-1} + T_k.
@@ -172,40 +180,40 @@ pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
 pub struct Fitted {
     /// Coefficients of the basis.
     pub coefficients: Vec<f64>,
-    /// What the expansion leaves out, estimated: the largest misfit of a value, and what the highest total degree amounts to
-    /// at most, over the points, or the one before it: one alone may be small by accident.
+    /// What the expansion leaves out, estimated: the largest misfit of a value, or of a derivative over what the first degree
+    /// left out makes of a value; and what the highest total degree amounts to at most, over the points, or the one before it:
+    /// one alone may be small by accident.
     pub missing: f64,
     /// The axis along which it converges worst.
     pub worst_axis: usize,
 }
 
-/// A least-squares fit of values and slopes at given points.
+/// A least-squares fit of values, slopes and curvatures at given points.
 pub struct Fit {
     basis: Basis,
     rows: Mat<f64>,
     weights: Vec<f64>,
+    /// Rows of a point.
+    per_point: usize,
     qr: Qr<f64>,
 }
 
 impl Fit {
-    /// For data at `units`: at each point the value, then the slope along each axis, which is left out where it is not
-    /// `sound`. `None` where the points do not determine the coefficients.
+    /// For data at `units`: at each point what [`Basis::orders`] lists, all but the value left out where it is not `sound`.
+    /// `None` where the points do not determine the coefficients.
     pub fn new(basis: &Basis, units: &[[f64; MAX_AXES]], sound: &[bool]) -> Option<Self> {
-        let axes = basis.axes;
-        let mut rows = Mat::zeros(units.len() * (1 + axes), basis.len());
+        let orders = Basis::orders(basis.axes);
+        let mut rows = Mat::zeros(units.len() * orders.len(), basis.len());
         let mut weights = vec![];
         let mut row = vec![];
+        let degree = basis.degree.max(1) as f64;
         for (unit, &sound) in units.iter().zip(sound) {
-            for part in 0..=axes {
-                let weight = if part == 0 {
-                    basis.values(unit, &mut row);
-                    1.0
-                } else {
-                    basis.slopes(unit, part - 1, &mut row);
-                    // As a slope in θ, x = cos θ, which is of the order of the degree everywhere.
-                    let (x, degree) = (unit[part - 1], basis.degree.max(1) as f64);
-                    if sound { (1.0 - x * x).max(0.0).sqrt().max(1.0 / degree) / degree } else { 0.0 }
-                };
+            // A derivative in θ, x = cos θ, is of the order of the degree everywhere.
+            let scale = unit.map(|x| (1.0 - x * x).max(0.0).sqrt().max(1.0 / degree) / degree);
+            for order in &orders {
+                basis.derivatives(unit, order, &mut row);
+                let weight = (0..basis.axes).map(|k| scale[k].powi(order[k] as i32)).product();
+                let weight = if sound || order.iter().all(|&times| times == 0) { weight } else { 0.0 };
                 for (column, value) in row.iter().enumerate() {
                     rows[(weights.len(), column)] = weight * value;
                 }
@@ -219,13 +227,22 @@ impl Fit {
         let qr = rows.qr();
         let pivot = |k: usize| qr.R()[(k, k)].abs();
         let smallest = (0..basis.len()).map(pivot).fold(f64::INFINITY, f64::min);
-        (smallest > 1e-3 * pivot(0)).then_some(Self { basis: basis.clone(), rows, weights, qr })
+        (smallest > 1e-3 * pivot(0)).then_some(Self {
+            basis: basis.clone(),
+            rows,
+            weights,
+            per_point: orders.len(),
+            qr,
+        })
     }
 
     /// The expansions of the columns of `data`, ordered as said at [`Fit::new`].
     pub fn expand(&self, mut data: Mat<f64>) -> Vec<Fitted> {
         for (row, &weight) in self.weights.iter().enumerate() {
-            (0..data.ncols()).for_each(|column| data[(row, column)] *= weight);
+            for column in 0..data.ncols() {
+                // What is left out may be no number.
+                data[(row, column)] = if weight > 0.0 { weight * data[(row, column)] } else { 0.0 };
+            }
         }
         let coefficients = self.qr.solve_lstsq(&data);
         let last: Vec<Mat<f64>> = (self.basis.degree.saturating_sub(1)..=self.basis.degree)
@@ -233,11 +250,12 @@ impl Fit {
             .map(|range| self.rows.get(.., range.clone()) * coefficients.get(range, ..))
             .collect();
         let fitted = &self.rows * &coefficients;
-        let values = || (0..data.nrows()).step_by(1 + self.basis.axes);
+        let values = || (0..data.nrows()).step_by(self.per_point);
         (0..data.ncols())
             .map(|column| {
-                let misfit =
-                    values().map(|row| (fitted[(row, column)] - data[(row, column)]).abs()).fold(0.0, f64::max);
+                let misfit = (0..data.nrows())
+                    .map(|row| (fitted[(row, column)] - data[(row, column)]).abs())
+                    .fold(0.0, f64::max);
                 let size = |last: &Mat<f64>| values().map(|row| last[(row, column)].abs()).fold(0.0, f64::max);
                 let tail = last.iter().map(size).fold(0.0, f64::max);
                 let coefficients: Vec<f64> = (0..self.basis.len()).map(|row| coefficients[(row, column)]).collect();
@@ -270,19 +288,26 @@ mod tests {
     #[test]
     fn fits_in_three_variables() {
         let f = |x: [f64; 3]| (0.7 * x[0] - 0.3 * x[1]).exp() / (5.0 + x[0] * x[1] + x[2]);
-        let h = 1e-5;
-        let slope = |x: [f64; 3], k: usize| {
+        let h = 1e-4;
+        let slope = |f: &dyn Fn([f64; 3]) -> f64, x: [f64; 3], k: usize| {
             let (mut up, mut down) = (x, x);
             up[k] += h;
             down[k] -= h;
             (f(up) - f(down)) / (2.0 * h)
         };
         let basis = Basis::new(3, 8);
-        let units = spread(3, &[], 60);
-        let fit = Fit::new(&basis, &units, &[true; 60]).expect("the points determine it");
-        let data = Mat::from_fn(240, 1, |row, _| {
-            let unit = units[row / 4];
-            if row % 4 == 0 { f(unit) } else { slope(unit, row % 4 - 1) }
+        let units = spread(3, &[], 25);
+        let fit = Fit::new(&basis, &units, &[true; 25]).expect("the points determine it");
+        let orders = Basis::orders(3);
+        let data = Mat::from_fn(250, 1, |row, _| {
+            let (unit, order) = (units[row / 10], orders[row % 10]);
+            let axes: Vec<usize> = (0..3).flat_map(|k| std::iter::repeat_n(k, order[k])).collect();
+            match *axes {
+                [] => f(unit),
+                [a] => slope(&f, unit, a),
+                [a, b] => slope(&|x| slope(&f, x, a), unit, b),
+                _ => unreachable!("at most two"),
+            }
         });
         let fitted = fit.expand(data).remove(0);
         let mut values = vec![];

@@ -26,25 +26,56 @@ pub fn symmetric_functions(z: &[c64]) -> Vec<c64> {
 
 /// The slopes of [`symmetric_functions`] where the roots `z` have slopes `dz`.
 pub fn symmetric_slopes(z: &[c64], dz: &[c64]) -> Vec<c64> {
-    let mean = |z: &[c64]| z.iter().sum::<c64>() / z.len() as f64;
-    let (centre, drift) = (mean(z), mean(dz));
     let mut slopes = vec![c64::ZERO; z.len()];
-    slopes[0] = drift;
-    for (i, &dz) in dz.iter().enumerate() {
-        // The product of all other factors, w^(k-1) first.
-        let mut others = vec![c64::new(1.0, 0.0)];
-        for (_, &root) in z.iter().enumerate().filter(|&(j, _)| j != i) {
-            others.push(c64::ZERO);
-            for k in (1..others.len()).rev() {
-                let below = others[k - 1];
-                others[k] -= (root - centre) * below;
+    slopes[0] = mean(dz);
+    add_first_order(&mut slopes, z, dz);
+    slopes
+}
+
+/// The curvatures of [`symmetric_functions`] along two axes, where the roots `z` have slopes `dza` and `dzb` along them and
+/// curvatures `ddz`.
+pub fn symmetric_curvatures(z: &[c64], dza: &[c64], dzb: &[c64], ddz: &[c64]) -> Vec<c64> {
+    let mut curvatures = vec![c64::ZERO; z.len()];
+    curvatures[0] = mean(ddz);
+    add_first_order(&mut curvatures, z, ddz);
+    // Two factors of the polynomial change at a time.
+    let (drift_a, drift_b) = (mean(dza), mean(dzb));
+    for (i, a) in dza.iter().enumerate() {
+        for (j, b) in dzb.iter().enumerate().filter(|&(j, _)| j != i) {
+            for (curvature, coefficient) in curvatures[1..].iter_mut().zip(product_without(z, &[i, j])) {
+                *curvature += (a - drift_a) * (b - drift_b) * coefficient;
             }
         }
-        for (slope, coefficient) in slopes[1..].iter_mut().zip(&others[1..]) {
-            *slope -= (dz - drift) * coefficient;
+    }
+    curvatures
+}
+
+fn mean(z: &[c64]) -> c64 {
+    z.iter().sum::<c64>() / z.len() as f64
+}
+
+/// The change of the polynomial's coefficients as far as it is linear in that of the roots, `dz`.
+fn add_first_order(coefficients: &mut [c64], z: &[c64], dz: &[c64]) {
+    let drift = mean(dz);
+    for (i, &dz) in dz.iter().enumerate() {
+        for (change, coefficient) in coefficients[1..].iter_mut().zip(&product_without(z, &[i])[1..]) {
+            *change -= (dz - drift) * coefficient;
         }
     }
-    slopes
+}
+
+/// The coefficients of the product of the factors `w - (z - c)` but for some, highest power first.
+fn product_without(z: &[c64], left_out: &[usize]) -> Vec<c64> {
+    let centre = mean(z);
+    let mut others = vec![c64::new(1.0, 0.0)];
+    for (_, &root) in z.iter().enumerate().filter(|(j, _)| !left_out.contains(j)) {
+        others.push(c64::ZERO);
+        for k in (1..others.len()).rev() {
+            let below = others[k - 1];
+            others[k] -= (root - centre) * below;
+        }
+    }
+    others
 }
 
 /// The roots of a cluster of `functions.len()` from its symmetric functions, and a bound of each one's error from

@@ -5,12 +5,13 @@ use faer::{Mat, c64};
 
 use super::build::Builder;
 use super::chebyshev::{Basis, Fit, Fitted};
-use super::cluster::{MAX_SIZE, symmetric_functions, symmetric_slopes};
+use super::cluster::{MAX_SIZE, symmetric_curvatures, symmetric_functions, symmetric_slopes};
+use super::derivatives::pairs;
 use super::samples::Sample;
 use super::{Channels, Cluster, Leaf, MAX_AXES};
 
 /// Bounds are this many times what was estimated or seen.
-const SAFETY: f64 = 4.0;
+const SAFETY: f64 = 6.0;
 /// Error of a charted share of the pad; where it is not reached the share is NaN.
 pub const SHARE_TOLERANCE: f64 = 1e-4;
 /// Distance of two roots, relative to their size, below which they count as merging.
@@ -42,6 +43,16 @@ impl Branches<'_> {
     /// Slopes along the unit coordinates.
     fn slope(&self, sample: usize, branch: usize, axis: usize) -> c64 {
         self.samples[sample].slopes[self.roots[sample][branch]][axis] * self.half[axis]
+    }
+
+    /// Curvatures along the unit coordinates of axes `a` and `b`, `a` up to `b`.
+    fn curvature(&self, sample: usize, branch: usize, [a, b]: [usize; 2]) -> c64 {
+        let along = self.samples[sample].curvatures[self.roots[sample][branch]][b * (b + 1) / 2 + a];
+        along * self.half[a] * self.half[b]
+    }
+
+    fn has_curvature(&self, sample: usize, branch: usize) -> bool {
+        self.samples[sample].has_curvature(self.roots[sample][branch])
     }
 
     fn condition(&self, sample: usize, branch: usize) -> f64 {
@@ -95,7 +106,8 @@ impl Builder<'_> {
         let parts = if branches.undamped { 1 } else { 2 };
         // An error of λ counts twice in λ².
         let tolerance = self.options.tolerance / parts as f64;
-        let mut data = Mat::zeros(count * (1 + axes), size * parts);
+        let per_point = Basis::orders(axes).len();
+        let mut data = Mat::zeros(count * per_point, size * parts);
         let (mut radius, mut scale, mut stray) = (0.0f64, f64::INFINITY, 0.0f64);
         let mut sound = vec![true; count];
         let mut allowed = vec![f64::INFINITY; size];
@@ -110,20 +122,22 @@ impl Builder<'_> {
                 condition = condition.max(branches.condition(node, members[0]));
             }
             allow(&z, functions[0], tolerance, &mut allowed);
-            for (k, function) in functions.iter().enumerate() {
-                data[(node * (1 + axes), k * parts)] = function.re;
-                if parts == 2 {
-                    data[(node * (1 + axes), k * parts + 1)] = function.im;
-                } else {
-                    stray = stray.max(function.im.abs() / function.norm().max(f64::MIN_POSITIVE));
-                }
+            if parts == 1 {
+                let imaginary = |function: &c64| function.im.abs() / function.norm().max(f64::MIN_POSITIVE);
+                stray = functions.iter().map(imaginary).fold(stray, f64::max);
             }
-            for axis in 0..axes {
-                let dz: Vec<c64> = members.iter().map(|&k| branches.slope(node, k, axis)).collect();
-                for (k, slope) in symmetric_slopes(&z, &dz).into_iter().enumerate() {
-                    data[(node * (1 + axes) + 1 + axis, k * parts)] = slope.re;
+            let along = |axis: usize| -> Vec<c64> { members.iter().map(|&k| branches.slope(node, k, axis)).collect() };
+            let slopes: Vec<Vec<c64>> = (0..axes).map(along).collect();
+            let curved = |pair: [usize; 2]| -> Vec<c64> {
+                let curvatures: Vec<c64> = members.iter().map(|&k| branches.curvature(node, k, pair)).collect();
+                symmetric_curvatures(&z, &slopes[pair[0]], &slopes[pair[1]], &curvatures)
+            };
+            let derived = slopes.iter().map(|dz| symmetric_slopes(&z, dz)).chain(pairs(axes).map(curved));
+            for (row, values) in std::iter::once(functions).chain(derived).enumerate() {
+                for (k, value) in values.into_iter().enumerate() {
+                    data[(node * per_point + row, k * parts)] = value.re;
                     if parts == 2 {
-                        data[(node * (1 + axes) + 1 + axis, k * parts + 1)] = slope.im;
+                        data[(node * per_point + row, k * parts + 1)] = value.im;
                     }
                 }
             }
@@ -178,15 +192,20 @@ impl Builder<'_> {
     ) -> Result<Leaf, usize> {
         let axes = self.chart.axes.len();
         let weight = if branches.undamped { 1.0 } else { 2.0 };
-        let mut rest = Mat::zeros(branches.samples.len() * (1 + axes), 2);
+        let per_point = Basis::orders(axes).len();
+        let mut rest = Mat::zeros(branches.samples.len() * per_point, 2);
         let mut largest = [0.0f64; 2];
         for (node, sample) in branches.samples.iter().enumerate() {
-            let row = node * (1 + axes);
+            let row = node * per_point;
             for k in 0..2 {
                 largest[k] = largest[k].max(sample.totals.powers[k].abs());
                 rest[(row, k)] = sample.totals.powers[k];
                 for axis in 0..axes {
                     rest[(row + 1 + axis, k)] = sample.total_slopes[axis][k] * branches.half[axis];
+                }
+                for (pair, [a, b]) in pairs(axes).enumerate() {
+                    let scale = branches.half[a] * branches.half[b];
+                    rest[(row + 1 + axes + pair, k)] = sample.total_curvatures[pair][k] * scale;
                 }
             }
             for &branch in settled.iter().flat_map(|(members, _)| members) {
@@ -198,12 +217,18 @@ impl Builder<'_> {
                     rest[(row + 1 + axis, 0)] -= weight * slope.re;
                     rest[(row + 1 + axis, 1)] -= weight * 2.0 * (z * slope).re;
                 }
+                for (pair, [a, b]) in pairs(axes).enumerate() {
+                    let curvature = branches.curvature(node, branch, [a, b]);
+                    let slopes = branches.slope(node, branch, a) * branches.slope(node, branch, b);
+                    rest[(row + 1 + axes + pair, 0)] -= weight * curvature.re;
+                    rest[(row + 1 + axes + pair, 1)] -= weight * 2.0 * (z * curvature + slopes).re;
+                }
             }
         }
         let sound: Vec<bool> = (0..branches.samples.len())
             .map(|node| {
                 let members = || settled.iter().flat_map(|(members, _)| members);
-                members().all(|&k| branches.condition(node, k) < 1e5)
+                members().all(|&k| branches.condition(node, k) < 1e5 && branches.has_curvature(node, k))
             })
             .collect();
         let Some(fit) = Fit::new(&self.chart.basis, &branches.units, &sound) else { return Err(0) };
@@ -212,7 +237,7 @@ impl Builder<'_> {
         for (k, fitted) in fit.expand(rest).into_iter().enumerate() {
             let floor = 64.0 * f64::EPSILON * largest[k] * self.sampler.model.dimension() as f64;
             remainder_errors[k] = SAFETY * fitted.missing + floor;
-            if remainder_errors[k] > 1e-6 * largest[k] + 2.0 * floor {
+            if remainder_errors[k].is_nan() || remainder_errors[k] > 1e-6 * largest[k] + 2.0 * floor {
                 return Err(fitted.worst_axis);
             }
             remainders.push(fitted.coefficients);
@@ -276,8 +301,9 @@ impl Builder<'_> {
             usize::MAX => f64::NAN,
             branch => branches.samples[node].spectrum.roots[branches.roots[node][branch]].pad_participation,
         };
-        let data = Mat::from_fn(points * (1 + axes), settled.len(), |row, k| {
-            if row % (1 + axes) == 0 { share(row / (1 + axes), k) } else { 0.0 }
+        let per_point = Basis::orders(axes).len();
+        let data = Mat::from_fn(points * per_point, settled.len(), |row, k| {
+            if row % per_point == 0 { share(row / per_point, k) } else { 0.0 }
         });
         // NaN is no share.
         let converged = |fitted: &Fitted| SAFETY * fitted.missing <= SHARE_TOLERANCE;

@@ -10,6 +10,7 @@ pub mod build;
 mod channels;
 pub(super) mod chebyshev;
 mod cluster;
+mod derivatives;
 pub mod hold_out;
 mod leaf;
 mod samples;

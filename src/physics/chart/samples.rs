@@ -1,7 +1,8 @@
-//! Solved points of a box: roots, their slopes along the axes, and which root is which from point to point.
+//! Solved points of a box: roots, their slopes and curvatures along the axes, and which root is which from point to point.
 
 use faer::{Mat, c64};
 
+use super::derivatives::{Change, Derivatives, PAIRS, pairs};
 use super::{Axis, MAX_AXES};
 use crate::physics::model::{Exact, Model, Traces};
 use crate::physics::operating_point::OperatingPoint;
@@ -9,10 +10,13 @@ use crate::physics::solver::{ROUNDING, Solver};
 use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
 use crate::physics::tracking::{continue_roots, tracked};
 
-/// Condition of a root above which its slope has lost too many digits.
+/// Condition of a root above which its slope has lost too many digits, and its curvature as well.
 const SOUND_CONDITION: f64 = 2e3;
 /// Step of a central difference of the laws, in the coordinate of an axis: truncation and rounding are both near 1e-11.
 const STEP: f64 = 1e-5;
+/// Step of a second difference, as a share of half the box: rounding is near 1e-10 of a law, and a curvature weighs less than
+/// a hundredth of a value.
+const WIDE_STEP: f64 = 1e-3;
 
 /// A solved point.
 pub struct Sample {
@@ -22,21 +26,28 @@ pub struct Sample {
     pub spectrum: Spectrum,
     /// Each tracked root: `λ²` of an undamped model, `λ` of a damped one.
     pub z: Vec<c64>,
-    /// Their slopes along each axis.
+    /// Their slopes along each axis, and their curvatures.
     pub slopes: Vec<[c64; MAX_AXES]>,
+    pub curvatures: Vec<[c64; PAIRS]>,
     /// Their condition numbers.
     pub conditions: Vec<f64>,
-    /// The sums of first and second powers of all roots and what else is known exactly; the slopes of the sums.
+    /// The sums of first and second powers of all roots and what else is known exactly; the slopes and curvatures of the sums.
     pub totals: Exact,
     pub total_slopes: [[f64; 2]; MAX_AXES],
+    pub total_curvatures: [[f64; 2]; PAIRS],
     /// What rounding can do to a well-conditioned root.
     pub rounding: f64,
 }
 
 impl Sample {
-    /// Whether the slope of root `k` can be used.
+    /// Whether the slope of root `k` can be used, and its curvature.
     pub fn is_sound(&self, k: usize) -> bool {
-        self.conditions[k] <= SOUND_CONDITION
+        self.conditions[k] <= SOUND_CONDITION && self.has_curvature(k)
+    }
+
+    /// Whether root `k` has a curvature: not where a law ends, or a multiple root lacks a vector.
+    pub fn has_curvature(&self, k: usize) -> bool {
+        self.curvatures[k].iter().all(|curvature| curvature.is_finite())
     }
 }
 
@@ -71,32 +82,25 @@ impl Sampler<'_> {
         let mut spectrum = solver.solve(self.model, &point, Vectors::Both)?;
         let left = std::mem::replace(&mut spectrum.left, Mat::new());
         let count = tracked(&spectrum);
-        let shapes = spectrum.shapes.get(.., ..count);
-        let (re, im) =
-            (Mat::from_fn(n, count, |i, j| shapes[(i, j)].re), Mat::from_fn(n, count, |i, j| shapes[(i, j)].im));
         let value = |k: usize| if spectrum.undamped { spectrum.roots[k].square } else { spectrum.roots[k].lambda };
         let z: Vec<c64> = (0..count).map(value).collect();
-        let mut slopes = vec![[c64::ZERO; MAX_AXES]; count];
+        let axes = self.axes.len();
+        let first = (0..axes).map(|axis| self.change(&[self.difference(x, axis)])).collect::<Result<Vec<_>, _>>()?;
+        let second =
+            pairs(axes).map(|pair| self.change(&self.second_difference(x, pair))).collect::<Result<Vec<_>, _>>()?;
+        let Derivatives { slopes, curvatures } = Derivatives::new(&spectrum, left.as_ref(), &first, &second);
+        let total = |p: &OperatingPoint| self.traces.at(self.model, p).powers;
         let mut total_slopes = [[0.0; 2]; MAX_AXES];
-        let (mut stiffness, mut damping) = (Mat::zeros(n, n), Mat::zeros(n, n));
-        for axis in 0..self.axes.len() {
-            let (mut below, mut above) = (*x, *x);
-            below[axis] = (x[axis] - STEP).max(self.low[axis]);
-            above[axis] = (x[axis] + STEP).min(self.high[axis]);
-            let per = 1.0 / (above[axis] - below[axis]);
-            let (below, above) = (self.point(&below), self.point(&above));
-            let changes = self.model.assemble_difference(&below, &above, per, &mut stiffness, &mut damping)?;
-            let (before, after) = (self.traces.at(self.model, &below), self.traces.at(self.model, &above));
-            total_slopes[axis] = [0, 1].map(|k| (after.powers[k] - before.powers[k]) * per);
-            for (matrix, is_damping) in [(&stiffness, false), (&damping, true)] {
-                if !changes[usize::from(is_damping)] {
-                    continue;
-                }
-                let (re, im) = (matrix * &re, matrix * &im);
-                for (k, slopes) in slopes.iter_mut().enumerate() {
-                    let along: c64 = (0..n).map(|i| left[(i, k)].conj() * c64::new(re[(i, k)], im[(i, k)])).sum();
-                    slopes[axis] -= if is_damping { z[k] * along } else { along };
-                }
+        for (axis, slope) in total_slopes[..axes].iter_mut().enumerate() {
+            let Difference { below, above, per } = self.difference(x, axis);
+            let (below, above) = (total(&below), total(&above));
+            *slope = std::array::from_fn(|k| (above[k] - below[k]) * per);
+        }
+        let mut total_curvatures = [[0.0; 2]; PAIRS];
+        for (curvature, pair) in total_curvatures.iter_mut().zip(pairs(axes)) {
+            for Difference { below, above, per } in self.second_difference(x, pair) {
+                let (below, above) = (total(&below), total(&above));
+                (0..2).for_each(|k| curvature[k] += (above[k] - below[k]) * per);
             }
         }
         let conditions = (0..count)
@@ -109,12 +113,61 @@ impl Sampler<'_> {
             at: *x,
             z,
             slopes,
+            curvatures,
             conditions,
             totals: self.traces.at(self.model, &point),
             total_slopes,
+            total_curvatures,
             rounding: ROUNDING * f64::EPSILON * spectrum.matrix_norm,
             spectrum,
         })
+    }
+
+    /// The sum of some differences of the stiffness and of the damping, where there is one.
+    fn change(&self, differences: &[Difference]) -> Result<Change, SolveError> {
+        let n = self.model.dimension();
+        let mut sums: Change = [None, None];
+        let [mut stiffness, mut damping] = [Mat::zeros(n, n), Mat::zeros(n, n)];
+        for Difference { below, above, per } in differences {
+            let changes = self.model.assemble_difference(below, above, *per, &mut stiffness, &mut damping)?;
+            let parts = sums.iter_mut().zip([&stiffness, &damping]).zip(changes);
+            for ((sum, part), _) in parts.filter(|(_, changes)| *changes) {
+                *sum = Some(sum.take().map_or_else(|| part.clone(), |sum| sum + part));
+            }
+        }
+        Ok(sums)
+    }
+
+    /// The central difference along an axis at `x`, within the box.
+    fn difference(&self, x: &[f64; MAX_AXES], axis: usize) -> Difference {
+        let (mut below, mut above) = (*x, *x);
+        below[axis] = (x[axis] - STEP).max(self.low[axis]);
+        above[axis] = (x[axis] + STEP).min(self.high[axis]);
+        let per = 1.0 / (above[axis] - below[axis]);
+        Difference { below: self.point(&below), above: self.point(&above), per }
+    }
+
+    /// The differences whose sum is the second derivative along axes `a` and `b` at `x`. Laws go on a little beyond an end in
+    /// friction and load; where the speed is an end the derivative is taken beside it.
+    fn second_difference(&self, x: &[f64; MAX_AXES], [a, b]: [usize; 2]) -> [Difference; 2] {
+        let step = |k: usize| 0.5 * WIDE_STEP * (self.high[k] - self.low[k]);
+        let mut centre = *x;
+        for k in [a, b].into_iter().filter(|&k| matches!(self.axes[k], Axis::Speed | Axis::LoadOverSpeed)) {
+            centre[k] = x[k].clamp(self.low[k] + step(k), self.high[k] - step(k));
+        }
+        let at = |along_a: f64, along_b: f64| {
+            let mut x = centre;
+            x[a] += along_a * step(a);
+            x[b] += along_b * step(b);
+            self.point(&x)
+        };
+        let per = 1.0 / (step(a) * step(b));
+        let upper_and_lower = if a == b {
+            [(at(0.0, 0.0), at(1.0, 0.0), per), (at(-1.0, 0.0), at(0.0, 0.0), -per)]
+        } else {
+            [(at(-1.0, 1.0), at(1.0, 1.0), 0.25 * per), (at(-1.0, -1.0), at(1.0, -1.0), -0.25 * per)]
+        };
+        upper_and_lower.map(|(below, above, per)| Difference { below, above, per })
     }
 
     /// Solves at all of `points`, spread over `solvers`, in their order.
@@ -144,6 +197,13 @@ impl Sampler<'_> {
             Ok(all)
         })
     }
+}
+
+/// `(f(above) - f(below)) per`.
+struct Difference {
+    below: OperatingPoint,
+    above: OperatingPoint,
+    per: f64,
 }
 
 /// `count` points of `[-1, 1]^axes`, far from each other and from `taken` in the angles `θ`, `x = cos θ`: there the points
@@ -214,4 +274,56 @@ pub fn follow(samples: &[&Sample], units: &[[f64; MAX_AXES]], start: usize) -> O
         }
     }
     known.into_iter().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::physics::model::ContactLaw;
+    use crate::physics::synthetic::{Synthetic, rig};
+
+    /// Central differences of slopes, of step h = 1e-4: of the order of h² and of rounding, 1e-11 / h, in what a root moves by.
+    #[test]
+    fn curvatures_are_those_of_differences_of_slopes() {
+        for (damping_ratio, axes) in
+            [(0.0, vec![Axis::Friction, Axis::Load]), (5e-3, vec![Axis::Friction, Axis::Load, Axis::Speed])]
+        {
+            let contact_law = ContactLaw { exponent: 0.3, ..Default::default() };
+            let model = rig(&Synthetic { modes: 12, pairs: 12, damping_ratio, contact_law, seed: 2 }).unwrap();
+            let base = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.3 };
+            let (low, high) = ([0.0, 4.0, -1.0], [1.0, 7.0, -0.02]);
+            let sampler = Sampler { model: &model, traces: Traces::new(&model), axes: axes.clone(), low, high, base };
+            let mut solver = Solver::new(12);
+            let mut solve = |x: [f64; MAX_AXES]| sampler.solve(&mut solver, &x).expect("it solves");
+            for x in [[0.3, 5.5, -0.1], [0.01, 6.9, -0.5]] {
+                let here = solve(x);
+                let mut compared = 0;
+                for (pair, [a, b]) in pairs(axes.len()).enumerate() {
+                    let h = 1e-4;
+                    let [below, above] = [-h, h].map(|h| {
+                        let mut beside = x;
+                        beside[b] += h;
+                        solve(beside)
+                    });
+                    let off = |z: c64, other: c64| (z - other).norm();
+                    for (k, &z) in here.z.iter().enumerate().filter(|&(k, _)| here.conditions[k] < 100.0) {
+                        let beside = |sample: &Sample| {
+                            let nearest = (0..sample.z.len())
+                                .min_by(|&i, &j| off(sample.z[i], z).total_cmp(&off(sample.z[j], z)));
+                            sample.slopes[nearest.expect("there are roots")][a]
+                        };
+                        let difference = (beside(&above) - beside(&below)) / (2.0 * h);
+                        let found = here.curvatures[k][pair];
+                        let limit = 1e-4 * (found.norm() + here.slopes[k][a].norm() + 1e-3 * z.norm());
+                        assert!(
+                            off(found, difference) < limit,
+                            "root {k} at {x:?}, axes {a} {b}: {found} is not {difference}"
+                        );
+                        compared += 1;
+                    }
+                }
+                assert!(compared >= 10, "{compared} compared at {x:?}");
+            }
+        }
+    }
 }

@@ -5,7 +5,7 @@ use super::cluster::MAX_SIZE;
 use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
 /// Changes whenever the words, or what a build makes of a model, mean something else than before.
-pub const FORMAT: u64 = 4;
+pub const FORMAT: u64 = 5;
 
 const AXES: [Axis; 4] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed];
 
