@@ -21,6 +21,8 @@ const PER_DECADE: usize = 10;
 const SENSITIVITY_STEP: f64 = 0.01;
 /// Width of the last bracket of the minimiser, decades: a smooth minimum is found to half of the digits anyway.
 const BRACKET: f64 = 1e-9;
+/// To what part of their distance from the minimiser the ends of the range are found.
+const RANGE_PRECISION: f64 = 0.01;
 /// `(3 - sqrt 5) / 2`.
 const GOLDEN: f64 = 0.381_966_011_250_105_1;
 
@@ -124,7 +126,7 @@ pub fn identify<E>(
     let mut crossing = |beyond: Option<usize>| -> Result<Option<f64>, IdentificationError<E>> {
         let Some(beyond) = beyond else { return Ok(None) };
         let (mut inside, mut outside) = (at, exponent(beyond));
-        while (outside - inside).abs() > 1e-4 {
+        while (outside - inside).abs() > (RANGE_PRECISION * (inside - at).abs()).max(BRACKET) {
             let middle = 0.5 * (inside + outside);
             if trial(middle)?.rms_error > limit { outside = middle } else { inside = middle }
         }
