@@ -103,7 +103,7 @@ fn the_stiffness_of_a_full_model_is_found_on_a_rig_with_residuals() {
     assert!(error < 7.13e-4, "{error:e}");
     let off = (number(&found, "stiffness_factor") / FACTOR).ln().abs();
     assert!(off < 1.1 * error / sensitivity, "{off:e}, {error:e} / {sensitivity}");
-    // Where the error doubles: what no stiffness removes is small, and the fit quadratic. Ends are found to 1 %, and the
+    // Where the error doubles: what no stiffness removes is small, and the fit quadratic. Ends are found to 0.1 %, and the
     // sensitivity is the full model's, above, within 5 %.
     let [from, to] = ["factor_from", "factor_to"].map(|key| number(&found, key));
     let expected = 2.0 * 3.0_f64.sqrt() * number(&found, "rms_error") / sensitivity;

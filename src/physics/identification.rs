@@ -22,7 +22,7 @@ const SENSITIVITY_STEP: f64 = 0.01;
 /// Width of the last bracket of the minimiser, decades: a smooth minimum is found to half of the digits anyway.
 const BRACKET: f64 = 1e-9;
 /// To what part of their distance from the minimiser the ends of the range are found.
-const RANGE_PRECISION: f64 = 0.01;
+const RANGE_PRECISION: f64 = 1e-3;
 /// `(3 - sqrt 5) / 2`.
 const GOLDEN: f64 = 0.381_966_011_250_105_1;
 
