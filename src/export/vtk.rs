@@ -1,44 +1,53 @@
-//! Meshes to look at: legacy VTK files, which ParaView, PyVista and VisIt open.
-//!
-//! Source: "VTK file formats", The VTK User's Guide (Kitware 2010), simple legacy formats.
+//! Meshes to look at: legacy VTK files, binary, which ParaView, PyVista and VisIt open.
 
 use std::io::{self, Write};
 
-use crate::fem::Mesh;
+use vtkio::model::{
+    Attribute, Attributes, ByteOrder, CellType, Cells, DataArray, DataSet, UnstructuredGridPiece, Version,
+    VertexNumbers, Vtk,
+};
 
-/// `VTK_HEXAHEDRON`, whose corners come in the order of [`crate::fem::Brick`].
-const HEXAHEDRON: &str = "12";
+use crate::fem::Mesh;
 
 /// Writes meshes as one unstructured grid with the number of each brick's component, counted on from mesh to mesh.
 ///
 /// # Errors
-/// What the writer reports.
+/// What the writer reports, and meshes with more nodes than the format can count.
 pub fn write_mesh(meshes: &[&Mesh], title: &str, out: &mut impl Write) -> io::Result<()> {
-    let nodes: usize = meshes.iter().map(|mesh| mesh.nodes_m.len()).sum();
+    let points: Vec<f64> = meshes.iter().flat_map(|mesh| mesh.nodes_m.as_flattened()).copied().collect();
     let bricks: usize = meshes.iter().map(|mesh| mesh.bricks.len()).sum();
-    writeln!(out, "# vtk DataFile Version 3.0\n{title}\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS {nodes} double")?;
-    for [x, y, z] in meshes.iter().flat_map(|mesh| &mesh.nodes_m) {
-        writeln!(out, "{x:e} {y:e} {z:e}")?;
-    }
-    writeln!(out, "CELLS {bricks} {}", 9 * bricks)?;
-    let mut first = 0;
+    let count = |count: usize| u32::try_from(count).map_err(io::Error::other);
+    let (mut vertices, mut components) = (vec![], vec![]);
+    let (mut first_node, mut first_component) = (0, 0);
     for mesh in meshes {
         for brick in &mesh.bricks {
-            writeln!(out, "8 {}", brick.nodes.map(|node| (first + node).to_string()).join(" "))?;
+            // The corners of a hexahedron come in the order of a brick's.
+            vertices.push(8);
+            for node in brick.nodes {
+                vertices.push(count(first_node + node)?);
+            }
+            components.push(count(first_component + brick.component)?);
         }
-        first += mesh.nodes_m.len();
+        first_node += mesh.nodes_m.len();
+        first_component += mesh.components.len();
     }
-    writeln!(out, "CELL_TYPES {bricks}")?;
-    for _ in 0..bricks {
-        writeln!(out, "{HEXAHEDRON}")?;
-    }
-    writeln!(out, "CELL_DATA {bricks}\nSCALARS component int 1\nLOOKUP_TABLE default")?;
-    let mut first = 0;
-    for mesh in meshes {
-        for brick in &mesh.bricks {
-            writeln!(out, "{}", first + brick.component)?;
-        }
-        first += mesh.components.len();
-    }
-    Ok(())
+    let grid = UnstructuredGridPiece {
+        points: points.into(),
+        cells: Cells {
+            cell_verts: VertexNumbers::Legacy { num_cells: count(bricks)?, vertices },
+            types: vec![CellType::Hexahedron; bricks],
+        },
+        data: Attributes {
+            cell: vec![Attribute::DataArray(DataArray::scalars("component", 1).with_data(components))],
+            ..Attributes::default()
+        },
+    };
+    let file = Vtk {
+        version: Version::new_legacy(3, 0),
+        title: title.to_owned(),
+        byte_order: ByteOrder::BigEndian,
+        data: DataSet::inline(grid),
+        file_path: None,
+    };
+    file.write_legacy(out).map_err(io::Error::other)
 }
