@@ -15,7 +15,8 @@
 //! that the first frequencies agree (upper part 331.44 Hz, lower part 1300.6 Hz, whole at rest 510.91 Hz). They are
 //! within 1 % at the default size, one layer of bricks through the disc; finer meshes are softer, the disc most of all,
 //! which bricks in layers let shear between the faces that hold it: 333.8, 1305.3 and 510.1 Hz with 22 032 degrees of
-//! freedom, 332.1, 1295.6 and 505.5 Hz with 101 908, 331.1, 1275.6 and 503.4 Hz with 220 285. It is a model of that kind, not its mesh, which cannot be known: it is said to have 904 968 degrees of freedom in 121 864 eight-node
+//! freedom, 332.1, 1295.6 and 505.5 Hz with 101 908, 331.1, 1275.6 and 503.4 Hz with 220 285. It is a model of that
+//! kind, not its mesh, which cannot be known: it is said to have 904 968 degrees of freedom in 121 864 eight-node
 //! bricks, more than such bricks can have. `y` points up, `y = 0` is the disc's upper face and the disc turns about the
 //! `y` axis; the pad lies around `x = ` [`MEAN_RADIUS_M`].
 //!
