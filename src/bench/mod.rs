@@ -13,7 +13,7 @@ use faer::{Mat, c64};
 use serde::Serialize;
 
 use crate::physics::chart::Scratch;
-use crate::physics::chart::build::{ChartError, ChartOptions, build};
+use crate::physics::chart::build::{ChartError, ChartOptions, Progress, resume};
 use crate::physics::chart::hold_out::hold_out;
 use crate::physics::reference::{self, Refined};
 use crate::physics::synthetic::{Synthetic, Uniform, rig};
@@ -49,7 +49,7 @@ pub struct Plan {
     pub seed: u64,
     pub band_max_hz: f64,
     pub tolerance: f64,
-    /// A chart that takes longer is given up.
+    /// What a chart does not hold by then stays without one.
     pub chart_limit: Duration,
     pub threads: usize,
 }
@@ -89,12 +89,12 @@ pub struct Offline {
     pub decoupled_modes: usize,
     pub map_s: f64,
     pub chart_s: f64,
-    /// False where the chart took longer than it was given.
-    pub chart_built: bool,
+    /// False where the chart would have taken longer than it was given.
+    pub chart_complete: bool,
     pub chart_solves: usize,
     pub chart_leaves: usize,
     pub chart_bytes: usize,
-    /// Share of the box that did not converge and is solved densely.
+    /// Share of the box that did not converge, or was not come to, and is solved densely.
     pub chart_dense_share: f64,
     /// Dense solves that the chart made unnecessary, of as many conditions.
     pub dense_solves_skipped: usize,
@@ -102,7 +102,7 @@ pub struct Offline {
     /// Merging pairs among what was compared, and roots that the reference did not find.
     pub pairs_compared: usize,
     pub not_refined: usize,
-    /// None where it was not asked for or there is no chart.
+    /// None where it was not asked for.
     pub held_out: Option<HeldOut>,
 }
 
@@ -292,21 +292,20 @@ pub fn measure(
     let options = chart_options(plan);
     let chart = chart(&model, plan, &options, say)?;
     let chart_s = begun.elapsed().as_secs_f64();
-    let held_out = match &chart {
-        Some(chart) if plan.held_out > 0 => {
-            say("held-out conditions");
-            let found = hold_out(&model, &options, chart, plan.held_out, plan.seed.wrapping_add(3000))?;
-            Some(HeldOut {
-                charted: found.charted,
-                not_converged: found.not_converged,
-                incomplete: found.incomplete,
-                bounds_broken: found.violations,
-                largest_share: found.largest_share,
-                largest_error: found.largest_error,
-                largest_pair_mean_error: found.largest_mean_error,
-            })
-        }
-        _ => None,
+    let held_out = if plan.held_out == 0 {
+        None
+    } else {
+        say("held-out conditions");
+        let found = hold_out(&model, &options, &chart, plan.held_out, plan.seed.wrapping_add(3000))?;
+        Some(HeldOut {
+            charted: found.charted,
+            not_converged: found.not_converged,
+            incomplete: found.incomplete,
+            bounds_broken: found.violations,
+            largest_share: found.largest_share,
+            largest_error: found.largest_error,
+            largest_pair_mean_error: found.largest_mean_error,
+        })
     };
 
     let mut samples: [Samples; 6] = Default::default();
@@ -321,11 +320,9 @@ pub fn measure(
         let values = solver.solve(&model, p, Vectors::None)?;
         let spectrum = solver.solve(&model, p, Vectors::Both).with_context(|| format!("{p:?}"))?;
         charted.clear();
-        let on_chart = chart
-            .as_ref()
-            .is_some_and(|chart| chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted).is_ok());
+        let on_chart = chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted).is_ok();
         bare.clear();
-        if let Some(chart) = chart.as_ref().filter(|_| on_chart) {
+        if on_chart {
             chart.values(p, &mut scratch, &mut bare)?;
         }
         let theirs = lapack.as_deref_mut().map(|peer| peer.solve(solver.matrix(&spectrum), false)).transpose()?;
@@ -369,7 +366,7 @@ pub fn measure(
                 time(4 + route, peer.solve(solver.matrix(&spectrum), route == 1)?.0);
             }
         }
-        if let Some(chart) = chart.as_ref().filter(|_| on_chart) {
+        if on_chart {
             // Once unseen: the dense solves before have emptied the caches, which charts in a row would not find so.
             bare.clear();
             chart.values(p, &mut scratch, &mut bare)?;
@@ -406,11 +403,11 @@ pub fn measure(
         decoupled_modes: model.decoupled_count(),
         map_s,
         chart_s,
-        chart_built: chart.is_some(),
-        chart_solves: chart.as_ref().map_or(0, Chart::solve_count),
-        chart_leaves: chart.as_ref().map_or(0, Chart::leaf_count),
-        chart_bytes: chart.as_ref().map_or(0, Chart::size_bytes),
-        chart_dense_share: chart.as_ref().map_or(1.0, Chart::dense_share),
+        chart_complete: chart.is_complete(),
+        chart_solves: chart.solve_count(),
+        chart_leaves: chart.leaf_count(),
+        chart_bytes: chart.size_bytes(),
+        chart_dense_share: chart.dense_share(),
         dense_solves_skipped: skipped,
         conditions: points.len(),
         pairs_compared,
@@ -438,17 +435,21 @@ fn chart_options(plan: &Plan) -> ChartOptions {
     }
 }
 
-/// The chart of that box; none where it takes too long.
-fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str)) -> anyhow::Result<Option<Chart>> {
+/// The chart of that box, as far as it comes in its time.
+fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str)) -> anyhow::Result<Chart> {
     let begun = Instant::now();
-    let go_on = |done: f64| {
-        say(&format!("chart {:.0} %", 100.0 * done.max(0.0)));
-        begun.elapsed() < plan.chart_limit
+    let mut so_far = None;
+    let mut go_on = |progress: &Progress<'_>| {
+        say(&format!("chart {:.0} %", 100.0 * progress.share));
+        let in_time = begun.elapsed() < plan.chart_limit;
+        if !in_time {
+            so_far = Some(progress.chart.clone());
+        }
+        in_time
     };
-    match build(model, options, &go_on) {
-        Ok(chart) => Ok(Some(chart)),
-        Err(ChartError::Stopped) => Ok(None),
-        Err(error) => Err(error.into()),
+    match (resume(model, options, None, &mut go_on), so_far) {
+        (Ok(chart), _) | (Err(ChartError::Stopped), Some(chart)) => Ok(chart),
+        (Err(error), _) => Err(error.into()),
     }
 }
 
