@@ -1,5 +1,11 @@
 //! Predicts friction-induced instability of a pad-on-disc tribometer from its operating conditions.
 
+/// A line on standard error; that nobody is there to read it is no error.
+#[cfg(feature = "node")]
+macro_rules! note {
+    ($($text:tt)*) => { drop(std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("{}\n", format_args!($($text)*)))) };
+}
+
 #[cfg(feature = "node")]
 mod ahead;
 #[cfg(feature = "node")]

@@ -140,7 +140,7 @@ pub fn chart_options(rig: &Rig) -> ChartOptions {
     }
 }
 
-/// Dense solves that the chart of a model of `dimension` coordinates may take: a quarter of an hour of one core, but for
+/// Dense solves that the chart of a model of `dimension` coordinates may take: twenty minutes of one core, but for
 /// large models enough for one axis.
 fn max_solves(dimension: usize) -> usize {
     let size = dimension.max(20) as f64 / 160.0;

@@ -103,7 +103,7 @@ impl Options {
             offline: vec![],
         };
         for &modes in &self.modes {
-            let say = |what: &str| eprintln!("n = {modes}: {what}");
+            let say = |what: &str| note!("n = {modes}: {what}");
             let (routes, offline) = measure(usize::from(modes), &plan, lapack.as_mut(), &say)?;
             report.routes.extend(routes);
             report.offline.push(offline);

@@ -95,11 +95,11 @@ pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> Option<Server
     let first = addresses.first()?;
     match Server::start(addresses, source) {
         Ok(server) => {
-            eprintln!("display: http://{}/", server.address());
+            note!("display: http://{}/", server.address());
             Some(server)
         }
         Err(error) => {
-            eprintln!("warning: no display on {first}: {error}; another one with --display 127.0.0.1:PORT");
+            note!("warning: no display on {first}: {error}; another one with --display 127.0.0.1:PORT");
             None
         }
     }

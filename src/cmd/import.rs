@@ -54,12 +54,12 @@ impl Options {
             ..Default::default()
         };
         let imported = import(&self.session, &self.output, &ImportOptions { log, overwrite: self.overwrite })?;
-        eprintln!("{}: {} operating points", imported.path.display(), imported.messages);
+        note!("{}: {} operating points", imported.path.display(), imported.messages);
         if imported.log.skipped == 0 {
             return Ok(Outcome::Done);
         }
         let first = imported.log.first_skipped.map(|error| format!(", the first: {error}")).unwrap_or_default();
-        eprintln!("{} lines left out{first}", imported.log.skipped);
+        note!("{} lines left out{first}", imported.log.skipped);
         Ok(Outcome::Differences)
     }
 }

@@ -1,10 +1,5 @@
 //! The commands, one file each; exit codes and output in one place.
 
-/// A line on standard error; that nobody is there to read it is no error.
-macro_rules! note {
-    ($($text:tt)*) => { drop(std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("{}\n", format_args!($($text)*)))) };
-}
-
 mod bench;
 mod buses;
 mod check;

@@ -19,7 +19,7 @@ impl Options {
             print(&format!("{}\n", describe(recovery)))?;
         }
         for error in &report.errors {
-            eprintln!("not recovered: {error}");
+            note!("not recovered: {error}");
         }
         anyhow::ensure!(report.errors.is_empty(), "{} files could not be recovered", report.errors.len());
         Ok(if report.loses_data() { Outcome::Differences } else { Outcome::Done })

@@ -59,7 +59,7 @@ impl Options {
     pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
         let recording = Recording::open(&self.file)?;
         for damage in recording.damage() {
-            eprintln!("damaged: {damage}");
+            note!("damaged: {damage}");
         }
         if self.verify { self.verify(&recording) } else { self.play(&recording, ros_args) }
     }
@@ -88,7 +88,7 @@ impl Options {
         let done = self.play_rounds(recording, first.log_time_ns, &player, &watch, &played, &stopped);
         shown.stop();
         done?;
-        eprintln!("played {} messages", played.load(Ordering::Relaxed));
+        note!("played {} messages", played.load(Ordering::Relaxed));
         Ok(Outcome::Done)
     }
 

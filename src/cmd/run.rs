@@ -84,7 +84,7 @@ pub fn serve(
     (sender, receiver): (Sender<Incoming>, Receiver<Incoming>),
 ) -> anyhow::Result<Outcome> {
     if let Some(known) = &rig.reduction {
-        eprintln!("{}", known.told());
+        note!("{}", known.told());
     }
     // Before the recording begins, so that it is finished whenever the signal comes.
     let stop = sender.clone();
@@ -121,7 +121,7 @@ pub fn serve(
             accepted: Box::new(move |name, value| {
                 // Not waited for: this is the thread that hears the bus.
                 if changes.try_send(Incoming::Parameter { name: name.to_owned(), value }).is_err() {
-                    eprintln!("parameter {name} = {value} came into a full queue and has no effect");
+                    note!("parameter {name} = {value} came into a full queue and has no effect");
                 }
             }),
         };
@@ -189,7 +189,7 @@ fn start_recorder(rig: &Rig, directory: &std::path::Path) -> anyhow::Result<Reco
         ..RecorderConfig::new(directory)
     };
     let recorder = Recorder::start(config)?;
-    eprintln!("recording into {}", recorder.status().directory.display());
+    note!("recording into {}", recorder.status().directory.display());
     Ok(recorder)
 }
 
@@ -197,15 +197,15 @@ fn finish(recorder: Recorder) -> anyhow::Result<Outcome> {
     let finished = recorder.finish(FINISH_WITHIN)?;
     let status = &finished.status;
     for recovered in &status.recovered {
-        eprintln!("recovered: {}", super::recover::describe(recovered));
+        note!("recovered: {}", super::recover::describe(recovered));
     }
     for problem in &status.unrecovered {
-        eprintln!("not recovered: {problem}");
+        note!("not recovered: {problem}");
     }
-    eprintln!("recorded {} messages into {}", status.messages_written, finished.directory.display());
+    note!("recorded {} messages into {}", status.messages_written, finished.directory.display());
     if status.dropped() > 0 {
         let why = status.last_error.as_deref().unwrap_or("the disk was too slow");
-        eprintln!("{} messages were not recorded: {why}", status.dropped());
+        note!("{} messages were not recorded: {why}", status.dropped());
         return Ok(Outcome::Differences);
     }
     Ok(Outcome::Done)

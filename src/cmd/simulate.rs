@@ -132,7 +132,7 @@ impl Options {
                 (time_s < duration_s).then(|| measuring.measure(seq, stamp_ns))
             });
             let written = offline::record(&rig, measured, directory)?;
-            eprintln!("{}", written.display());
+            note!("{}", written.display());
             return Ok(Outcome::Done);
         }
         self.publish(profile, period, ros_args)

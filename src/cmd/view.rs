@@ -39,7 +39,7 @@ pub fn read(file: &std::path::Path, rig: Option<&str>, criteria: Criteria) -> an
     };
     let recorded = Recorded::read(&recording, Arc::new(rig), criteria);
     for damage in recording.damage().iter().chain(&recorded.damage) {
-        eprintln!("damaged: {damage}");
+        note!("damaged: {damage}");
     }
     ensure!(!recorded.moments.is_empty(), "{}: holds no predictions", file.display());
     Ok((recording, recorded))

@@ -52,7 +52,7 @@ pub fn session_chart(rig: &Rig, threads: usize, go_on: &dyn Fn() -> bool) -> Res
 /// The chart a session uses, from where it is `kept`, or built on from what is; `go_on` stops the work by saying no.
 fn kept_chart(rig: &Rig, kept: &ChartFile, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
     let begun = kept.load().unwrap_or_else(|error| {
-        eprintln!("{error}: the rig is charted anew");
+        note!("{error}: the rig is charted anew");
         None
     });
     if let Some(chart) = begun.as_ref().filter(|chart| chart.is_complete()) {
@@ -61,7 +61,7 @@ fn kept_chart(rig: &Rig, kept: &ChartFile, go_on: &dyn Fn() -> bool) -> Result<C
     let mut saved = Instant::now();
     let save = |chart: &Chart| {
         if let Err(error) = kept.save(chart) {
-            eprintln!("the chart is not kept: {error}");
+            note!("the chart is not kept: {error}");
         }
     };
     let chart = resume(&rig.model, &chart_options(rig), begun, &mut |progress| {
