@@ -13,8 +13,8 @@ use crate::rig::Rig;
 
 /// Band where neither rig nor full model names one, Hz.
 pub const DEFAULT_BAND_HZ: f64 = 5000.0;
-/// Roots that decay faster are not compared, 1/s.
-const DECAY_PER_S: f64 = 20.0;
+/// Roots that decay faster are neither held nor compared, 1/s.
+pub const DECAY_PER_S: f64 = 20.0;
 
 /// How a reduced model differs from the full one: the table `[reduction]` of a rig file.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -35,6 +35,9 @@ pub struct Certificate {
     pub max_growth_error_per_s: f64,
     /// Largest `|Δλ| / |λ|`.
     pub max_relative_error: f64,
+    /// Loads and speeds at which windows of instability were compared.
+    #[serde(default)]
+    pub windows_compared_at: usize,
     /// Largest difference of an end of a window of instability; none where both models have no windows.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub critical_friction_error: Option<f64>,
@@ -55,9 +58,10 @@ impl Certificate {
 
     /// A line for people.
     pub fn told(&self) -> String {
-        let critical = match self.critical_friction_error {
-            Some(error) => format!(", critical friction {error:.1e}"),
-            None => String::new(),
+        let (critical, what) = match (self.windows_compared_at, self.critical_friction_error) {
+            (0, _) => (", windows of instability not compared".to_owned(), "unstable modes"),
+            (_, Some(error)) => (format!(", critical friction {error:.1e}"), "unstable modes or windows"),
+            (_, None) => (String::new(), "unstable modes or windows"),
         };
         let unpaired = match self.unpaired {
             0 => String::new(),
@@ -65,7 +69,7 @@ impl Certificate {
         };
         format!(
             "reduction  errors at {} held-out points up to {} Hz: frequency {:.1e} relative, growth rate {:.1e} 1/s{critical}; \
-             {} unstable modes or windows missed, {} invented{unpaired}",
+             {} {what} missed, {} invented{unpaired}",
             self.points,
             self.band_hz,
             self.max_frequency_error,
@@ -179,7 +183,9 @@ pub fn verify_against(
         windows: true,
     };
     let (mut windows, mut critical, mut missed, mut invented) = (vec![], None::<f64>, 0, 0);
-    for p in places(rig).into_iter().filter(|_| against.windows) {
+    let places = if against.windows { places(rig) } else { vec![] };
+    let windows_compared_at = places.len();
+    for p in places {
         let told = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
         let of_full =
             full_windows(&full.model, full_solver, &p, band_rad_s, &options, &mut |step| progress(&told, step))?;
@@ -212,6 +218,7 @@ pub fn verify_against(
         max_frequency_error: largest(|point| point.max_frequency_error),
         max_growth_error_per_s: largest(|point| point.max_growth_error_per_s),
         max_relative_error: largest(|point| point.max_relative_error),
+        windows_compared_at,
         critical_friction_error: critical,
         missed: missed + points.iter().map(|point| point.missed.len()).sum::<usize>(),
         invented: invented + points.iter().map(|point| point.invented.len()).sum::<usize>(),
@@ -239,21 +246,16 @@ fn held_out(rig: &Rig, against: &Against) -> Vec<OperatingPoint> {
         .collect()
 }
 
-/// Where windows are compared: at the reference, and at the ends of the rig's range of loads and speeds where they matter.
+/// Where windows are compared: at the reference, and at the corners of the rig's range of loads and speeds where they matter.
 fn places(rig: &Rig) -> Vec<OperatingPoint> {
     let mut places = vec![rig.reference];
     let (load, speed) = rig.model.depends_on_load_and_speed();
-    if load || speed {
-        for end in 0..2 {
-            let mut place = rig.reference;
-            if load {
-                place.normal_load_n = rig.chart.normal_load_n[end];
-            }
-            if speed {
-                place.disc_speed_rad_s = rig.chart.disc_speed_rad_s[end];
-            }
-            places.push(place);
+    let ends = |matters: bool, range: [f64; 2], reference: f64| if matters { range.to_vec() } else { vec![reference] };
+    for normal_load_n in ends(load, rig.chart.normal_load_n, rig.reference.normal_load_n) {
+        for disc_speed_rad_s in ends(speed, rig.chart.disc_speed_rad_s, rig.reference.disc_speed_rad_s) {
+            places.push(OperatingPoint { normal_load_n, disc_speed_rad_s, ..rig.reference });
         }
     }
+    places.dedup();
     places
 }

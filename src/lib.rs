@@ -22,6 +22,8 @@ pub mod fem;
 #[cfg(feature = "node")]
 pub mod full_model;
 #[cfg(feature = "node")]
+mod hex;
+#[cfg(feature = "node")]
 pub mod html;
 #[cfg(feature = "node")]
 pub mod io;

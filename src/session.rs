@@ -330,7 +330,8 @@ impl Session {
         point: OperatingPoint,
         map: Option<&StabilityMap>,
     ) -> Result<(), String> {
-        if !self.charted_at(&point) {
+        let charted = self.charted_at(&point);
+        if !charted {
             self.solved_at(&point, map)?;
         }
         let sliding = self.rig.model.contact_state(&point) == ContactState::Sliding;
@@ -340,13 +341,13 @@ impl Session {
         let margin = ends.filter(|_| searched).and_then(|ends| ends.margin(&point));
         self.prediction.reason.clear();
         let level = self.judge(margin.map(|margin| margin.value));
-        let notes = [
-            self.rig.model.contact_state(&point).note(),
+        let others = [
+            (sliding && !charted && self.chart.is_some()).then_some("not charted here: solved"),
             (sliding && map.is_none()).then_some("margin pending"),
             (sliding && !searched).then_some("friction coefficient beyond mu_max: no margin"),
         ];
-        let Self { prediction, summary, order, .. } = self;
-        for note in notes.into_iter().flatten() {
+        let Self { rig, prediction, summary, order, .. } = self;
+        for note in rig.notes(&point).chain(others.into_iter().flatten()) {
             if !prediction.reason.is_empty() {
                 prediction.reason.push_str("; ");
             }
@@ -712,6 +713,7 @@ mod tests {
         let (mut solved, mut charted) = (with_map(session()), with_map(session()));
         let chart = crate::physics::chart::build::build(&charted.rig.model, &chart_options(&charted.rig), &|_| true);
         charted.step(Event::ChartReady(Arc::new(chart.expect("the rig can be charted")))).unwrap();
+        let charted_to = charted.rig.mu_max;
         for seq in 0..400 {
             let mu = 0.005 * seq as f64 + 1e-4;
             let (a, b) = (predict(&mut solved, friction(seq, mu)), predict(&mut charted, friction(seq, mu)));
@@ -728,6 +730,10 @@ mod tests {
         assert_eq!((charted.counters().charted, charted.counters().solved), (400, 0));
         let backwards = predict(&mut charted, conditions(1000, 500.0, -13.0, 0.3));
         assert!(charted.counters().solved == 1 && backwards.modes.len() == 9, "the other direction is solved");
+        let beyond = predict(&mut charted, friction(1001, charted_to + 0.1));
+        for outside in [backwards, beyond] {
+            assert!(outside.reason.contains("not charted here: solved"), "{}", outside.reason);
+        }
     }
 
     #[test]

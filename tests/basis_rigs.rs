@@ -141,7 +141,11 @@ fn a_system_on_its_basis_has_the_roots_it_has() {
         // Not among the points that were held out: the tolerance is what was found at those, not a bound.
         assert!(found.errors.len() > 5 && found.worst() < 1e-6, "{p:?}: {} {:e}", found.errors.len(), found.worst());
     }
-    for (wrong, told) in [(["--range", "mu=1:0"], "ascending order"), (["--range", "load=0:5"], "more than 0")] {
+    for (wrong, told) in [
+        (["--range", "mu=1:0"], "ascending order"),
+        (["--range", "load=0:5"], "more than 0"),
+        (["--range", "mu=0.3:0.6"], "begins at 0.3"),
+    ] {
         run([&["reduce", &text(&full), "-o", &text(&at("no.toml"))], &wrong[..]].concat()).exits(1).complains(told);
     }
     run(["reduce", &text(&full), "--range", "rpm=1:2", "-o", &text(&at("no.toml"))]).exits(2).complains("none of mu");
@@ -193,6 +197,10 @@ fn a_rig_made_at_one_load_and_used_at_another_is_caught() {
     fs::write(&hertzian, written + "\n[load]\nexponent = 0.3333333333333333\nreference_n = 500.0\n").unwrap();
     let to = temp.path().join("at-500-n.toml");
     run(["reduce", &text(&hertzian), "--range", "mu=0:1,load=500", "--points", "0", "-o", &text(&to)]).exits(0);
+    // A prediction says so itself.
+    let beyond = "beyond the conditions that the basis was made for";
+    let predict = |load: &str| run(["predict", &text(&to), "--mu", "0.3", "--load", load]).exits(0).stdout;
+    assert!(predict("900").contains(beyond) && !predict("500").contains(beyond));
     let verify = |rig: &std::path::Path, code: i32| {
         // To the 1e-6 that the basis was made for.
         let options = ["--points", "2", "--no-windows", "--json"];

@@ -224,7 +224,7 @@ fn calculix_abaqus_and_matrix_market_give_the_same_modes() {
             assert!((found / expected - 1.0).abs() < 1e-10, "{name}: {found} {expected}");
         }
     }
-    // Our own bricks are others: their incompatible modes have no mass. Both are of second order in the mesh, so that they
+    // Our own bricks are others: their incompatible modes have mass. Both are of second order in the mesh, so that they
     // differ by no more than what the mesh itself leaves, which a finer one shows.
     let (ours, finer) = (modes(&text(&path)), modes(&text(&tribometer(&folder.join("finer"), 20_000))));
     for ((ours, theirs), finer) in ours.iter().zip(&expected).zip(&finer) {

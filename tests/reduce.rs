@@ -160,6 +160,12 @@ fn the_rig_file_names_archives_by_their_hash_and_hands_on_the_tables() {
     // Archives that the rig file named before, and no longer does, are gone; others stay.
     assert!(names(&rig).iter().all(|name| !folder.path().join(name).exists()), "{:?}", files_below(folder.path()));
     assert!(names(&below).iter().all(|name| folder.path().join(name).exists()) && Path::new(&path).exists());
+    // A copy of the rig file goes on naming its archives.
+    let copy = folder.path().join("copy.toml");
+    std::fs::copy(&to, &copy).unwrap();
+    run(["reduce", &path, "--modes", "12+9", "--points", "0", "-o", &text(&to)]).exits(0);
+    assert_ne!(std::fs::read(&to).unwrap(), std::fs::read(&copy).unwrap());
+    assert_eq!(names(&Rig::load(copy.to_str().unwrap()).unwrap()), names(&below));
     let omega: Vec<f64> = (0..2)
         .map(|side| {
             let phi = &below.shapes[side];

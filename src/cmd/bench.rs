@@ -15,7 +15,7 @@ use crate::plot;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Numbers of modes; 490 takes minutes more
-    #[arg(long, value_name = "N,N", value_delimiter = ',', default_value = "20,80,160", value_parser = clap::value_parser!(u16).range(4..=2000))]
+    #[arg(long, value_name = "N,N", value_delimiter = ',', default_value = "20,80,160,490", value_parser = clap::value_parser!(u16).range(4..=2000))]
     modes: Vec<u16>,
     /// What the rigs are like
     #[arg(long, value_enum, default_value = "undamped")]

@@ -12,9 +12,7 @@ fn conditions(rig: &Rig, point: &OperatingPoint) -> String {
         "{}: {normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}\n",
         rig.name
     );
-    if let Some(note) = rig.model.contact_state(point).note() {
-        text += &format!("{note}\n");
-    }
+    rig.notes(point).for_each(|note| text += &format!("{note}\n"));
     text
 }
 
@@ -53,9 +51,7 @@ pub fn prediction(rig: &Rig, point: &OperatingPoint, summary: &Summary) -> Strin
 /// Windows of instability as a table.
 pub fn windows(rig: &Rig, map: &StabilityMap, mu_max: f64) -> String {
     let mut text = format!("{}: {} N, {} rad/s\n", rig.name, map.point.normal_load_n, map.point.disc_speed_rad_s);
-    if let Some(note) = rig.model.contact_state(&map.point).note() {
-        text += &format!("{note}\n");
-    }
+    rig.notes(&map.point).for_each(|note| text += &format!("{note}\n"));
     match map.critical_friction() {
         None => {
             let _ = writeln!(text, "stable for friction coefficients 0 to {mu_max}");

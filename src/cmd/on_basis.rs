@@ -5,6 +5,7 @@ use std::f64::consts::TAU;
 use anyhow::bail;
 
 use super::steps::Steps;
+use crate::certificate::DECAY_PER_S;
 use crate::full_model::FullModelFile;
 use crate::reduction::{
     Counted, FullSolver, GIB, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
@@ -12,8 +13,6 @@ use crate::reduction::{
 
 /// Largest `|Δλ|/|λ|` where nothing else is asked for.
 pub const TOLERANCE: f64 = 1e-6;
-/// Roots that grow faster than this are held, 1/s.
-const GROWTH_FLOOR_PER_S: f64 = -20.0;
 /// Operating points beside corners and middle at which the error is estimated, for each condition that matters.
 const TRAINING: usize = 8;
 /// Operating points held out, for each condition that matters.
@@ -104,9 +103,13 @@ pub fn basis_of(
             "{path}: the range is a single operating point; expected two values of mu, load or speed where they matter"
         );
     }
+    let lowest = range.friction_coefficient[0];
+    if lowest > 0.0 {
+        bail!("{path}: the range of mu begins at {lowest}; expected 0: windows of instability are searched from there");
+    }
     let request = ParametricRequest {
         range,
-        counted: Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: GROWTH_FLOOR_PER_S },
+        counted: Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: -DECAY_PER_S },
         tolerance,
         training: TRAINING * matters,
         held_out: HELD_OUT * matters,

@@ -126,6 +126,13 @@ impl Options {
         let kept = full.keep_modes(&wanted, !self.no_residual, room, &mut |part, what| {
             tell(&mut steps, part, names[part], what)
         })?;
+        for (name, Kept { modes, .. }) in names.iter().zip(&kept) {
+            let worst = modes.residuals.iter().copied().fold(0.0, f64::max);
+            steps.say(&format!(
+                "{name}: {} modes, residuals |K x - w^2 M x| / |K x| at most {worst:.1e}",
+                modes.residuals.len()
+            ));
+        }
         let mut sides = modal_sides(&full, &kept)?;
         let residual = if self.compact { between_pairs(&file, &full, &mut sides)? } else { None };
         let (kept, mut remarks) = (remarks(&names, &kept), source_remarks(&full));
@@ -288,7 +295,8 @@ pub fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
     }
 }
 
-/// Archives and matrices that the rig file at `path` names now, as this command names them, and `files` do not.
+/// Archives and matrices that the rig file at `path` names now, as this command names them, and neither `files` nor another
+/// rig file beside it do.
 fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
     let text = std::fs::read_to_string(path).unwrap_or_default();
     let Some(stem) = path.file_stem() else { return vec![] };
@@ -313,6 +321,14 @@ fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
     let mut found = vec![];
     let table = text.parse::<toml::Table>().unwrap_or_default();
     strings(&table.into(), &mut |text| found.extend(named(text)));
+    // A copy of the rig file may go on naming them.
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let others = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let others = others.filter(|other| other.extension().is_some_and(|kind| kind == "toml"));
+    let others = others.filter(|other| other.file_name() != path.file_name());
+    let texts: Vec<String> = others.filter_map(|other| std::fs::read_to_string(other).ok()).collect();
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    found.retain(|path| texts.iter().all(|text| !text.contains(&name(path))));
     found
 }
 

@@ -6,11 +6,13 @@ use clap::Args;
 use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of};
 use super::reduce::tell;
+use super::signals::on_stop;
 use super::steps::Steps;
 use super::{Outcome, positive, write_file};
 use crate::export::write_full_model;
 use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::full_model::FullModelFile;
+use crate::io::whole_file::remove_begun;
 use crate::reduction::Wanted;
 use crate::reproduce::{Heard, Item, MODES, PartModes, Study, index, nine_dof};
 
@@ -33,6 +35,11 @@ pub struct Options {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        on_stop(|| {
+            remove_begun();
+            note!("\nstopped: not all files were written");
+            std::process::exit(130);
+        })?;
         std::fs::create_dir_all(&self.output)
             .with_context(|| format!("{}: cannot make the folder", self.output.display()))?;
         let mut items = nine_dof()?;

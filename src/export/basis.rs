@@ -8,6 +8,7 @@ use super::matrix_market::write_array;
 use super::rig::{HASH_DIGITS, ModalSide, modal_rig, rig_name, source_remarks};
 use crate::certificate::Certificate;
 use crate::full_model::FullModelFile;
+use crate::hex::hex;
 use crate::physics::{Law, Term};
 use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
 use crate::rig::RigFile;
@@ -99,7 +100,7 @@ fn system_rig(
     let mut write = |what: &str, matrix: &Mat<f64>| -> anyhow::Result<toml::Value> {
         let mut bytes = vec![];
         write_array(matrix, &format!("{what} of {stem} on its basis"), &mut bytes).context(what.to_owned())?;
-        let hash: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        let hash = hex(&Sha256::digest(&bytes));
         let name = format!("{stem}-{what}-{}.mtx", &hash[..HASH_DIGITS]);
         files.push(RigFile { name: name.clone(), bytes });
         Ok(name.into())

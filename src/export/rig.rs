@@ -12,6 +12,7 @@ use sha2::{Digest, Sha256};
 
 use crate::certificate::Certificate;
 use crate::full_model::{FullModelFile, PartGeometry};
+use crate::hex::hex;
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullPart, Kept, Residual};
 use crate::rig::RigFile;
@@ -169,7 +170,7 @@ pub fn modal_rig(
     table.extend(common.clone());
     let mut archives = vec![];
     let mut add = |what: &str, bytes: Vec<u8>| -> toml::Value {
-        let hash: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+        let hash = hex(&Sha256::digest(&bytes));
         let name = format!("{stem}-{what}-{}.npz", &hash[..HASH_DIGITS]);
         archives.push(RigFile { name: name.clone(), bytes });
         name.into()

@@ -217,8 +217,16 @@ pub fn deck_nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, 
             continue;
         }
         if let Some(keyword) = content.strip_prefix('*') {
-            let keyword = keyword.split(',').next().unwrap_or("").trim();
+            let mut words = keyword.split(',').map(str::trim);
+            let keyword = words.next().unwrap_or("");
             inside = keyword.eq_ignore_ascii_case("NODE");
+            let mut system =
+                words.filter_map(|word| word.split_once('=')).map(|(key, value)| (key.trim(), value.trim()));
+            let turned =
+                |(key, value): (&str, &str)| key.eq_ignore_ascii_case("SYSTEM") && !value.eq_ignore_ascii_case("R");
+            if keyword.eq_ignore_ascii_case("SYSTEM") || inside && system.any(turned) {
+                return Err(refuse(file, line, "nodes", told(content), "nodes in the global rectangular system"));
+            }
             continue;
         }
         if !inside {
@@ -243,4 +251,19 @@ pub fn deck_nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, 
         return Err(lines.refuse("nodes", "are missing".to_owned(), "lines below *NODE"));
     }
     Ok(Nodes::new(&labels, positions))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nodes_of_another_coordinate_system_are_refused() {
+        let read = |text: &str| deck_nodes("a.inp", text.as_bytes(), 1.0).map(|nodes| nodes.positions);
+        assert_eq!(read("*NODE, NSET=ALL, SYSTEM=R\n1, 1., 0., 0.\n").unwrap(), [[1.0, 0.0, 0.0]]);
+        for (text, line) in [("*Node, System=C\n1, 1., 0., 0.\n", 1), ("** part\n*SYSTEM\n0., 0., 1.\n", 2)] {
+            let refused = read(text).unwrap_err().to_string();
+            assert!(refused.contains(&format!("a.inp, line {line}: nodes is `")), "{refused}");
+        }
+    }
 }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use crate::hex::hex;
 use crate::rig::RigError;
 
 /// Bytes that are read at once.
@@ -78,7 +79,7 @@ impl Files {
             hasher.update(name.as_bytes());
             hasher.update(digest);
         }
-        hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+        hex(&hasher.finalize())
     }
 }
 

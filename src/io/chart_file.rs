@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use crate::hex::hex;
 use crate::physics::Chart;
 use crate::physics::chart::FORMAT;
 
@@ -40,7 +41,7 @@ impl ChartFile {
             .chain_update(env!("CARGO_PKG_VERSION"))
             .finalize()
             .into();
-        let short: String = key[..8].iter().map(|byte| format!("{byte:02x}")).collect();
+        let short = hex(&key[..8]);
         let name = |stem: &str| format!("{stem}.{short}.chart");
         let beside = rig_file.and_then(|file| {
             let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));

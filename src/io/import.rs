@@ -14,6 +14,7 @@ use super::{
     recording_file::{RecordingFile, WriteError, with_suffix},
     tribometer_log::{self, LogError, LogOptions, TribometerLog},
 };
+use crate::hex::hex;
 use crate::wire::{Header, OperatingPoint, Time, schema::Topic};
 
 /// The name of the metadata record that says where the recording is from. Its keys: `source`, `source_sha256`,
@@ -82,7 +83,7 @@ pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Im
 
 fn write(file: &mut RecordingFile, input: &Path, bytes: &[u8], log: &TribometerLog) -> Result<(), ImportError> {
     let source = input.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    let digest: String = Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect();
+    let digest = hex(&Sha256::digest(bytes));
     let mut metadata = BTreeMap::from([
         ("source".to_owned(), source),
         ("source_sha256".to_owned(), digest),

@@ -10,6 +10,7 @@ use sha2::{Digest, Sha256};
 
 use super::Incoming;
 use super::sensitivity::{self, Question};
+use crate::hex::hex;
 use crate::io::chart_file::ChartFile;
 use crate::physics::chart::build::{ChartOptions, build, resume};
 use crate::physics::{Chart, Ends, OperatingPoint, Solver, StabilityMap};
@@ -96,7 +97,7 @@ fn hash(words: impl Iterator<Item = u64>) -> String {
     for word in words {
         hasher.update(word.to_le_bytes());
     }
-    hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    hex(&hasher.finalize())
 }
 
 /// Gives the calling thread the lowest priority. Where the system does not allow it, it competes like any thread.

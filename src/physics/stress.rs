@@ -452,9 +452,16 @@ pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> R
             return Err(format!("{mu} does not grow in {:?}", map.windows));
         }
         growing += usize::from(grows(1e-6));
-        let count = growing_roots(&spectrum);
+        let count = growing_roots(&spectrum, if spectrum.undamped { GROWS } else { 0.0 });
         if let Some((left, below)) = before.replace((mu, count)).filter(|(_, below)| *below != count) {
-            let end = change((left, below), mu, |mu| Ok(growing_roots(&solve(mu)?)))?;
+            let mut bisect = |threshold: f64| change((left, below), mu, |mu| Ok(growing_roots(&solve(mu)?, threshold)));
+            let end = if spectrum.undamped {
+                // Beyond the merging σ/|λ| is a square root: a threshold moves the end by its square.
+                let (near, far) = (bisect(GROWS)?, bisect(2.0 * GROWS)?);
+                near - (far - near) / 3.0
+            } else {
+                bisect(0.0)?
+            };
             let nearest = ends.iter().map(|other| (other - end).abs()).fold(f64::INFINITY, f64::min);
             if nearest > ENDS_AGREE * end {
                 return Err(format!("{below} roots grow below {end}, {count} above; no window ends there: {ends:?}"));
@@ -469,10 +476,12 @@ pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> R
     ))
 }
 
-/// How many roots grow, for bisection. Of an undamped pair `σ/|λ|` rises like a square root from rounding, which takes half the
-/// digits: 1e-7 is above it, and reached within 1e-14 of `(λ₁² - λ₂²)²`, relative, from the merging point.
-fn growing_roots(spectrum: &Spectrum) -> usize {
-    let threshold = if spectrum.undamped { 1e-7 } else { 0.0 };
+/// `σ/|λ|` above which a root of an undamped pair grows, for bisection: it rises like a square root from rounding, which takes
+/// half the digits.
+const GROWS: f64 = 1e-7;
+
+/// How many roots grow.
+fn growing_roots(spectrum: &Spectrum, threshold: f64) -> usize {
     spectrum.roots.iter().filter(|root| root.is_unstable(threshold)).count()
 }
 

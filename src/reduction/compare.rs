@@ -3,7 +3,8 @@
 //! Roots are paired off, nearest first. A full root that grows and whose partner does not is *missed*; a reduced one that
 //! grows and whose partner does not is *invented*. The windows of the full model are those of its projection on its own
 //! right and left vectors at a few friction coefficients, to which the ends of the windows are added until they stay
-//! where they are: near a merging point `λ` has half the digits, the ends of windows have all of them.
+//! where they are: near a merging point `λ` has half the digits, the ends of windows have all of them. What no sample saw
+//! would be missed in silence, so that the projection is then held against the full model between the samples.
 
 use faer::{Mat, c64};
 
@@ -11,6 +12,7 @@ use super::ReductionError;
 use super::full_model::FullModel;
 use super::full_order::{FullProgress, FullSolver, FullSpectrum, FullVectors};
 use super::matching::pair_off;
+use crate::physics::chart::radical_inverse;
 use crate::physics::{
     MapError, MapOptions, Model, ModelError, OperatingPoint, SolveError, Solver, StabilityMap, Vectors, Window,
 };
@@ -24,6 +26,10 @@ const DAMPED: f64 = 0.05;
 const STILL: f64 = 1e-8;
 /// Rounds of adding vectors at the ends of windows.
 const MOST_ROUNDS: usize = 8;
+/// Friction coefficients at which the projection is held against the full model once the ends of windows are still.
+const CHECKS: usize = 2;
+/// Relative error of a root of the projection there, up to which it has seen everything.
+const CHECKED: f64 = 1e-6;
 /// Roots of full and reduced model further apart than this, relative to `|λ|`, are no pair.
 const PAIRED: f64 = 0.2;
 
@@ -40,6 +46,11 @@ pub enum CompareError {
     Map(#[from] MapError),
     #[error("ends of windows of the full model still move by {moved:.1e} after {rounds} rounds, limit {limit:.1e}")]
     NotStill { moved: f64, rounds: usize, limit: f64 },
+    #[error(
+        "full model on its own vectors is off by {error:.1e} between the friction coefficients that they are of, after \
+         {rounds} rounds, limit {limit:.1e}"
+    )]
+    NotHeld { error: f64, rounds: usize, limit: f64 },
 }
 
 /// What is judged.
@@ -199,39 +210,71 @@ pub fn full_windows(
     progress: &mut dyn FnMut(FullProgress),
 ) -> Result<Vec<Window>, CompareError> {
     let mut basis = Basis { columns: Mat::zeros(model.dimension(), 0) };
-    let mut sampled: Vec<f64> = vec![];
+    let mut roots = 0;
+    let mut sample = |mu: f64, columns: usize| -> Result<FullSpectrum, ReductionError> {
+        // Vectors found join the columns, which grow into another place; then there are these, products and a new basis.
+        let columns = size_of::<f64>() * model.dimension() * (columns + 4 * roots);
+        solver.make_room(FullVectors::Both, roots, 2 * columns, 3 * columns)?;
+        let found = solver.roots(&p.with_friction(mu), 1.1 * band_rad_s, FullVectors::Both, progress)?;
+        roots = roots.max(found.roots.len());
+        Ok(found)
+    };
     let mut next: Vec<f64> = [0.0, 0.5, 1.0].iter().map(|share| share * options.mu_max).collect();
-    let mut ends: Vec<f64> = vec![];
-    let (mut moved, mut roots) = (f64::INFINITY, 0);
+    let (mut sampled, mut ends): (Vec<f64>, Vec<f64>) = (vec![], vec![]);
+    let (mut moved, mut error) = (f64::INFINITY, f64::INFINITY);
+    // 1/4, 3/4, 1/8, ...
+    let mut checks = (2..).map(|index| options.mu_max * radical_inverse(index, 2));
     for _ in 0..MOST_ROUNDS {
         for mu in std::mem::take(&mut next) {
-            // Vectors found join the columns, which grow into another place; then there are these, products and a new basis.
-            let columns = size_of::<f64>() * model.dimension() * (basis.columns.ncols() + 4 * roots);
-            solver.make_room(FullVectors::Both, roots, 2 * columns, 3 * columns)?;
-            let found = solver.roots(&p.with_friction(mu), 1.1 * band_rad_s, FullVectors::Both, progress)?;
-            roots = roots.max(found.roots.len());
-            basis.add(&found);
+            basis.add(&sample(mu, basis.columns.ncols())?);
             sampled.push(mu);
         }
         let reduced = model.project(basis.columns.as_ref())?.model(model.contact_law)?;
-        let map = StabilityMap::build(&reduced, &mut Solver::new(reduced.dimension()), p, options)?;
+        let mut dense = Solver::new(reduced.dimension());
+        let map = StabilityMap::build(&reduced, &mut dense, p, options)?;
         let found: Vec<f64> = map.windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten().collect();
         moved = if found.len() == ends.len() {
             found.iter().zip(&ends).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
         } else {
             f64::INFINITY
         };
-        if moved < STILL || (found.is_empty() && !sampled.is_empty()) {
-            return Ok(map.windows);
-        }
         let far = |mu: &f64| sampled.iter().all(|known| (known - mu).abs() > 1e-3 * STILL);
         next = found.iter().copied().filter(far).collect();
         ends = found;
-        if next.is_empty() {
-            return Ok(map.windows);
+        if moved < STILL || next.is_empty() {
+            moved = 0.0;
+            error = 0.0;
+            for mu in checks.by_ref().take(CHECKS) {
+                let found = sample(mu, basis.columns.ncols())?;
+                let of_projection = reduced_roots(&reduced, &mut dense, &p.with_friction(mu))?;
+                error = error.max(error_of_projection(&found, &of_projection, band_rad_s));
+                basis.add(&found);
+                sampled.push(mu);
+            }
+            if error <= CHECKED {
+                return Ok(map.windows);
+            }
         }
     }
-    Err(CompareError::NotStill { moved, rounds: MOST_ROUNDS, limit: STILL })
+    let (rounds, limit) = (MOST_ROUNDS, CHECKED);
+    Err(if moved < STILL {
+        CompareError::NotHeld { error, rounds, limit }
+    } else {
+        CompareError::NotStill { moved, rounds, limit: STILL }
+    })
+}
+
+/// Whether vectors of a root are of interest: those damped more than [`DAMPED`] are not.
+fn may_grow(lambda: c64) -> bool {
+    lambda.re > -DAMPED * lambda.norm()
+}
+
+/// The largest `|Δλ| / |λ|` of the full roots of the band that may grow; infinite where one of them has no partner.
+fn error_of_projection(full: &FullSpectrum, projected: &[c64], band_rad_s: f64) -> f64 {
+    let full: Vec<c64> = full.roots.iter().map(|root| root.lambda).filter(|lambda| may_grow(*lambda)).collect();
+    let judged = Judged { band_rad_s, instability_threshold: f64::INFINITY, decay_per_s: f64::INFINITY };
+    let compared = compare_roots(&full, projected, &judged);
+    if compared.unpaired > 0 { f64::INFINITY } else { compared.relative_error() }
 }
 
 /// Orthonormal columns that span vectors of a full model.
@@ -244,8 +287,7 @@ impl Basis {
     fn add(&mut self, found: &FullSpectrum) {
         let n = self.columns.nrows();
         for vectors in [&found.right, &found.left] {
-            let judged = |k: &usize| found.roots[*k].lambda.re > -DAMPED * found.roots[*k].lambda.norm();
-            for k in (0..vectors.ncols()).filter(judged) {
+            for k in (0..vectors.ncols()).filter(|&k| may_grow(found.roots[k].lambda)) {
                 // Turned so that a vector that is real but for a factor becomes real.
                 let square: c64 = (0..n).map(|i| vectors[(i, k)] * vectors[(i, k)]).sum();
                 let turn =
@@ -343,6 +385,27 @@ mod tests {
         let (own, other) = (error(500.0), error(2000.0));
         // At its own load the basis holds the roots themselves.
         assert!(own < 1e-9 && other > 1e-6, "{own:e} {other:e}");
+    }
+
+    /// Between its samples a projection is held against the full model by every root that may grow.
+    #[test]
+    fn a_projection_that_has_not_seen_everything_is_told() {
+        let model = touching(42, 0.0, ContactLaw::default());
+        let band = 700.0;
+        let mut solver = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
+        let mut solve = |mu: f64, band: f64| solver.roots(&point(mu), band, FullVectors::Both, &mut |_| {}).unwrap();
+        let checked = solve(0.4, band);
+        let mut error = |samples: &[(f64, f64)]| {
+            let mut basis = Basis { columns: Mat::zeros(model.dimension(), 0) };
+            samples.iter().for_each(|&(mu, band)| basis.add(&solve(mu, band)));
+            let reduced = model.project(basis.columns.as_ref()).unwrap().model(model.contact_law).unwrap();
+            let roots = reduced_roots(&reduced, &mut Solver::new(reduced.dimension()), &point(0.4)).unwrap();
+            error_of_projection(&checked, &roots, band)
+        };
+        // Vectors of the lower half of the band alone, of one friction coefficient, of those that windows begin with.
+        let (half, one, three) =
+            (error(&[(0.0, 0.5 * band)]), error(&[(0.0, band)]), error(&[(0.0, band), (0.5, band), (1.0, band)]));
+        assert!(half > 1e-3 && one > CHECKED && three < one, "{half:e} {one:e} {three:e}");
     }
 
     #[test]

@@ -28,6 +28,10 @@ pub enum ReductionError {
     ModeCount { what: String, value: String, limit: String },
     #[error("{what}: no shift up to {value:.3e} rad^2/s^2 makes K + shift M positive definite")]
     NoShift { what: String, value: f64 },
+    #[error(
+        "{what}: {modes} modes kept, all of them motions of a rigid body; expected more for the residual of the others"
+    )]
+    OnlyRigid { what: String, modes: usize },
     #[error("{what}: mode {mode} has residual {value:.3e} after {vectors} vectors, limit {limit:.1e}")]
     NotConverged { what: String, mode: usize, value: f64, limit: f64, vectors: usize },
     #[error(

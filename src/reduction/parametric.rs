@@ -547,8 +547,10 @@ impl Building<'_, '_> {
             }
         }
         let solved = inverse(residuals.clone());
-        let square = |j: usize| (residuals.col(j).transpose() * solved.col(j)).max(0.0);
-        (0..roots.len()).map(|j| (square(2 * j) + square(2 * j + 1)).sqrt()).collect()
+        let square = |j: usize| residuals.col(j).transpose() * solved.col(j);
+        // What rounded below zero is nothing; what is no number must not pass for nothing in a maximum.
+        let size = |square: f64| if square.is_nan() { f64::INFINITY } else { square.max(0.0).sqrt() };
+        (0..roots.len()).map(|j| size(square(2 * j) + square(2 * j + 1))).collect()
     }
 
     /// The model on the fewest leading singular vectors of the snapshots that hold the tolerance at all training points.

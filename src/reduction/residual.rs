@@ -22,10 +22,12 @@ use faer::Mat;
 
 use super::ReductionError;
 use super::normal_modes::{Analysed, Progress, SparseModes};
-use super::sparse::times;
+use super::sparse::{SparseMatrix, times};
 
 /// The shift, relative to the last kept `ω²`.
 const SHIFT: f64 = 1e-6;
+/// `ω²` up to this times the largest ratio of stiffness to mass on a diagonal is that of a rigid-body motion: rounding.
+const RIGID: f64 = 1e-13;
 /// Loads that are solved for at once.
 const TOGETHER: usize = 32;
 /// Rows of kept answers that are multiplied at once.
@@ -65,7 +67,7 @@ impl Analysed<'_> {
     /// that is held, whose rows and columns are 0.
     ///
     /// # Errors
-    /// [`ReductionError`]: `NegativeStiffness` where a kept mode is unstable, `NoShift`, `Factorisation`.
+    /// [`ReductionError`]: `OnlyRigid` where no kept mode tells how stiff the part is, `NegativeStiffness` where a kept mode is unstable, `NoShift`, `Factorisation`.
     pub fn residual(
         &self,
         modes: &SparseModes,
@@ -76,6 +78,11 @@ impl Analysed<'_> {
         let pencil = &self.pencil;
         let (what, mass, n) = (pencil.what, pencil.mass, pencil.dimension());
         let last = modes.omega_squared.last().copied().unwrap_or(0.0);
+        let diagonal = |matrix: &SparseMatrix, k: usize| matrix.get(k, k).copied().unwrap_or(0.0);
+        let largest = (0..n).map(|k| diagonal(pencil.stiffness, k) / diagonal(mass, k)).fold(0.0, f64::max);
+        if last <= RIGID * largest {
+            return Err(ReductionError::OnlyRigid { what: what.to_owned(), modes: modes.omega_squared.len() });
+        }
         let limit = -super::SEMIDEFINITE_TOLERANCE * last.abs();
         if let Some((mode, &value)) = modes.omega_squared.iter().enumerate().find(|(_, square)| **square < limit) {
             return Err(ReductionError::NegativeStiffness { what: format!("{what}.stiffness"), mode, value, limit });
@@ -189,6 +196,19 @@ mod tests {
         }
         let build = |t: &[_]| SparseMatrix::try_new_from_triplets(n, n, t).unwrap();
         (build(&mass), build(&stiffness))
+    }
+
+    /// Its one rigid-body motion says nothing of how stiff it is.
+    #[test]
+    fn nothing_but_rigid_motions_leaves_no_residual() {
+        let (mass, stiffness) = chain(420);
+        let analysed = Analysed::new("pad", &mass, &stiffness).unwrap();
+        let residual = |count: usize| {
+            let kept = lowest_modes("pad", &mass, &stiffness, count).unwrap();
+            analysed.residual(&kept, &[Some(3)], InertiaBy::SecondSolve, &mut |_| {})
+        };
+        assert_eq!(residual(1).unwrap_err(), ReductionError::OnlyRigid { what: "pad".to_owned(), modes: 1 });
+        residual(2).unwrap();
     }
 
     #[test]

@@ -27,7 +27,7 @@ pub mod uff;
 use faer::Mat;
 
 use crate::certificate::Certificate;
-use crate::physics::{ContactPairs, Model, OperatingPoint, ResidualFlexibility};
+use crate::physics::{ContactPairs, ContactState, Model, OperatingPoint, ResidualFlexibility};
 
 pub use embedded::{EMBEDDED, Embedded};
 pub use error::RigError;
@@ -73,6 +73,8 @@ pub struct Rig {
     pub reduction: Option<Certificate>,
     /// `[basis] tolerance`: the largest `|Δλ|/|λ|` its basis was made to hold.
     pub basis_tolerance: Option<f64>,
+    /// `[basis]`: the conditions its basis was made for.
+    pub made_for: Option<MadeFor>,
     /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
     pub shapes: Vec<SideShapes>,
 }
@@ -115,6 +117,14 @@ pub struct Limits {
     pub friction_coefficient: [f64; 2],
 }
 
+/// The conditions that the basis of a rig was made for, as far as its file names them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MadeFor {
+    pub friction_coefficient: Option<[f64; 2]>,
+    pub normal_load_n: Option<[f64; 2]>,
+    pub disc_speed_rad_s: Option<[f64; 2]>,
+}
+
 /// Conditions for which predictions are prepared, where the rig depends on them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChartRange {
@@ -135,6 +145,23 @@ pub struct Warning {
     pub hysteresis: f64,
     /// FAULT after this much silence, s.
     pub silence_s: f64,
+}
+
+impl MadeFor {
+    /// Whether `p` is outside, as far as what changes there matters to `model`: a vector held at one load need not hold at another.
+    fn is_left_at(&self, model: &Model, p: &OperatingPoint) -> bool {
+        let outside =
+            |range: Option<[f64; 2]>, value: f64| range.is_some_and(|[low, high]| value < low || value > high);
+        let (load, speed) = model.depends_on_load_and_speed();
+        let friction = match model.contact_state(p) {
+            ContactState::Open => return true,
+            ContactState::NotSliding => 0.0,
+            ContactState::Sliding => p.disc_speed_rad_s.signum() * p.friction_coefficient,
+        };
+        outside(self.friction_coefficient, friction)
+            || load && outside(self.normal_load_n, p.normal_load_n)
+            || speed && outside(self.disc_speed_rad_s, p.disc_speed_rad_s.abs())
+    }
 }
 
 impl Rig {
@@ -215,8 +242,20 @@ impl Rig {
             contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::told)).collect(),
             reduction: raw.reduction,
             basis_tolerance: raw.basis.as_ref().and_then(|basis| basis.tolerance),
+            made_for: raw.basis.as_ref().map(|basis| MadeFor {
+                friction_coefficient: basis.friction_coefficient,
+                normal_load_n: basis.normal_load_n,
+                disc_speed_rad_s: basis.disc_speed_rad_s,
+            }),
             shapes: built.shapes,
         })
+    }
+
+    /// What to know of a prediction at `p`: what the contact does there, and whether the rig's basis was made for it.
+    pub fn notes(&self, p: &OperatingPoint) -> impl Iterator<Item = &'static str> {
+        let beyond = self.made_for.is_some_and(|made_for| made_for.is_left_at(&self.model, p));
+        let beyond = beyond.then_some("beyond the conditions that the basis was made for");
+        self.model.contact_state(p).note().into_iter().chain(beyond)
     }
 
     /// The stiffness of the rig's contact pairs as its file lists it, N/m: one value, or one for each pair of a patch.

@@ -3,6 +3,7 @@
 use sha2::{Digest, Sha256};
 
 use super::{RigError, RigFile};
+use crate::hex::hex;
 
 /// Where what a rig file refers to comes from.
 pub struct Source<'a> {
@@ -51,7 +52,7 @@ impl<'a> Source<'a> {
                 hasher.update(part);
             }
         }
-        hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+        hex(&hasher.finalize())
     }
 
     pub fn into_files(self) -> Vec<RigFile> {

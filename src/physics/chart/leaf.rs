@@ -108,7 +108,7 @@ impl Builder<'_> {
         let tolerance = self.options.tolerance / parts as f64;
         let per_point = Basis::orders(axes).len();
         let mut data = Mat::zeros(count * per_point, size * parts);
-        let (mut radius, mut scale, mut stray) = (0.0f64, f64::INFINITY, 0.0f64);
+        let (mut radius, mut stray) = (0.0f64, 0.0f64);
         let mut sound = vec![true; count];
         let mut allowed = vec![f64::INFINITY; size];
         let mut condition = 1.0f64;
@@ -116,7 +116,6 @@ impl Builder<'_> {
             let z: Vec<c64> = members.iter().map(|&k| branches.z(node, k)).collect();
             let functions = symmetric_functions(&z);
             sound[node] = members.iter().all(|&k| branches.samples[node].is_sound(branches.roots[node][k]));
-            scale = scale.min(functions[0].norm());
             radius = z.iter().map(|z| (z - functions[0]).norm()).fold(radius, f64::max);
             if size == 1 {
                 condition = condition.max(branches.condition(node, members[0]));
