@@ -713,7 +713,6 @@ mod tests {
         let (mut solved, mut charted) = (with_map(session()), with_map(session()));
         let chart = crate::physics::chart::build::build(&charted.rig.model, &chart_options(&charted.rig), &|_| true);
         charted.step(Event::ChartReady(Arc::new(chart.expect("the rig can be charted")))).unwrap();
-        let charted_to = charted.rig.mu_max;
         for seq in 0..400 {
             let mu = 0.005 * seq as f64 + 1e-4;
             let (a, b) = (predict(&mut solved, friction(seq, mu)), predict(&mut charted, friction(seq, mu)));
@@ -730,10 +729,7 @@ mod tests {
         assert_eq!((charted.counters().charted, charted.counters().solved), (400, 0));
         let backwards = predict(&mut charted, conditions(1000, 500.0, -13.0, 0.3));
         assert!(charted.counters().solved == 1 && backwards.modes.len() == 9, "the other direction is solved");
-        let beyond = predict(&mut charted, friction(1001, charted_to + 0.1));
-        for outside in [backwards, beyond] {
-            assert!(outside.reason.contains("not charted here: solved"), "{}", outside.reason);
-        }
+        assert!(backwards.reason.contains("not charted here: solved"), "{}", backwards.reason);
     }
 
     #[test]
