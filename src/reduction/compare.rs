@@ -2,8 +2,8 @@
 //!
 //! Roots are paired off, nearest first. A full root that grows and whose partner does not is *missed*; a reduced one that
 //! grows and whose partner does not is *invented*. The windows of the full model are those of its projection on its own
-//! right and left vectors at a few friction coefficients, to which the ends of the windows are added until they stay
-//! where they are: near a merging point `λ` has half the digits, the ends of windows have all of them. What no sample saw
+//! right and left vectors at a few friction coefficients, to which ends of the windows are added, a few at a time, until all
+//! stay where they are: near a merging point `λ` has half the digits, the ends of windows have all of them. What no sample saw
 //! would be missed in silence, so that the projection is then held against the full model between the samples.
 
 use faer::{Mat, c64};
@@ -24,8 +24,10 @@ const NEW: f64 = 1e-6;
 const DAMPED: f64 = 0.05;
 /// Ends of windows of the full model that move by less than this are found.
 const STILL: f64 = 1e-8;
-/// Rounds of adding vectors at the ends of windows.
-const MOST_ROUNDS: usize = 8;
+/// Ends of windows at which vectors are added in a round.
+const ADDED: usize = 3;
+/// Rounds of adding them.
+const MOST_ROUNDS: usize = 16;
 /// Friction coefficients at which the projection is held against the full model once the ends of windows are still.
 const CHECKS: usize = 2;
 /// Relative error of a root of the projection there, up to which it has seen everything.
@@ -238,8 +240,7 @@ pub fn full_windows(
         } else {
             f64::INFINITY
         };
-        let far = |mu: &f64| sampled.iter().all(|known| (known - mu).abs() > 1e-3 * STILL);
-        next = found.iter().copied().filter(far).collect();
+        next = farthest(&found, &sampled);
         ends = found;
         if moved < STILL || next.is_empty() {
             moved = 0.0;
@@ -262,6 +263,22 @@ pub fn full_windows(
     } else {
         CompareError::NotStill { moved, rounds, limit: STILL }
     })
+}
+
+/// The [`ADDED`] of `ends`, or fewer, that are farthest from what was `sampled` and from each other.
+fn farthest(ends: &[f64], sampled: &[f64]) -> Vec<f64> {
+    let mut known = sampled.to_vec();
+    let mut chosen = vec![];
+    while chosen.len() < ADDED {
+        let distance = |mu: f64| known.iter().map(|known| (known - mu).abs()).fold(f64::INFINITY, f64::min);
+        let Some(&far) = ends.iter().max_by(|a, b| distance(**a).total_cmp(&distance(**b))) else { break };
+        if distance(far) <= 1e-3 * STILL {
+            break;
+        }
+        known.push(far);
+        chosen.push(far);
+    }
+    chosen
 }
 
 /// Whether vectors of a root are of interest: those damped more than [`DAMPED`] are not.
@@ -385,6 +402,12 @@ mod tests {
         let (own, other) = (error(500.0), error(2000.0));
         // At its own load the basis holds the roots themselves.
         assert!(own < 1e-9 && other > 1e-6, "{own:e} {other:e}");
+    }
+
+    #[test]
+    fn ends_far_from_what_was_sampled_are_next() {
+        assert_eq!(farthest(&[0.1, 0.3, 0.31, 0.5, 0.9], &[0.0, 0.5, 1.0]), [0.3, 0.1, 0.9]);
+        assert_eq!(farthest(&[0.5, 0.5], &[0.0, 0.5, 1.0]), [0.0; 0]);
     }
 
     /// Between its samples a projection is held against the full model by every root that may grow.
