@@ -23,7 +23,7 @@ use super::critical::Window;
 use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
 use super::operating_point::OperatingPoint;
 use super::reference::{self, MAX_TOGETHER};
-use super::solver::Solver;
+use super::solver::{ROUNDING, Solver};
 use super::spectrum::{Spectrum, Vectors};
 use super::stability_map::{MapOptions, StabilityMap, mirror};
 use super::synthetic::{Synthetic, Uniform, rig};
@@ -541,9 +541,10 @@ pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> 
             let partner = mirror(&here, k);
             let same = |j: usize| found[k] == Some(ids[j]);
             if !same(k) && !partner.is_some_and(same) {
-                // Two that have parted again.
+                // Two that have parted again, or that are one to rounding.
                 let other = (0..ids.len()).find(|&j| same(j));
-                let swapped = other.is_none_or(|j| found[j] != Some(ids[k]) || !was_pair(&map, ids[k], ids[j], target));
+                let may = |j: usize| was_pair(&map, ids[k], ids[j], target) || are_one(&here, k, j);
+                let swapped = other.is_none_or(|j| found[j] != Some(ids[k]) || !may(j));
                 if swapped {
                     let hz = here.roots[k].frequency_hz();
                     return Err(format!("{target}: mode {} at {hz} Hz is called {:?}", ids[k], found[k]));
@@ -557,8 +558,15 @@ pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> 
     Ok(format!("{compared} modes at {steps} steps, {halvings} of them halved, no swap"))
 }
 
+/// Whether rounding alone may tell two roots apart: the shapes of such a doublet are arbitrary within their plane.
+fn are_one(spectrum: &Spectrum, a: usize, b: usize) -> bool {
+    let value = |k: usize| if spectrum.undamped { spectrum.roots[k].square } else { spectrum.roots[k].lambda };
+    (value(a) - value(b)).norm() <= 2.0 * ROUNDING * f64::EPSILON * spectrum.matrix_norm
+}
+
 /// Identities of `next` by the overlap of its shapes with those of `here`; `None` unless each shape has one counterpart that is
-/// clearly its own, or is one of two that merge or part, whose shapes are nearly one: these keep the order of their frequencies.
+/// clearly its own, or is one of two that merge or part, whose shapes are nearly one, or of a doublet: these keep the order of their
+/// frequencies.
 fn carried(here: &Spectrum, ids: &[u32], next: &Spectrum) -> Option<Vec<u32>> {
     let count = tracked(next);
     if count != ids.len() {
@@ -574,10 +582,11 @@ fn carried(here: &Spectrum, ids: &[u32], next: &Spectrum) -> Option<Vec<u32>> {
         // Shapes need not be orthogonal: how far it has moved is held against how far the next one is.
         let clear = 1.0 - first < 0.1 * (1.0 - second);
         let merging = mirror(next, j).is_some() || nearly_merged(here, best[0], best[1]);
-        if !(clear || merging && first > 0.9) {
+        let doublet = are_one(here, best[0], best[1]);
+        if !(clear || merging && first > 0.9 || doublet && first + second > 0.9) {
             return None;
         }
-        best.truncate(if clear { 1 } else { 2 });
+        best.truncate(if clear && !doublet { 1 } else { 2 });
         best.sort_unstable(); // as roots are: by frequency
         let source = best.into_iter().find(|&k| !taken[k])?;
         taken[source] = true;
