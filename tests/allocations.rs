@@ -1,5 +1,4 @@
 //! What a condition costs in memory: nothing, after the first, when it is read off the chart.
-#![cfg(feature = "node")]
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;

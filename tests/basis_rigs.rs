@@ -1,6 +1,5 @@
 //! Rigs on a basis of a whole full model: pad and disc on shared coordinates, systems of small matrices, and
 //! `squealcast reduce --tolerance`, which writes both.
-#![cfg(feature = "node")]
 
 mod program;
 

@@ -2,7 +2,6 @@
 //!
 //! They are no part of the project. They are looked for in `$SQUEALCAST_SHARED/data/brake4669`, by default in `../shared`
 //! beside the project; without them the test says that it is skipped.
-#![cfg(feature = "node")]
 
 mod program;
 

@@ -1,6 +1,5 @@
 //! The node at the speed of the bus, over shared memory, beside a bare round trip over the same bus. It measures times:
 //! `SQUEALCAST_MEASURE=1 cargo test --release --test bus_speed -- --nocapture`.
-#![cfg(feature = "node")]
 
 mod bus;
 

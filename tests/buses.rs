@@ -1,6 +1,5 @@
 //! Both buses, both ways, against their own mirror; loopback, private names and domains. Peers in other languages are
 //! in `tests/peers`.
-#![cfg(feature = "node")]
 
 mod bus;
 

@@ -1,6 +1,5 @@
 //! What the real binary computes and says: exit codes, output, closed forms, the published nine-degree-of-freedom model.
 //! Sessions are in `sessions.rs`.
-#![cfg(feature = "node")]
 
 mod program;
 

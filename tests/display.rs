@@ -2,7 +2,6 @@
 //!
 //! `tests/browser/setup.sh` puts in place what the browser tests need. Without it they are skipped and say so; with
 //! `SQUEALCAST_BROWSER_TESTS=required` that is a failure.
-#![cfg(feature = "node")]
 
 mod program;
 

@@ -1,5 +1,4 @@
 //! Full models from files: what is read of the tribometer, and what is said of files that are wrong.
-#![cfg(feature = "node")]
 
 mod program;
 

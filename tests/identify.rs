@@ -1,5 +1,4 @@
 //! `identify` against the nine-DoF rig's natural frequencies in 30-digit arithmetic (its contact springs are 1 N/m).
-#![cfg(feature = "node")]
 
 mod program;
 

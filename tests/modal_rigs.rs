@@ -1,5 +1,4 @@
 //! Rigs of kind 2: what the modes left out do at the contact, and modes from Universal Files.
-#![cfg(feature = "node")]
 
 mod program;
 

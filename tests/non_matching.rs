@@ -1,5 +1,4 @@
 //! A pad mesh finer than the disc's: through the interpolation `T` the interface converges to the one of meshes that match.
-#![cfg(feature = "node")]
 
 mod program;
 

@@ -3,7 +3,6 @@
 //!
 //! `SQUEALCAST_PEERS` names another folder than `target/peers`; with it set, missing peers are a failure.
 //! `SQUEALCAST_SHARED` names another folder with the real brake's matrices than `../shared`.
-#![cfg(feature = "node")]
 
 mod program;
 

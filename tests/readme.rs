@@ -1,7 +1,6 @@
 //! Every command that README.md shows is run: those of its `sh` and `console` blocks that begin with `squealcast` or
 //! `cargo run --release --`. One that says `# needs ...` behind it is left out (`# needs a rig`), one that says
 //! `# exits with N` must do so. They run one after another in one folder, with what the repository holds beside them.
-#![cfg(feature = "node")]
 
 mod program;
 

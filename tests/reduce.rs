@@ -1,5 +1,4 @@
 //! `squealcast reduce`: the tribometer in its modes against its own full model, and what becomes of work that cannot be done.
-#![cfg(feature = "node")]
 
 mod program;
 

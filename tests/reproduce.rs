@@ -1,5 +1,4 @@
 //! `squealcast reproduce`: the paper's tribometer on a small one of ours.
-#![cfg(feature = "node")]
 
 mod program;
 

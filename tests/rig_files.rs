@@ -1,6 +1,5 @@
 //! Everything that can be wrong with a rig file and what it refers to: each its own error that names file, field,
 //! value and limit; and no bytes at all that make a reader panic.
-#![cfg(feature = "node")]
 
 mod program;
 

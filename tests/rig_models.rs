@@ -1,5 +1,4 @@
 //! What rig files become: closed forms, the published nine-degree-of-freedom table, the real brake, modal substructures.
-#![cfg(feature = "node")]
 
 mod program;
 

@@ -1,6 +1,5 @@
 //! Rigs written by numpy and scipy predict what scipy does on matrices that it assembles for itself
 //! (`tests/peers/scipy_rigs.py`).
-#![cfg(feature = "node")]
 
 mod program;
 

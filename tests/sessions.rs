@@ -1,5 +1,4 @@
 //! Sessions of the real binary: simulated, run, recorded, replayed, verified, recovered, imported.
-#![cfg(feature = "node")]
 
 mod program;
 

@@ -19,7 +19,6 @@ fn every_extreme_comes_out_as_it_should() {
 }
 
 /// The paper's nine-degree-of-freedom models, friction coefficients 0 to 20.
-#[cfg(feature = "node")]
 #[test]
 fn every_window_of_the_nine_dof_models_is_found_and_no_mode_changes_its_name() {
     for name in ["nine-dof", "nine-dof-case-2"] {
@@ -49,7 +48,6 @@ fn no_mode_of_40_changes_its_name() {
 }
 
 /// The tribometer on its basis and in 80 + 80 modes, 100 000 friction coefficients from 0 to 1: many minutes.
-#[cfg(feature = "node")]
 #[test]
 fn every_window_of_the_tribometer_is_found_and_no_mode_changes_its_name() {
     if std::env::var_os("SQUEALCAST_MEASURE").is_none() {

@@ -1,6 +1,5 @@
 //! The reference tribometer as files: sizes agree, the contact nodes of pad and disc coincide, matrices are symmetric
 //! and positive on the diagonal.
-#![cfg(feature = "node")]
 
 mod program;
 
