@@ -16,6 +16,7 @@ pub mod export;
 pub mod full_model;
 mod hex;
 pub mod html;
+pub mod input_file;
 pub mod io;
 pub mod node;
 pub mod offline;

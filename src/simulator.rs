@@ -5,6 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
+use crate::input_file;
 use crate::physics::OperatingPoint;
 
 /// Conditions over time: straight lines between points, with noise around them.
@@ -103,7 +104,8 @@ impl Profile {
     /// [`ProfileError`], naming file, field, value and limit.
     pub fn load(path: &std::path::Path) -> Result<Self, ProfileError> {
         let file = path.display().to_string();
-        let text = std::fs::read_to_string(path).map_err(|source| ProfileError::Read { file: file.clone(), source })?;
+        let text = input_file::read_text(path, input_file::TOML)
+            .map_err(|source| ProfileError::Read { file: file.clone(), source })?;
         Self::parse(&file, &text)
     }
 

@@ -5,6 +5,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::{Outcome, positive, print, write_file};
+use crate::input_file;
 use crate::physics::identification::{IdentificationError, Identified, identify};
 use crate::physics::{OperatingPoint, Solver, Vectors};
 use crate::plot;
@@ -112,7 +113,8 @@ fn at_rest_hz(rig: &Rig, normal_load_n: f64, factor: f64) -> anyhow::Result<Vec<
 /// The column `frequency_hz`, ascending.
 fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
     let file = path.display();
-    let mut reader = csv::Reader::from_path(path).with_context(|| format!("{file}: cannot be read"))?;
+    let bytes = input_file::read(path, input_file::TARGETS).with_context(|| format!("{file}: cannot be read"))?;
+    let mut reader = csv::Reader::from_reader(bytes.as_slice());
     let headers = reader.headers().with_context(|| format!("{file}: no header"))?;
     let column = headers
         .iter()

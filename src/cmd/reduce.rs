@@ -13,6 +13,7 @@ use super::{Outcome, positive, print};
 use crate::certificate::{Against, Certificate, Verified, verify_against};
 use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
 use crate::full_model::FullModelFile;
+use crate::input_file;
 use crate::io::whole_file::{remove_begun, write_whole};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullSolver, GIB, Kept, Progress, Residual, Wanted};
@@ -298,7 +299,7 @@ pub fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
 /// Archives and matrices that the rig file at `path` names now, as this command names them, and neither `files` nor another
 /// rig file beside it do.
 fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
-    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let text = input_file::read_text(path, input_file::TOML).unwrap_or_default();
     let Some(stem) = path.file_stem() else { return vec![] };
     let start = format!("{}-", stem.to_string_lossy());
     let named = |text: &str| -> Option<PathBuf> {
@@ -326,7 +327,8 @@ fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
     let others = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let others = others.filter(|other| other.extension().is_some_and(|kind| kind == "toml"));
     let others = others.filter(|other| other.file_name() != path.file_name());
-    let texts: Vec<String> = others.filter_map(|other| std::fs::read_to_string(other).ok()).collect();
+    let text = |other: PathBuf| input_file::read_text(&other, input_file::TOML).ok();
+    let texts: Vec<String> = others.filter_map(text).collect();
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     found.retain(|path| texts.iter().all(|text| !text.contains(&name(path))));
     found

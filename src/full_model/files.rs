@@ -1,12 +1,12 @@
 //! The files of a full model, read once from beginning to end, and their hash.
 
-use std::fs::File;
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
 use crate::hex::hex;
+use crate::input_file;
 use crate::rig::RigError;
 
 /// Bytes that are read at once.
@@ -26,7 +26,7 @@ impl Files {
     /// # Errors
     /// [`RigError::NoSuchFile`].
     pub fn open(path: &Path) -> Result<(Self, Vec<u8>), RigError> {
-        let bytes = std::fs::read(path).map_err(|error| RigError::NoSuchFile {
+        let bytes = input_file::read(path, input_file::TOML).map_err(|error| RigError::NoSuchFile {
             value: path.display().to_string(),
             reason: error.to_string(),
             limit: "the TOML file of a full model".to_owned(),
@@ -53,7 +53,8 @@ impl Files {
             reason: error.to_string(),
             limit: "a readable file, relative to the TOML file".to_owned(),
         };
-        let file = File::open(self.directory.join(name)).map_err(missing)?;
+        let path = self.directory.join(name);
+        let file = input_file::open(&path, input_file::FULL_MODEL_PART).map_err(missing)?;
         let hashing = Hashing { inner: file, hasher: Sha256::new() };
         let mut reader = BufReader::with_capacity(CHUNK, hashing);
         let made = work(&mut reader)?;

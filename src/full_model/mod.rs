@@ -14,6 +14,7 @@ mod tables;
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
+use crate::input_file;
 use crate::physics::ContactLaw;
 use crate::reduction::{
     FullContact, FullModel, FullPart, Kept, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
@@ -76,7 +77,8 @@ impl FullModelFile {
     /// Whether the TOML file at `path` has parts with matrices in files: the sign of a full model. A `[system]` may be a
     /// rig as well.
     pub fn is_one(path: &Path) -> bool {
-        let table = std::fs::read_to_string(path).ok().and_then(|text| text.parse::<toml::Table>().ok());
+        let table =
+            input_file::read_text(path, input_file::TOML).ok().and_then(|text| text.parse::<toml::Table>().ok());
         let has = |part: &str| {
             let part = table.as_ref().and_then(|table| table.get(part)).and_then(toml::Value::as_table);
             part.is_some_and(|part| {

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::hex::hex;
+use crate::input_file;
 use crate::physics::Chart;
 use crate::physics::chart::FORMAT;
 
@@ -62,7 +63,7 @@ impl ChartFile {
     /// # Errors
     /// [`ChartFileError`].
     pub fn load(&self) -> Result<Option<Chart>, ChartFileError> {
-        let bytes = match fs::read(&self.path) {
+        let bytes = match input_file::read(&self.path, input_file::CHART) {
             Ok(bytes) => bytes,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(source) => return Err(ChartFileError::Io { path: self.path.clone(), source }),
@@ -164,5 +165,11 @@ mod tests {
         assert!(matches!(file.load(), Err(ChartFileError::Foreign { .. })));
         fs::write(file.path(), &bytes[..100]).unwrap();
         assert!(matches!(file.load(), Err(ChartFileError::Foreign { .. })));
+        // A named pipe that nobody writes to: the rig is charted anew, and the chart takes its place.
+        fs::remove_file(file.path()).unwrap();
+        rustix::fs::mkfifoat(rustix::fs::CWD, file.path(), rustix::fs::Mode::RWXU).unwrap();
+        assert!(file.load().unwrap_err().to_string().ends_with("is a named pipe, expected a regular file"));
+        file.save(&chart).unwrap();
+        assert!(file.load().unwrap().is_some());
     }
 }

@@ -15,6 +15,7 @@ use super::{
     tribometer_log::{self, LogError, LogOptions, TribometerLog},
 };
 use crate::hex::hex;
+use crate::input_file;
 use crate::wire::{Header, OperatingPoint, Time, schema::Topic};
 
 /// The name of the metadata record that says where the recording is from. Its keys: `source`, `source_sha256`,
@@ -59,7 +60,8 @@ pub struct Imported {
 ///
 /// A log that cannot be read, whose lines make no sense, or an output that exists or cannot be written.
 pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Imported, ImportError> {
-    let bytes = fs::read(input).map_err(|source| ImportError::Read { path: input.to_owned(), source })?;
+    let bytes = input_file::read(input, input_file::LOG)
+        .map_err(|source| ImportError::Read { path: input.to_owned(), source })?;
     let log = tribometer_log::parse(&tribometer_log::decode_text(&bytes), &options.log)
         .map_err(|source| ImportError::Log { path: input.to_owned(), source })?;
     if output.exists() && !options.overwrite {

@@ -11,12 +11,15 @@
 use std::path::{Path, PathBuf};
 
 use saphyr::{LoadableYamlNode, Scalar, Yaml};
+use saphyr_parser::{Event, Parser};
 use thiserror::Error;
 
-/// Files longer than this are refused.
-const MAX_BYTES: u64 = 1 << 20;
+use crate::input_file;
+
 /// Names nested deeper than this are refused.
 const MAX_DEPTH: usize = 32;
+/// YAML nested deeper than this is refused before it is built: building it takes as many nested calls.
+const MAX_NESTING: usize = 64;
 
 const PARAMETERS: &str = "ros__parameters";
 
@@ -25,8 +28,6 @@ const PARAMETERS: &str = "ros__parameters";
 pub enum ParamsFileError {
     #[error("parameter file {path}: {source}")]
     Read { path: PathBuf, source: std::io::Error },
-    #[error("parameter file {path}: {bytes} bytes, at most {MAX_BYTES} are read")]
-    TooLong { path: PathBuf, bytes: u64 },
     #[error("parameter file {path}: {source}")]
     Yaml { path: PathBuf, source: saphyr::ScanError },
     #[error("parameter file {path}: {at}: {problem}")]
@@ -39,11 +40,7 @@ pub enum ParamsFileError {
 /// A file that cannot be read, is no YAML, or is not laid out as above.
 pub fn read(path: &Path, namespace: &str, node: &str) -> Result<Vec<(String, String)>, ParamsFileError> {
     let failed = |source| ParamsFileError::Read { path: path.to_owned(), source };
-    let bytes = std::fs::metadata(path).map_err(failed)?.len();
-    if bytes > MAX_BYTES {
-        return Err(ParamsFileError::TooLong { path: path.to_owned(), bytes });
-    }
-    let text = std::fs::read_to_string(path).map_err(failed)?;
+    let text = input_file::read_text(path, input_file::PARAMETERS).map_err(failed)?;
     parse(&text, namespace, node).map_err(|error| match error {
         ParseError::Yaml(source) => ParamsFileError::Yaml { path: path.to_owned(), source },
         ParseError::Shape { at, problem } => ParamsFileError::Shape { path: path.to_owned(), at, problem },
@@ -60,7 +57,28 @@ fn shape(at: &[String], problem: &'static str) -> ParseError {
     ParseError::Shape { at: if at.is_empty() { "top level".to_owned() } else { at.join(" / ") }, problem }
 }
 
+/// Refuses what takes more memory or stack to build than the text is worth: deep nesting, and aliases, each of which stands
+/// for a copy of what it refers to. ROS itself reads no aliases.
+fn check_events(text: &str) -> Result<(), ParseError> {
+    let mut depth = 0_usize;
+    for event in Parser::new_from_str(text) {
+        let (event, span) = event.map_err(ParseError::Yaml)?;
+        let refuse = |problem| Err(ParseError::Shape { at: format!("line {}", span.start.line()), problem });
+        match event {
+            Event::SequenceStart(..) | Event::MappingStart(..) if depth == MAX_NESTING => {
+                return refuse("nested too deep");
+            }
+            Event::SequenceStart(..) | Event::MappingStart(..) => depth += 1,
+            Event::SequenceEnd | Event::MappingEnd => depth = depth.saturating_sub(1),
+            Event::Alias(_) => return refuse("an alias (`*name`): write what it stands for"),
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
 fn parse(text: &str, namespace: &str, node: &str) -> Result<Vec<(String, String)>, ParseError> {
+    check_events(text)?;
     let documents = Yaml::load_from_str(text).map_err(ParseError::Yaml)?;
     let tokens: Vec<&str> = namespace.split('/').chain([node]).filter(|token| !token.is_empty()).collect();
     let mut values = Vec::new();
@@ -191,6 +209,21 @@ other:
         let nested = format!("{}1{}", "{a: ".repeat(100), "}".repeat(100));
         assert!(problem(&nested).ends_with("nested too deep"));
         assert!(problem(&format!("n: {{ros__parameters: {nested}}}").replace("n:", "squealcast:")).ends_with("deep"));
+        // As deep as a file can be: none of them may take the stack along.
+        for (start, end) in [("[", ""), ("[", "]"), ("{a: ", ""), ("- ", ""), ("? ", "")] {
+            let nested = format!("{}{}", start.repeat(200_000 / start.len()), end.repeat(200_000 / start.len()));
+            assert!(parse(&nested, "/", "squealcast").is_err(), "{start}");
+        }
+    }
+
+    /// Every level doubles what the one before stands for: 2^40 values in some lines.
+    #[test]
+    fn aliases_are_refused() {
+        let mut text = "a0: &a0 [x, x]\n".to_owned();
+        for level in 1..40 {
+            text += &format!("a{level}: &a{level} [*a{0}, *a{0}]\n", level - 1);
+        }
+        assert_eq!(problem(&text), "line 2: an alias (`*name`): write what it stands for");
     }
 
     proptest::proptest! {

@@ -5,6 +5,9 @@
 
 use std::{borrow::Cow, f64::consts::TAU, fmt};
 
+/// Longest line that is read, in bytes.
+const LONGEST_LINE: usize = 64 << 10;
+
 /// A quantity a column can hold, in the unit it is kept in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Field {
@@ -235,17 +238,23 @@ pub fn decode_text(bytes: &[u8]) -> Cow<'_, str> {
 ///
 /// See [`LogError`]; with [`LogOptions::skip_bad_lines`] only those of the log as a whole.
 pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError> {
+    check_lines(text)?;
     let header = find_header(text, options)?;
-    let rows = rows(text, &header)?;
-    let (mut columns, rows) = match rows.split_first() {
-        Some((first, rest)) if is_unit_row(first, &header.columns) => (with_units(first, header.columns)?, rest),
-        _ => (header.columns, rows.as_slice()),
+    // Rows are read once for each question, one at a time: all of them would take many times the memory of the text.
+    let rows = |skipped: usize| Rows::below(text, &header).skip(skipped);
+    let first = rows(0).next().transpose()?;
+    let (mut columns, unit_rows) = match first {
+        Some(first) if is_unit_row(&first, &header.columns) => (with_units(&first, header.columns.clone())?, 1),
+        _ => (header.columns.clone(), 0),
     };
-    let iso = is_iso(rows, &columns);
+    let iso = rows(unit_rows).next().transpose()?.is_some_and(|first| is_iso(&first, &columns));
     for column in &mut columns {
         resolve_unit(column, header.line, iso, options)?;
     }
-    let decimal = decimal_sign(rows, &columns, iso, options)?;
+    let decimal = match options.decimal {
+        Some(sign) => sign,
+        None => decimal_sign(rows(unit_rows), &columns, iso)?,
+    };
 
     let mut log = TribometerLog {
         samples: Vec::new(),
@@ -257,8 +266,9 @@ pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError
     };
     let mut last: Option<(usize, i64)> = None;
     let mut absolute = None;
-    for row in rows {
-        let sample = sample(row, &log.columns, decimal, iso, &mut absolute, options).and_then(|sample| match last {
+    for row in rows(unit_rows) {
+        let row = row?;
+        let sample = sample(&row, &log.columns, decimal, iso, &mut absolute, options).and_then(|sample| match last {
             Some((before, stamp_ns)) if sample.stamp_ns <= stamp_ns => {
                 Err(LogError::NotLater { line: row.line, before, value: row.time_text(&log.columns) })
             }
@@ -441,31 +451,57 @@ impl Row {
     }
 }
 
-/// The lines below the header; those without any content are passed over.
-fn rows(text: &str, header: &Header) -> Result<Vec<Row>, LogError> {
-    let text = text.get(header.end..).unwrap_or_default();
-    let mut reader = csv::ReaderBuilder::new()
-        .delimiter(header.separator)
-        .has_headers(false)
-        .flexible(true)
-        .trim(csv::Trim::All)
-        .from_reader(text.as_bytes());
-    let mut rows = Vec::new();
-    // The reader's own line numbers are those of the line breaks before a record: behind by the empty lines and by
-    // one where lines end in CR LF.
-    let (mut line, mut counted) = (header.line + 1, 0);
-    for record in reader.records() {
-        let cells = record.map_err(|error| LogError::Text { line, reason: error.to_string() })?;
-        let position = cells.position().map_or(0, csv::Position::byte) as usize;
-        let breaks = text.bytes().skip(position).take_while(|byte| matches!(byte, b'\r' | b'\n')).count();
-        let start = position + breaks;
-        line += text.bytes().take(start).skip(counted).filter(|byte| *byte == b'\n').count();
-        counted = start.max(counted);
-        if cells.iter().any(|cell| !cell.is_empty()) {
-            rows.push(Row { line, cells });
+/// The rows below the header; those without any content are passed over.
+struct Rows<'t> {
+    text: &'t str,
+    records: csv::StringRecordsIntoIter<&'t [u8]>,
+    /// The reader's own line numbers are those of the line breaks before a record: behind by the empty lines and by one
+    /// where lines end in CR LF.
+    line: usize,
+    counted: usize,
+}
+
+impl<'t> Rows<'t> {
+    fn below(text: &'t str, header: &Header) -> Self {
+        let text = text.get(header.end..).unwrap_or_default();
+        let reader = csv::ReaderBuilder::new()
+            .delimiter(header.separator)
+            .has_headers(false)
+            .flexible(true)
+            .trim(csv::Trim::All)
+            .from_reader(text.as_bytes());
+        Self { text, records: reader.into_records(), line: header.line + 1, counted: 0 }
+    }
+}
+
+impl Iterator for Rows<'_> {
+    type Item = Result<Row, LogError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            let cells = match self.records.next()? {
+                Ok(cells) => cells,
+                Err(error) => return Some(Err(LogError::Text { line: self.line, reason: error.to_string() })),
+            };
+            let bytes = self.text.as_bytes();
+            let position = cells.position().map_or(0, csv::Position::byte) as usize;
+            let breaks = bytes.iter().skip(position).take_while(|byte| matches!(byte, b'\r' | b'\n')).count();
+            let start = position + breaks;
+            self.line += bytes.iter().take(start).skip(self.counted).filter(|byte| **byte == b'\n').count();
+            self.counted = start.max(self.counted);
+            if cells.iter().any(|cell| !cell.is_empty()) {
+                return Some(Ok(Row { line: self.line, cells }));
+            }
         }
     }
-    Ok(rows)
+}
+
+/// That no line is longer than one of measurements can be.
+fn check_lines(text: &str) -> Result<(), LogError> {
+    match text.lines().position(|line| line.len() > LONGEST_LINE) {
+        Some(at) => Err(LogError::Text { line: at + 1, reason: format!("longer than {LONGEST_LINE} bytes") }),
+        None => Ok(()),
+    }
 }
 
 /// Whether the line below the header holds units: none of its cells has a digit at its start, and some are units.
@@ -488,8 +524,8 @@ fn with_units(row: &Row, mut columns: Vec<Column>) -> Result<Vec<Column>, LogErr
 }
 
 /// Whether times are dates: their first holds a `:` or a `-` behind its start.
-fn is_iso(rows: &[Row], columns: &[Column]) -> bool {
-    let first = rows.first().map(|row| row.time_text(columns)).unwrap_or_default();
+fn is_iso(first: &Row, columns: &[Column]) -> bool {
+    let first = first.time_text(columns);
     first.contains(':') || first.char_indices().any(|(at, c)| c == '-' && at >= 4 && !first.contains(['e', 'E']))
 }
 
@@ -528,13 +564,15 @@ fn resolve_unit(column: &mut Column, line: usize, iso: bool, options: &LogOption
 
 /// Comma or point. A cell with both settles it (the last one is the decimal sign); so do cells with only one of them,
 /// unless there are cells of both kinds.
-fn decimal_sign(rows: &[Row], columns: &[Column], iso: bool, options: &LogOptions) -> Result<char, LogError> {
-    if let Some(sign) = options.decimal {
-        return Ok(sign);
-    }
-    let mut comma: Option<(usize, &str)> = None;
-    let mut point: Option<(usize, &str)> = None;
+fn decimal_sign(
+    rows: impl Iterator<Item = Result<Row, LogError>>,
+    columns: &[Column],
+    iso: bool,
+) -> Result<char, LogError> {
+    let mut comma: Option<(usize, String)> = None;
+    let mut point: Option<(usize, String)> = None;
     for row in rows {
+        let row = row?;
         for column in columns.iter().filter(|column| !(iso && column.field == Field::Time)) {
             let cell = row.cells.get(column.index).unwrap_or_default();
             let seen = match (cell.rfind(','), cell.rfind('.')) {
@@ -543,10 +581,11 @@ fn decimal_sign(rows: &[Row], columns: &[Column], iso: bool, options: &LogOption
                 (None, None) => continue,
                 _ => &mut point,
             };
-            seen.get_or_insert((row.line, cell));
+            seen.get_or_insert_with(|| (row.line, cell.to_owned()));
         }
-        if let (Some((comma_line, comma)), Some((point_line, point))) = (comma, point) {
-            return Err(LogError::Decimal { comma: comma.to_owned(), comma_line, point: point.to_owned(), point_line });
+        if let (Some((comma_line, comma)), Some((point_line, point))) = (&comma, &point) {
+            let (comma, point) = (comma.clone(), point.clone());
+            return Err(LogError::Decimal { comma, comma_line: *comma_line, point, point_line: *point_line });
         }
     }
     Ok(if comma.is_some() { ',' } else { '.' })

@@ -13,6 +13,8 @@ pub enum RigError {
     NoSuchFile { value: String, reason: String, limit: String },
     #[error("{file}: {field} = \"{value}\" cannot be read: {reason}; expected {limit}")]
     MissingFile { file: String, field: String, value: String, reason: String, limit: String },
+    #[error("{file}: is {bytes} bytes long, expected at most {limit}")]
+    TooLong { file: String, bytes: usize, limit: u64 },
     #[error("{file}, line {line}: {value}; expected {limit}")]
     Syntax { file: String, line: usize, value: String, limit: String },
     #[error("{file}, line {line}: unknown key `{field}`; expected {limit}")]

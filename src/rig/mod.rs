@@ -27,6 +27,7 @@ pub mod uff;
 use faer::Mat;
 
 use crate::certificate::Certificate;
+use crate::input_file;
 use crate::physics::{ContactPairs, ContactState, Model, OperatingPoint, ResidualFlexibility};
 
 pub use embedded::{EMBEDDED, Embedded};
@@ -174,7 +175,7 @@ impl Rig {
             return Self::from_files(&embedded.files());
         }
         let path = std::path::Path::new(name_or_path);
-        let bytes = std::fs::read(path).map_err(|error| RigError::NoSuchRig {
+        let bytes = input_file::read(path, input_file::TOML).map_err(|error| RigError::NoSuchRig {
             value: name_or_path.to_owned(),
             reason: error.to_string(),
             limit: Embedded::names(),
@@ -183,7 +184,7 @@ impl Rig {
         let directory = path.parent().unwrap_or(std::path::Path::new(""));
         let rig = Self::build(
             RigFile { name, bytes },
-            &|name| std::fs::read(directory.join(name)).map_err(|error| error.to_string()),
+            &|name| input_file::read(&directory.join(name), input_file::RIG_PART).map_err(|error| error.to_string()),
             "a readable file, relative to the rig file",
         )?;
         Ok(Self { path: Some(path.to_owned()), ..rig })

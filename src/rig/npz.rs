@@ -1,16 +1,22 @@
 //! Modes of a substructure as a finite-element program wrote them: an `.npz` archive of numpy arrays.
+//!
+//! The type and the shape of an array are checked before its values are unpacked, and memory is allocated once, for as many
+//! values as the shape says.
 
-use std::io::{Cursor, Read};
+use std::io::{self, BufReader, Cursor, Read};
 
 use faer::Mat;
-use npyz::{NpyFile, Order, TypeChar};
+use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 
 use super::RigError;
 use super::modal_data::{ModalData, Residual};
 use crate::physics::ResidualFlexibility;
 
-/// Largest array that is read, in bytes: a limit for archives that unpack to far more than they hold.
-const LARGEST: u64 = 2 << 30;
+/// The arrays of one archive may take this much, in bytes ...
+const MOST_BYTES: u64 = 1 << 30;
+/// ... but, above the second number, no more than so many times the bytes of the archive: numbers that mean something do not
+/// compress further.
+const MOST_TIMES_ARCHIVE: (u64, u64) = (100, 64 << 20);
 /// Longest header of an array, in bytes; numpy writes 128.
 const LONGEST_HEADER: usize = 1024;
 /// Two mirrored entries of a residual may differ by this times its largest entry: what printing with ten digits leaves.
@@ -29,19 +35,15 @@ struct Array {
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
 pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<ResidualFlexibility, RigError> {
-    let mut archive = open(file, bytes)?;
+    let mut archive = Archive::open(file, bytes)?;
     let triangle = |row: usize, column: usize| row * (row + 1) / 2 + column;
     let mut both = |kind: &str| -> Result<Option<[Mat<f64>; 2]>, RigError> {
         let names = ["normal", "sliding"].map(|direction| format!("{kind}_{direction}"));
         let shapes = [vec![triangle(c, 0)], vec![c, c]];
         let mut arrays = vec![];
         for (name, shape) in names.iter().zip(&shapes) {
-            let array = read_array(file, &mut archive, name)?;
-            if let Some(array) = array.as_ref().filter(|array| array.shape != *shape) {
-                let (value, limit) = (format!("has shape ({})", told(&array.shape)), format!("({})", told(shape)));
-                return Err(refuse(file, name, &value, &format!("{limit}, by the {c} contact pairs")));
-            }
-            arrays.push(array);
+            let limit = || format!("({}), by the {c} contact pairs", told(shape));
+            arrays.push(archive.array(name, |found| if found == shape { Ok(()) } else { Err(limit()) })?);
         }
         match (&arrays[0], &arrays[1]) {
             (None, None) => Ok(None),
@@ -64,44 +66,37 @@ pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<Residual
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
 pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
-    let mut archive = open(file, bytes)?;
-    let mut array = |name: &str| read_array(file, &mut archive, name);
+    let mut archive = Archive::open(file, bytes)?;
     let required = |name: &str, array: Option<Array>, shape: &str| {
         array.ok_or_else(|| refuse(file, name, "is missing", &format!("an array of shape {shape}")))
     };
-    let omega = required("omega_rad_s", array("omega_rad_s")?, "(i)")?;
-    let phi = required("phi", array("phi")?, "(c, 3, i)")?;
-    let nodes = required("nodes_m", array("nodes_m")?, "(c, 3)")?;
-    let damping = array("damping_ratio")?;
-    let mass_share = array("mass_share")?;
-    let residuals = [array("residual_flexibility")?, array("residual_inertia")?];
-
-    let wrong = |name: &str, array: &Array, limit: &str| {
-        Err(refuse(file, name, &format!("has shape ({})", told(&array.shape)), limit))
+    let expected = |holds: bool, limit: String| if holds { Ok(()) } else { Err(limit) };
+    let omega = archive.array("omega_rad_s", |shape| expected(shape.len() == 1, "(i)".to_owned()))?;
+    let omega = required("omega_rad_s", omega, "(i)")?;
+    let modes = omega.values.len();
+    let nodes = archive.array("nodes_m", |shape| expected(matches!(shape, [_, 3]), "(c, 3)".to_owned()))?;
+    let nodes = required("nodes_m", nodes, "(c, 3)")?;
+    let count = nodes.shape[0];
+    let phi = archive.array("phi", |shape| {
+        expected(modes > 0 && count > 0, "at least one node and one mode".to_owned())?;
+        expected(shape == [count, 3, modes], format!("({count}, 3, {modes}), by nodes_m and omega_rad_s"))
+    })?;
+    let phi = required("phi", phi, "(c, 3, i)")?;
+    let damping =
+        archive.array("damping_ratio", |shape| expected(shape == [modes], format!("({modes}), as omega_rad_s")))?;
+    let mass_share = archive.array("mass_share", |shape| {
+        expected(shape == [modes, modes], format!("({modes}, {modes}), by omega_rad_s"))
+    })?;
+    let mut residual = |name: &str| {
+        let size = 3 * count;
+        archive.array(name, |shape| expected(shape == [size, size], format!("({size}, {size}), by nodes_m")))
     };
-    let &[modes] = omega.shape.as_slice() else { return wrong("omega_rad_s", &omega, "(i)") };
-    let &[count, 3] = nodes.shape.as_slice() else { return wrong("nodes_m", &nodes, "(c, 3)") };
-    if modes == 0 || count == 0 {
-        return wrong("phi", &phi, "at least one node and one mode");
-    }
-    if phi.shape != [count, 3, modes] {
-        return wrong("phi", &phi, &format!("({count}, 3, {modes}), by nodes_m and omega_rad_s"));
-    }
-    if let Some(damping) = &damping
-        && damping.shape != [modes]
-    {
-        return wrong("damping_ratio", damping, &format!("({modes}), as omega_rad_s"));
-    }
+    let residuals = [residual("residual_flexibility")?, residual("residual_inertia")?];
     if let Some((mode, value)) = omega.values.iter().enumerate().find(|(_, value)| **value < 0.0) {
         return Err(refuse(file, &format!("omega_rad_s[{mode}]"), &format!("is {value}"), "at least 0"));
     }
-    let mass_share = match mass_share {
-        Some(share) if share.shape != [modes, modes] => {
-            return wrong("mass_share", &share, &format!("({modes}, {modes}), by omega_rad_s"));
-        }
-        share => share.map(|share| Mat::from_fn(modes, modes, |i, j| share.values[i * modes + j])),
-    };
-    let residual = residual(file, count, residuals)?;
+    let mass_share = mass_share.map(|share| Mat::from_fn(modes, modes, |i, j| share.values[i * modes + j]));
+    let residual = symmetric_residual(file, count, residuals)?;
     let nodes_m = nodes.values.chunks_exact(3).map(|node| [node[0], node[1], node[2]]).collect();
     Ok(ModalData {
         omega_rad_s: omega.values,
@@ -114,14 +109,10 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
 }
 
 /// Residual flexibility and inertia between the three directions of every one of `count` nodes.
-fn residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> Result<Option<Residual>, RigError> {
+fn symmetric_residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> Result<Option<Residual>, RigError> {
     let names = ["residual_flexibility", "residual_inertia"];
     let symmetric = |name: &str, array: Array| -> Result<Mat<f64>, RigError> {
         let size = 3 * count;
-        if array.shape != [size, size] {
-            let limit = format!("({size}, {size}), by nodes_m");
-            return Err(refuse(file, name, &format!("has shape ({})", told(&array.shape)), &limit));
-        }
         let at = |row: usize, column: usize| array.values[row * size + column];
         let limit = SYMMETRY * array.values.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
         for row in 0..size {
@@ -147,13 +138,6 @@ fn residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> Result<Opti
     }
 }
 
-fn open<'a>(file: &str, bytes: &'a [u8]) -> Result<npyz::npz::NpzArchive<Cursor<&'a [u8]>>, RigError> {
-    npyz::npz::NpzArchive::new(Cursor::new(bytes)).map_err(|error| {
-        let limit = "an .npz archive as numpy.savez writes it";
-        refuse(file, "(archive)", &format!("cannot be opened: {error}"), limit)
-    })
-}
-
 fn refuse(file: &str, field: &str, value: &str, limit: &str) -> RigError {
     RigError::Npz { file: file.to_owned(), field: field.to_owned(), value: value.to_owned(), limit: limit.to_owned() }
 }
@@ -162,66 +146,107 @@ fn told(shape: &[usize]) -> String {
     shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
 }
 
-/// An array of the archive by name; `None` where it is not there.
-fn read_array(
-    file: &str,
-    archive: &mut npyz::npz::NpzArchive<Cursor<&[u8]>>,
-    name: &str,
-) -> Result<Option<Array>, RigError> {
-    let readable = "an array of numbers as numpy writes it";
-    let unreadable = |error: &dyn std::fmt::Display| refuse(file, name, &format!("cannot be read: {error}"), readable);
-    let entry_name = npyz::npz::file_name_from_array_name(name);
-    let zip = archive.zip_archive();
-    if !zip.file_names().any(|entry| entry == entry_name) {
-        return Ok(None);
-    }
-    let entry = zip.by_name(&entry_name).map_err(|error| unreadable(&error))?;
-    let mut bytes = vec![];
-    entry.take(LARGEST + 1).read_to_end(&mut bytes).map_err(|error| unreadable(&error))?;
-    if bytes.len() as u64 > LARGEST {
-        return Err(refuse(file, name, &format!("is larger than {LARGEST} bytes"), "a smaller array"));
-    }
-    check_header(&bytes).map_err(|reason| unreadable(&reason))?;
-    let array = NpyFile::new(bytes.as_slice()).map_err(|error| unreadable(&error))?;
-    let shape: Vec<usize> = array.shape().iter().map(|&length| usize::try_from(length).unwrap_or(usize::MAX)).collect();
-    let fortran = array.order() == Order::Fortran;
-    let scalar = match array.dtype() {
-        npyz::DType::Plain(scalar) => scalar,
-        other => {
-            return Err(refuse(file, name, &format!("has type {}", other.descr()), "float64, float32 or an integer"));
-        }
-    };
-    let length = shape.iter().try_fold(1_usize, |product, &length| product.checked_mul(length));
-    let size = scalar.size_field() as usize;
-    // The values must be there before memory is asked for them.
-    if length.and_then(|length| length.checked_mul(size)).is_none_or(|needed| needed > bytes.len()) {
-        return Err(refuse(
-            file,
-            name,
-            &format!("has shape ({}) but {} bytes", told(&shape), bytes.len()),
-            "all its values",
-        ));
-    }
-    let values: std::io::Result<Vec<f64>> = match (scalar.type_char(), size) {
-        (TypeChar::Float, 8) => array.into_vec::<f64>(),
-        (TypeChar::Float, 4) => array.into_vec::<f32>().map(|values| values.into_iter().map(f64::from).collect()),
-        (TypeChar::Int, 8) => array.into_vec::<i64>().map(|values| values.into_iter().map(|v| v as f64).collect()),
-        (TypeChar::Int, 4) => array.into_vec::<i32>().map(|values| values.into_iter().map(f64::from).collect()),
-        _ => return Err(refuse(file, name, &format!("has type {scalar}"), "float64, float32, int64 or int32")),
-    };
-    let mut values = values.map_err(|error| unreadable(&error))?;
-    if fortran {
-        values = to_c_order(&shape, &values);
-    }
-    if let Some((index, &value)) = values.iter().enumerate().find(|(_, value)| !value.is_finite()) {
-        let field = format!("{name}[{}]", told(&position(&shape, index)));
-        return Err(RigError::NotFinite { file: file.to_owned(), field, value });
-    }
-    Ok(Some(Array { shape, values }))
+/// An archive and how much of it was unpacked.
+struct Archive<'a> {
+    file: &'a str,
+    zip: npyz::npz::NpzArchive<Cursor<&'a [u8]>>,
+    /// Bytes that the arrays read so far take, and those that all of them may take.
+    unpacked: u64,
+    limit: u64,
 }
 
-/// Refuses headers on which the reader would overflow: too long, or with numbers whose product is no size.
-fn check_header(bytes: &[u8]) -> Result<(), String> {
+impl<'a> Archive<'a> {
+    fn open(file: &'a str, bytes: &'a [u8]) -> Result<Self, RigError> {
+        let zip = npyz::npz::NpzArchive::new(Cursor::new(bytes)).map_err(|error| {
+            let limit = "an .npz archive as numpy.savez writes it";
+            refuse(file, "(archive)", &format!("cannot be opened: {error}"), limit)
+        })?;
+        let (times, at_least) = MOST_TIMES_ARCHIVE;
+        let limit = (times * bytes.len() as u64).clamp(at_least, MOST_BYTES);
+        Ok(Self { file, zip, unpacked: 0, limit })
+    }
+
+    /// An array by name; `None` where it is not there. `fits` says what was expected where a shape is not of use.
+    fn array(
+        &mut self,
+        name: &str,
+        fits: impl FnOnce(&[usize]) -> Result<(), String>,
+    ) -> Result<Option<Array>, RigError> {
+        let file = self.file;
+        let readable = "an array of numbers as numpy writes it";
+        let unreadable =
+            |error: &dyn std::fmt::Display| refuse(file, name, &format!("cannot be read: {error}"), readable);
+        let entry_name = npyz::npz::file_name_from_array_name(name);
+        let zip = self.zip.zip_archive();
+        if !zip.file_names().any(|entry| entry == entry_name) {
+            return Ok(None);
+        }
+        let mut entry = zip.by_name(&entry_name).map_err(|error| unreadable(&error))?;
+        let there = entry.size();
+        let mut head = vec![];
+        entry.by_ref().take(LONGEST_HEADER as u64).read_to_end(&mut head).map_err(|error| unreadable(&error))?;
+        let header = check_header(&head).map_err(|reason| unreadable(&reason))?;
+        let array = NpyFile::new(head.as_slice()).map_err(|error| unreadable(&error))?;
+        let length = |length: &u64| usize::try_from(*length).unwrap_or(usize::MAX);
+        let shape: Vec<usize> = array.shape().iter().map(length).collect();
+        let refuse_shape =
+            |value: &str, limit: &str| Err(refuse(file, name, &format!("has shape ({}){value}", told(&shape)), limit));
+        let scalar = match array.dtype() {
+            DType::Plain(scalar) => scalar,
+            other => {
+                let value = format!("has type {}", other.descr());
+                return Err(refuse(file, name, &value, "float64, float32 or an integer"));
+            }
+        };
+        if let Err(limit) = fits(&shape) {
+            return refuse_shape("", &limit);
+        }
+        let count = shape.iter().try_fold(1_usize, |product, &length| product.checked_mul(length));
+        let size = scalar.size_field() as usize;
+        let needed = |each: usize| Some(count?.checked_mul(each)? as u64);
+        // Neither the archive nor the array is believed: both must agree that the values are there.
+        let Some(count) = count.filter(|_| needed(size).is_some_and(|bytes| header as u64 + bytes <= there)) else {
+            return refuse_shape(&format!(" but {there} bytes"), "all its values");
+        };
+        self.unpacked = needed(size_of::<f64>()).map_or(u64::MAX, |bytes| self.unpacked.saturating_add(bytes));
+        if self.unpacked > self.limit {
+            let limit = format!("at most {} bytes in the arrays of this archive, by its size", self.limit);
+            return refuse_shape(&format!(", with which the archive unpacks to {} bytes", self.unpacked), &limit);
+        }
+        let fortran = array.order() == Order::Fortran;
+        let rest = BufReader::new(head[header..].chain(entry));
+        let data = NpyFile::with_header(array.header().clone(), rest);
+        let values = match (scalar.type_char(), size) {
+            (TypeChar::Float, 8) => values::<f64>(data, count, |value| value),
+            (TypeChar::Float, 4) => values::<f32>(data, count, f64::from),
+            (TypeChar::Int, 8) => values::<i64>(data, count, |value| value as f64),
+            (TypeChar::Int, 4) => values::<i32>(data, count, f64::from),
+            _ => return Err(refuse(file, name, &format!("has type {scalar}"), "float64, float32, int64 or int32")),
+        };
+        let mut values = values.map_err(|error| unreadable(&error))?;
+        if fortran {
+            values = to_c_order(&shape, &values);
+        }
+        if let Some((index, &value)) = values.iter().enumerate().find(|(_, value)| !value.is_finite()) {
+            let field = format!("{name}[{}]", told(&position(&shape, index)));
+            return Err(RigError::NotFinite { file: file.to_owned(), field, value });
+        }
+        Ok(Some(Array { shape, values }))
+    }
+}
+
+/// The `count` values of an array.
+fn values<T: Deserialize>(data: NpyFile<impl Read>, count: usize, to: fn(T) -> f64) -> io::Result<Vec<f64>> {
+    let mut values = Vec::with_capacity(count);
+    for value in data.data::<T>().map_err(io::Error::other)? {
+        values.push(to(value?));
+    }
+    Ok(values)
+}
+
+/// The length of a header. Refuses those on which the reader would overflow: too long, or with numbers whose product is no
+/// size.
+fn check_header(bytes: &[u8]) -> Result<usize, String> {
     let length = match bytes.get(..12) {
         Some([0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, low, high, ..]) => {
             10 + usize::from(u16::from_le_bytes([*low, *high]))
@@ -242,7 +267,7 @@ fn check_header(bytes: &[u8]) -> Result<(), String> {
             .filter(|product| *product < 1 << 50)
             .ok_or("the numbers in its header are too large")?;
     }
-    Ok(())
+    Ok(length)
 }
 
 /// Index of every axis of the `flat`-th value in C order.
@@ -261,15 +286,29 @@ fn position(shape: &[usize], flat: usize) -> Vec<usize> {
     indices
 }
 
+/// Values in Fortran order, the first axis running fastest, rewritten to C order.
 fn to_c_order(shape: &[usize], values: &[f64]) -> Vec<f64> {
-    (0..values.len())
-        .map(|flat| {
-            let (mut from, mut stride) = (0, 1);
-            for (index, length) in position(shape, flat).iter().zip(shape) {
-                from += index * stride;
-                stride *= length;
-            }
-            values[from]
+    let strides: Vec<usize> = shape
+        .iter()
+        .scan(1, |next, &length| {
+            let stride = *next;
+            *next *= length;
+            Some(stride)
         })
-        .collect()
+        .collect();
+    let (mut index, mut from) = (vec![0; shape.len()], 0);
+    let mut ordered = Vec::with_capacity(values.len());
+    for _ in values {
+        ordered.push(values[from]);
+        for axis in (0..shape.len()).rev() {
+            index[axis] += 1;
+            from += strides[axis];
+            if index[axis] < shape[axis] {
+                break;
+            }
+            from -= strides[axis] * shape[axis];
+            index[axis] = 0;
+        }
+    }
+    ordered
 }

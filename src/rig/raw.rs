@@ -4,6 +4,7 @@ use serde::Deserialize;
 
 use super::RigError;
 use crate::certificate::Certificate;
+use crate::input_file;
 
 /// A whole rig file.
 #[derive(Debug, Deserialize)]
@@ -210,8 +211,11 @@ fn one() -> String {
 /// Reads the text of a rig file, or of another file of tables.
 ///
 /// # Errors
-/// [`RigError::Syntax`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
+/// [`RigError::TooLong`], [`RigError::Syntax`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
 pub fn parse<T: serde::de::DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, RigError> {
+    if bytes.len() as u64 > input_file::TOML {
+        return Err(RigError::TooLong { file: file.to_owned(), bytes: bytes.len(), limit: input_file::TOML });
+    }
     let text = std::str::from_utf8(bytes).map_err(|error| {
         let line = 1 + bytes.iter().take(error.valid_up_to()).filter(|byte| **byte == b'\n').count();
         let value = format!("bytes that are not UTF-8 ({error})");

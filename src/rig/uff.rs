@@ -8,6 +8,7 @@
 //! Source: Structural Dynamics Research Laboratory, University of Cincinnati, "Universal File Formats for Modal Analysis
 //! Testing".
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::f64::consts::TAU;
 
@@ -38,11 +39,16 @@ struct Units {
     force_n: f64,
 }
 
-/// The lines of a file and how far they were read.
+/// Longest line that is read, in bytes.
+const LONGEST_LINE: usize = 64 << 10;
+
+/// The lines of a file, one at a time.
 struct Lines<'a> {
     file: &'a str,
-    lines: Vec<std::borrow::Cow<'a, str>>,
-    next: usize,
+    /// What was not read yet; `None` behind the last line.
+    rest: Option<&'a [u8]>,
+    /// How many lines were read.
+    read: usize,
     dataset: String,
 }
 
@@ -52,8 +58,7 @@ struct Lines<'a> {
 /// [`RigError::Line`], naming the line, what stands there and what was expected.
 pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     let bytes = bytes.strip_suffix(b"\n").unwrap_or(bytes);
-    let lines = bytes.split(|byte| *byte == b'\n').map(String::from_utf8_lossy).collect();
-    let mut lines = Lines { file, lines, next: 0, dataset: String::new() };
+    let mut lines = Lines { file, rest: Some(bytes), read: 0, dataset: String::new() };
     let (mut nodes, mut modes) = (Vec::<Node>::new(), Vec::<Mode>::new());
     let mut units = Units { length_m: 1.0, force_n: 1.0 };
     while let Some(number) = lines.next_dataset()? {
@@ -65,7 +70,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
             _ => lines.skip()?,
         }
     }
-    let whole = |field: &str, value: &str, limit: &str| lines.refused(lines.lines.len(), field, value, limit);
+    let whole = |field: &str, value: &str, limit: &str| lines.refused(lines.read, field, value, limit);
     if nodes.is_empty() {
         return Err(whole("nodes", "are missing", "a dataset 15 or 2411"));
     }
@@ -115,7 +120,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     })
 }
 
-impl Lines<'_> {
+impl<'a> Lines<'a> {
     /// An error at a line, counted from 1.
     fn refused(&self, line: usize, field: &str, value: &str, limit: &str) -> RigError {
         let (file, field, value, limit) = (self.file.to_owned(), field.to_owned(), value.to_owned(), limit.to_owned());
@@ -124,24 +129,36 @@ impl Lines<'_> {
 
     /// An error at the line read last.
     fn refused_here(&self, field: &str, value: &str, limit: &str) -> RigError {
-        self.refused(self.next, &format!("dataset {}: {field}", self.dataset), value, limit)
+        self.refused(self.read, &format!("dataset {}: {field}", self.dataset), value, limit)
+    }
+
+    /// The next line of the file; `None` behind the last one.
+    fn advance(&mut self) -> Result<Option<Cow<'a, str>>, RigError> {
+        let Some(rest) = self.rest else { return Ok(None) };
+        let mut parts = rest.splitn(2, |byte| *byte == b'\n');
+        let line = parts.next().unwrap_or_default();
+        self.rest = parts.next();
+        self.read += 1;
+        if line.len() > LONGEST_LINE {
+            let value = format!("is {} bytes long", line.len());
+            return Err(self.refused(self.read, "line", &value, &format!("at most {LONGEST_LINE}")));
+        }
+        Ok(Some(String::from_utf8_lossy(line)))
     }
 
     /// The number of the next dataset; `None` at the end of the file.
     fn next_dataset(&mut self) -> Result<Option<String>, RigError> {
-        while let Some(line) = self.lines.get(self.next) {
-            self.next += 1;
+        while let Some(line) = self.advance()? {
             match line.trim() {
                 "" => {}
                 DELIMITER => {
-                    let number = self.lines.get(self.next).map_or("", |line| line.trim()).to_owned();
-                    self.next += 1;
+                    let number = self.advance()?.map_or_else(String::new, |line| line.trim().to_owned());
                     // A binary variant is told by a letter after the number, and by more numbers behind that.
                     let first = number.split_whitespace().next().unwrap_or("").to_owned();
                     if first.is_empty() || !first.starts_with(|c: char| c.is_ascii_digit()) {
                         let value = format!("is `{}`", shown(&number));
                         return Err(self.refused(
-                            self.next,
+                            self.read,
                             "number of a dataset",
                             &value,
                             "a number after a line of -1",
@@ -152,7 +169,7 @@ impl Lines<'_> {
                 }
                 other => {
                     let value = format!("is `{}`", shown(other));
-                    return Err(self.refused(self.next, "line between datasets", &value, "-1, as in a Universal File"));
+                    return Err(self.refused(self.read, "line between datasets", &value, "-1, as in a Universal File"));
                 }
             }
         }
@@ -161,16 +178,11 @@ impl Lines<'_> {
 
     /// The next line of a dataset; `None` after its last one.
     fn line(&mut self) -> Result<Option<String>, RigError> {
-        match self.lines.get(self.next) {
-            Some(line) => {
-                self.next += 1;
-                let line = line.trim_end_matches('\r');
-                Ok((line.trim() != DELIMITER).then(|| line.to_owned()))
-            }
-            None => {
-                Err(self.refused(self.lines.len(), &format!("dataset {}", self.dataset), "has no end", "a line of -1"))
-            }
+        if let Some(line) = self.advance()? {
+            let line = line.trim_end_matches('\r');
+            return Ok((line.trim() != DELIMITER).then(|| line.to_owned()));
         }
+        Err(self.refused(self.read, &format!("dataset {}", self.dataset), "has no end", "a line of -1"))
     }
 
     /// The next line of a dataset that must not end here.
