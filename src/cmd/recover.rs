@@ -32,6 +32,7 @@ pub fn describe(recovery: &Recovery) -> String {
     match &recovery.outcome {
         recover::Outcome::Complete { path, messages } => format!("{}: complete, {messages} messages", path.display()),
         recover::Outcome::Empty => format!("{original}: held nothing, removed"),
+        recover::Outcome::SetAside { path } => format!("{original}: no recording, kept as {}", path.display()),
         recover::Outcome::InUse => format!("{original}: being written, left alone"),
         recover::Outcome::Restored(restored) => {
             let mut text = format!("{}: restored {} messages", restored.path.display(), restored.messages);

@@ -1,13 +1,16 @@
 //! Walks the records of one MCAP file, however damaged, from start to end.
 //!
-//! The readers of the `mcap` crate refuse a file without its summary, and trust lengths they find inside chunks. This
+//! The readers of the `mcap` crate refuse a file without its summary, and trust lengths they find inside chunks and records
+//! (4 GiB are allocated for a name that claims to be as long). This
 //! one goes from record to record, believes no length beyond the bytes that are there, opens chunks itself (checking
 //! their CRC before any message is given out, and taking what it can from a chunk cut short), goes on behind a chunk
 //! that is damaged inside, and says what was damaged.
+//!
+//! Its memory and time are bounded, whatever a file claims: one chunk is open at a time, its records are read one by one as
+//! they are asked for, and what exceeds a ceiling below is passed over and counts as damage.
 
 use std::{
-    borrow::Cow,
-    collections::{BTreeMap, HashMap, VecDeque},
+    collections::{BTreeMap, HashMap},
     fs::File,
     io::{self, BufReader, Read},
     path::Path,
@@ -17,11 +20,31 @@ use std::{
 use bytes::Bytes;
 use mcap::{
     MAGIC,
-    records::{Metadata, Record, op},
+    records::{Metadata, op},
 };
 
-/// No chunk may hold more than this, whatever it says.
-const MAX_CHUNK_BYTES: u64 = 256 << 20;
+use crate::input_file;
+
+/// Largest chunk that is opened, in bytes of its records. Recorders close theirs at about 1 MB, after one large message at
+/// the latest.
+const MAX_CHUNK_BYTES: u64 = 32 << 20;
+/// What all chunks of a file may unpack to: so many times the length of the file, and at least the second number of bytes.
+const MOST_TIMES_FILE: (u64, u64) = (1000, 64 << 20);
+/// Largest schema, and largest record of metadata.
+const MAX_TEXT_BYTES: u64 = 1 << 20;
+/// Largest channel record.
+const MAX_CHANNEL_BYTES: u64 = 64 << 10;
+/// What the schemas and channels of a file may take, in bytes of their records.
+const MAX_KEPT_BYTES: usize = 16 << 20;
+/// A channel takes this many times its record, for the tree its metadata is kept in.
+const CHANNEL_OVERHEAD: usize = 8;
+/// So many unreadable records of one chunk are passed over before the rest of it is.
+const MAX_UNREADABLE: usize = 20;
+/// So much damage of one file is listed, each in so many characters.
+const MAX_DAMAGE: usize = 100;
+const MAX_DAMAGE_CHARS: usize = 300;
+/// The compressed form of a chunk may be larger than its records by this, its header included.
+const CHUNK_OVERHEAD: u64 = 1 << 20;
 
 /// A schema as its file has it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -99,10 +122,27 @@ pub struct RecordWalker {
     offset: u64,
     depth: Depth,
     state: State,
-    queue: VecDeque<Item>,
+    /// Read, but not given out yet.
+    next: Option<Item>,
+    chunk: Option<OpenChunk>,
+    /// Bytes of records of all chunks opened so far.
+    unpacked: u64,
+    /// Bytes of the records of all schemas and channels, overheads included.
+    kept: usize,
     schemas: HashMap<u16, Arc<Schema>>,
     channels: HashMap<u16, Arc<Channel>>,
     damage: Vec<Damage>,
+}
+
+/// A chunk whose records are being read.
+#[derive(Debug)]
+struct OpenChunk {
+    /// Where its record begins in the file.
+    start: u64,
+    /// The file ends within it.
+    cut: bool,
+    records: Bytes,
+    unreadable: usize,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -120,7 +160,7 @@ impl RecordWalker {
     ///
     /// What opening or reading the file yields.
     pub fn open(path: &Path, depth: Depth) -> io::Result<Option<Self>> {
-        let file = File::open(path)?;
+        let file = input_file::open(path, input_file::ANY_SIZE)?;
         let length = file.metadata()?.len();
         let mut walker = Self {
             input: BufReader::with_capacity(128 << 10, file),
@@ -128,7 +168,10 @@ impl RecordWalker {
             offset: 0,
             depth,
             state: State::Data,
-            queue: VecDeque::new(),
+            next: None,
+            chunk: None,
+            unpacked: 0,
+            kept: 0,
             schemas: HashMap::new(),
             channels: HashMap::new(),
             damage: Vec::new(),
@@ -148,6 +191,11 @@ impl RecordWalker {
         &self.damage
     }
 
+    /// How many bytes of messages were unpacked so far: what is given out shares their memory.
+    pub fn unpacked_bytes(&self) -> u64 {
+        self.unpacked
+    }
+
     /// At most `length` bytes from here, fewer at the end of the file. Memory grows with what is there.
     fn read(&mut self, length: u64) -> io::Result<Vec<u8>> {
         let mut bytes = Vec::with_capacity(length.min(self.length.saturating_sub(self.offset)) as usize);
@@ -156,7 +204,19 @@ impl RecordWalker {
         Ok(bytes)
     }
 
-    fn note(&mut self, offset: u64, what: String, loses_data: bool) {
+    /// Lists damage; of more than can be listed only whether it loses data, once.
+    fn note(&mut self, offset: u64, mut what: String, loses_data: bool) {
+        if self.damage.len() >= MAX_DAMAGE {
+            let said = |damage: &Damage| damage.loses_data || !loses_data;
+            if self.damage.len() > MAX_DAMAGE && self.damage[MAX_DAMAGE..].iter().any(said) {
+                return;
+            }
+            what = format!("more damage than the {MAX_DAMAGE} listed");
+        }
+        if let Some((end, _)) = what.char_indices().nth(MAX_DAMAGE_CHARS) {
+            what.truncate(end);
+            what.push_str("...");
+        }
         self.damage.push(Damage { offset, what, loses_data });
     }
 
@@ -186,8 +246,8 @@ impl RecordWalker {
         let there = self.length.saturating_sub(self.offset);
         let matters = data && !matches!(opcode, op::MESSAGE_INDEX | op::DATA_END);
         if length > there {
-            if opcode == op::CHUNK && data && self.depth == Depth::Messages {
-                let body = self.read(there)?;
+            if opcode == op::CHUNK && data && self.depth == Depth::Messages && there <= largest(opcode) {
+                let body = Bytes::from(self.read(there)?);
                 self.chunk(start, &body, true);
             }
             let name = opcode_name(opcode);
@@ -200,7 +260,12 @@ impl RecordWalker {
             op::DATA_END | op::FOOTER => false,
             _ => true,
         };
-        if skipped {
+        let too_large = length > largest(opcode);
+        if too_large && !skipped {
+            let what = format!("{} of {length} bytes, more than the limit of {}", opcode_name(opcode), largest(opcode));
+            self.note(start, what, matters);
+        }
+        if skipped || too_large {
             self.input.seek_relative(i64::try_from(length).map_err(io::Error::other)?)?;
             self.offset += length;
             return Ok(());
@@ -212,9 +277,16 @@ impl RecordWalker {
         }
         match opcode {
             op::CHUNK => self.chunk(start, &body, false),
+            op::ATTACHMENT => match attachment(body) {
+                Ok(attachment) => self.next = Some(Item::Attachment(attachment)),
+                Err(what) => self.note(start, what, true),
+            },
             op::DATA_END => self.state = State::Summary,
             op::FOOTER => self.end(start)?,
             _ => {
+                if opcode == op::MESSAGE {
+                    self.unpacked += length;
+                }
                 if let Err(what) = self.record(opcode, &body) {
                     self.note(start, what, true);
                 }
@@ -238,8 +310,8 @@ impl RecordWalker {
         Ok(())
     }
 
-    /// Queues what a chunk holds; `cut`: the file ends within it.
-    fn chunk(&mut self, start: u64, body: &[u8], cut: bool) {
+    /// Opens a chunk; `cut`: the file ends within it.
+    fn chunk(&mut self, start: u64, body: &Bytes, cut: bool) {
         let mut fields = Fields(body);
         let Some(header) = ChunkHeader::read(&mut fields) else {
             if !cut {
@@ -256,7 +328,21 @@ impl RecordWalker {
                 return self.note(start, what, true);
             }
         };
-        let (records, trouble) = decompress(&header.compression, compressed, header.uncompressed_bytes, cut);
+        let (times, at_least) = MOST_TIMES_FILE;
+        let budget = self.length.saturating_mul(times).max(at_least);
+        let claimed = header.uncompressed_bytes;
+        // A chunk that claims too much by itself is refused below: what it claims may be damaged.
+        if !cut && claimed <= MAX_CHUNK_BYTES && self.unpacked.saturating_add(claimed) > budget {
+            let what = format!(
+                "chunk of {claimed} bytes, with which a file of {} unpacks to more than the limit of {budget}; what \
+                 follows is not read",
+                self.length
+            );
+            return self.stop(start, what, true);
+        }
+        let limit = MAX_CHUNK_BYTES.min(budget.saturating_sub(self.unpacked));
+        let (records, trouble) = decompress(&header.compression, body, compressed, claimed, limit, cut);
+        self.unpacked += records.len() as u64;
         if !cut {
             if let Some(what) = trouble {
                 return self.note(start, what, true);
@@ -267,86 +353,109 @@ impl RecordWalker {
                 return self.note(start, what, true);
             }
         }
-        let records = Bytes::from(records);
-        let mut fields = Fields(&records);
-        while !fields.0.is_empty() {
+        self.chunk = Some(OpenChunk { start, cut, records, unreadable: 0 });
+    }
+
+    /// Reads on in an open chunk up to its next message, or to its end.
+    fn step_in(&mut self, mut chunk: OpenChunk) {
+        while self.next.is_none() && !chunk.records.is_empty() {
+            let mut fields = Fields(&chunk.records);
             let Some((opcode, record)) = fields.record() else {
-                if !cut {
-                    self.note(start, "chunk that ends within a record".to_owned(), true);
+                if !chunk.cut {
+                    self.note(chunk.start, "chunk that ends within a record".to_owned(), true);
                 }
                 return;
             };
+            let (record, rest) = (chunk.records.slice_ref(record), chunk.records.slice_ref(fields.0));
+            chunk.records = rest;
             if !matches!(opcode, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
                 continue;
             }
-            if let Err(what) = self.record(opcode, &records.slice_ref(record)) {
-                self.note(start, format!("in a chunk: {what}"), true);
+            if let Err(what) = self.record(opcode, &record) {
+                self.note(chunk.start, format!("in a chunk: {what}"), true);
+                chunk.unreadable += 1;
+                if chunk.unreadable == MAX_UNREADABLE {
+                    let what = format!("in a chunk: {MAX_UNREADABLE} unreadable records; the rest of it is not read");
+                    return self.note(chunk.start, what, true);
+                }
             }
+        }
+        if !chunk.records.is_empty() {
+            self.chunk = Some(chunk);
         }
     }
 
-    /// Takes in a record other than a chunk.
+    /// Takes in a record other than a chunk or an attachment.
     fn record(&mut self, opcode: u8, body: &Bytes) -> Result<(), String> {
-        if opcode == op::ATTACHMENT {
-            self.queue.push_back(Item::Attachment(attachment(body)?));
-            return Ok(());
+        if body.len() as u64 > largest(opcode) {
+            let limit = largest(opcode);
+            return Err(format!("{} of {} bytes, more than the limit of {limit}", opcode_name(opcode), body.len()));
         }
-        let record =
-            mcap::parse_record(opcode, body).map_err(|error| format!("unreadable {}: {error}", opcode_name(opcode)))?;
-        match record {
-            Record::Schema { header, data } => {
-                let schema = Schema { name: header.name, encoding: header.encoding, data: data.into_owned() };
-                match self.schemas.get(&header.id) {
-                    _ if header.id == 0 => return Err("schema with the number 0".to_owned()),
+        let unreadable = || format!("unreadable {}", opcode_name(opcode));
+        let mut fields = Fields(body);
+        match opcode {
+            op::SCHEMA => {
+                let (id, schema) = fields.schema().ok_or_else(unreadable)?;
+                match self.schemas.get(&id) {
+                    _ if id == 0 => return Err("schema with the number 0".to_owned()),
                     Some(known) if **known == schema => {}
-                    Some(known) => {
-                        return Err(format!("schema {} is both {} and {}", header.id, known.name, schema.name));
+                    Some(known) => return Err(format!("schema {id} is both {} and {}", known.name, schema.name)),
+                    None => {
+                        self.keep(body.len())?;
+                        self.schemas.insert(id, Arc::new(schema));
                     }
-                    None => drop(self.schemas.insert(header.id, Arc::new(schema))),
                 }
             }
-            Record::Channel(channel) => {
-                let schema = match channel.schema_id {
-                    0 => None,
-                    id => Some(self.schemas.get(&id).cloned().ok_or_else(|| {
-                        format!("channel {} refers to schema {id}, which is not there", channel.topic)
-                    })?),
-                };
-                let channel = Channel {
-                    id: channel.id,
-                    topic: channel.topic,
-                    message_encoding: channel.message_encoding,
-                    metadata: channel.metadata,
-                    schema,
-                };
+            op::CHANNEL => {
+                let (schema_id, mut channel) = fields.channel().ok_or_else(unreadable)?;
+                if schema_id != 0 {
+                    let schema = self.schemas.get(&schema_id).cloned();
+                    channel.schema = Some(schema.ok_or_else(|| {
+                        format!("channel {} refers to schema {schema_id}, which is not there", channel.topic)
+                    })?);
+                }
                 match self.channels.get(&channel.id) {
                     Some(known) if **known == channel => {}
                     Some(known) => {
                         return Err(format!("channel {} is both {} and {}", channel.id, known.topic, channel.topic));
                     }
-                    None => drop(self.channels.insert(channel.id, Arc::new(channel))),
+                    None => {
+                        self.keep(CHANNEL_OVERHEAD * body.len())?;
+                        self.channels.insert(channel.id, Arc::new(channel));
+                    }
                 }
             }
-            Record::Message { header, data } => {
-                let channel = self.channels.get(&header.channel_id).ok_or_else(|| {
-                    format!("message {} on channel {}, which is not there", header.sequence, header.channel_id)
-                })?;
+            op::MESSAGE => {
+                let (channel, sequence, log_time_ns, publish_time_ns) = fields.message().ok_or_else(unreadable)?;
+                let known = self.channels.get(&channel);
+                let channel =
+                    known.ok_or_else(|| format!("message {sequence} on channel {channel}, which is not there"))?;
                 if self.depth == Depth::Messages {
-                    self.queue.push_back(Item::Message(RawMessage {
+                    self.next = Some(Item::Message(RawMessage {
                         channel: Arc::clone(channel),
-                        sequence: header.sequence,
-                        log_time_ns: header.log_time,
-                        publish_time_ns: header.publish_time,
-                        data: match data {
-                            Cow::Borrowed(data) => body.slice_ref(data),
-                            Cow::Owned(data) => data.into(),
-                        },
+                        sequence,
+                        log_time_ns,
+                        publish_time_ns,
+                        data: body.slice_ref(fields.0),
                     }));
                 }
             }
-            Record::Metadata(metadata) => self.queue.push_back(Item::Metadata(metadata)),
+            op::METADATA => {
+                let (name, metadata) =
+                    fields.string().and_then(|name| Some((name, fields.map()?))).ok_or_else(unreadable)?;
+                self.next = Some(Item::Metadata(Metadata { name, metadata }));
+            }
             _ => {}
         }
+        Ok(())
+    }
+
+    /// Counts what a schema or channel takes.
+    fn keep(&mut self, bytes: usize) -> Result<(), String> {
+        if self.kept + bytes > MAX_KEPT_BYTES {
+            return Err(format!("schemas and channels of more than the limit of {MAX_KEPT_BYTES} bytes"));
+        }
+        self.kept += bytes;
         Ok(())
     }
 }
@@ -356,8 +465,12 @@ impl Iterator for RecordWalker {
 
     fn next(&mut self) -> Option<Item> {
         loop {
-            if let Some(item) = self.queue.pop_front() {
+            if let Some(item) = self.next.take() {
                 return Some(item);
+            }
+            if let Some(chunk) = self.chunk.take() {
+                self.step_in(chunk);
+                continue;
             }
             if self.state == State::Ended {
                 return None;
@@ -389,20 +502,38 @@ impl ChunkHeader {
     }
 }
 
-/// The records of a chunk as far as they can be had, and what stopped that. Memory grows with what comes out.
-fn decompress(compression: &str, compressed: &[u8], claimed: u64, cut: bool) -> (Vec<u8>, Option<String>) {
-    let limit = if cut { MAX_CHUNK_BYTES } else { claimed.min(MAX_CHUNK_BYTES) };
-    if !cut && claimed > limit {
-        return (Vec::new(), Some(format!("chunk of {claimed} bytes, more than the limit of {limit}")));
+/// The largest record of a kind that is read.
+fn largest(opcode: u8) -> u64 {
+    match opcode {
+        op::CHUNK => MAX_CHUNK_BYTES + CHUNK_OVERHEAD,
+        op::MESSAGE => MAX_CHUNK_BYTES,
+        op::ATTACHMENT => input_file::RIG_PART + MAX_TEXT_BYTES,
+        op::CHANNEL => MAX_CHANNEL_BYTES,
+        _ => MAX_TEXT_BYTES,
     }
+}
+
+/// The records of a chunk as far as they can be had, and what stopped that. At most `limit` bytes are unpacked.
+fn decompress(
+    compression: &str,
+    body: &Bytes,
+    compressed: &[u8],
+    claimed: u64,
+    limit: u64,
+    cut: bool,
+) -> (Bytes, Option<String>) {
+    if !cut && claimed > limit {
+        return (Bytes::new(), Some(format!("chunk of {claimed} bytes, more than the limit of {limit}")));
+    }
+    let limit = claimed.min(limit);
     let (records, error) = match compression {
-        "" => (compressed.to_vec(), None),
-        "zstd" => match zstd::stream::read::Decoder::with_buffer(compressed) {
+        "" => (body.slice_ref(compressed), None),
+        "zstd" => match zstd_decoder(compressed) {
             Ok(decoder) => read_until_error(decoder, limit),
-            Err(error) => (Vec::new(), Some(error)),
+            Err(error) => (Bytes::new(), Some(error)),
         },
         "lz4" => read_until_error(lz4_flex::frame::FrameDecoder::new(compressed), limit),
-        other => return (Vec::new(), Some(format!("chunk with the unknown compression {other:?}"))),
+        other => return (Bytes::new(), Some(format!("chunk with the unknown compression {other:?}"))),
     };
     let trouble = match error {
         Some(error) => Some(format!("chunk cannot be decompressed: {error}")),
@@ -414,34 +545,48 @@ fn decompress(compression: &str, compressed: &[u8], claimed: u64, cut: bool) -> 
     (records, trouble)
 }
 
-fn read_until_error(mut input: impl Read, limit: u64) -> (Vec<u8>, Option<io::Error>) {
-    let mut bytes = Vec::new();
-    // `read_to_end` keeps what came before an error.
-    let error = input.by_ref().take(limit).read_to_end(&mut bytes).err();
-    (bytes, error)
+fn zstd_decoder(compressed: &[u8]) -> io::Result<zstd::stream::read::Decoder<'static, &[u8]>> {
+    let mut decoder = zstd::stream::read::Decoder::with_buffer(compressed)?;
+    // The window it keeps of what came before, whatever the frame asks for.
+    decoder.window_log_max(MAX_CHUNK_BYTES.ilog2())?;
+    Ok(decoder)
 }
 
-/// An attachment from its record; `mcap::parse_record` panics on one shorter than its CRC.
-fn attachment(body: &[u8]) -> Result<Attachment, String> {
-    let mut fields = Fields(body);
+fn read_until_error(mut input: impl Read, limit: u64) -> (Bytes, Option<io::Error>) {
+    // One allocation: a growing one would be copied, and be twice as large at the end.
+    let mut bytes = Vec::with_capacity(limit as usize);
+    // `read_to_end` keeps what came before an error.
+    let error = input.by_ref().take(limit).read_to_end(&mut bytes).err();
+    bytes.shrink_to_fit();
+    (bytes.into(), error)
+}
+
+/// An attachment from its record.
+fn attachment(body: Bytes) -> Result<Attachment, String> {
+    let mut fields = Fields(&body);
     let mut read = || {
         let attachment = Attachment {
             log_time_ns: fields.u64()?,
             create_time_ns: fields.u64()?,
             name: fields.string()?,
             media_type: fields.string()?,
-            data: {
-                let length = usize::try_from(fields.u64()?).ok()?;
-                fields.bytes(length)?.to_vec()
-            },
+            data: vec![],
         };
-        Some((attachment, body.len() - fields.0.len(), fields.u32()?))
+        let length = usize::try_from(fields.u64()?).ok()?;
+        let data = fields.bytes(length)?.len();
+        let end = body.len() - fields.0.len();
+        Some((attachment, end - data..end, fields.u32()?))
     };
-    let (attachment, covered, written) = read().ok_or("attachment shorter than it says")?;
-    let crc = crc32fast::hash(body.get(..covered).unwrap_or_default());
+    let (mut attachment, data, written) = read().ok_or("attachment shorter than it says")?;
+    let crc = crc32fast::hash(body.get(..data.end).unwrap_or_default());
     if written != 0 && written != crc {
         return Err(format!("attachment {:?} with CRC {crc:08x} where {written:08x} was written", attachment.name));
     }
+    // In place: it may be large.
+    let mut bytes = Vec::from(body);
+    bytes.truncate(data.end);
+    bytes.drain(..data.start);
+    attachment.data = bytes;
     Ok(attachment)
 }
 
@@ -470,6 +615,43 @@ impl<'a> Fields<'a> {
     fn string(&mut self) -> Option<String> {
         let length = usize::try_from(self.u32()?).ok()?;
         String::from_utf8(self.bytes(length)?.to_vec()).ok()
+    }
+
+    fn u16(&mut self) -> Option<u16> {
+        self.array().map(u16::from_le_bytes)
+    }
+
+    /// Its length in bytes, then keys and values by turns; every key once.
+    fn map(&mut self) -> Option<BTreeMap<String, String>> {
+        let length = usize::try_from(self.u32()?).ok()?;
+        let mut fields = Fields(self.bytes(length)?);
+        let mut map = BTreeMap::new();
+        while !fields.0.is_empty() {
+            let (key, value) = (fields.string()?, fields.string()?);
+            if map.insert(key, value).is_some() {
+                return None;
+            }
+        }
+        Some(map)
+    }
+
+    /// A schema and its number.
+    fn schema(&mut self) -> Option<(u16, Schema)> {
+        let (id, name, encoding) = (self.u16()?, self.string()?, self.string()?);
+        let length = usize::try_from(self.u32()?).ok()?;
+        Some((id, Schema { name, encoding, data: self.bytes(length)?.to_vec() }))
+    }
+
+    /// The number of a channel's schema, and the channel without it.
+    fn channel(&mut self) -> Option<(u16, Channel)> {
+        let (id, schema_id) = (self.u16()?, self.u16()?);
+        let (topic, message_encoding, metadata) = (self.string()?, self.string()?, self.map()?);
+        Some((schema_id, Channel { id, topic, message_encoding, metadata, schema: None }))
+    }
+
+    /// The number of a message's channel, its sequence number, log time and publish time; what is left is its data.
+    fn message(&mut self) -> Option<(u16, u32, u64, u64)> {
+        Some((self.u16()?, self.u32()?, self.u64()?, self.u64()?))
     }
 
     fn opcode_and_length(&mut self) -> Option<(u8, u64)> {

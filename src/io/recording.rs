@@ -19,9 +19,13 @@ use super::{
 };
 use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic, same_fields};
 
-/// Messages read at a time, and how many times ahead of their use.
+/// Messages read at a time, at most of chunks that unpack to the second number of bytes, and how many times ahead of their
+/// use.
 const BATCH: usize = 512;
-const BATCHES_AHEAD: usize = 4;
+const BATCH_BYTES: u64 = 8 << 20;
+const BATCHES_AHEAD: usize = 2;
+/// What the attachments of a recording may take together, each counted once.
+const MAX_ATTACHMENT_BYTES: usize = 2 << 30;
 
 /// Why a recording cannot be opened.
 #[derive(Debug, thiserror::Error)]
@@ -112,9 +116,22 @@ impl Recording {
                             (&other.name, &other.media_type, &other.data)
                                 == (&attachment.name, &attachment.media_type, &attachment.data)
                         };
-                        if !recording.attachments.iter().any(known) {
-                            recording.attachments.push(attachment);
+                        if recording.attachments.iter().any(known) {
+                            continue;
                         }
+                        let all = recording.attachments.iter().map(|known| known.data.len()).sum::<usize>();
+                        if all + attachment.data.len() > MAX_ATTACHMENT_BYTES {
+                            let what = format!(
+                                "attachment {:?} of {} bytes, with which all have more than the limit of \
+                                 {MAX_ATTACHMENT_BYTES}",
+                                attachment.name,
+                                attachment.data.len()
+                            );
+                            let damage = Damage { offset: 0, what, loses_data: true };
+                            recording.damage.push(FileDamage { file: file.clone(), damage });
+                            continue;
+                        }
+                        recording.attachments.push(attachment);
                     }
                     Item::Metadata(metadata) => recording.metadata.push(metadata),
                     Item::Message(_) => {}
@@ -197,12 +214,18 @@ fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
         };
         let mut told = 0;
         loop {
-            let messages = walker.by_ref().filter_map(|item| match item {
-                Item::Message(raw) => Some(raw),
-                Item::Attachment(_) | Item::Metadata(_) => None,
-            });
-            let raw: VecDeque<_> = messages.take(BATCH).collect();
-            let last = raw.len() < BATCH;
+            let (mut raw, before) = (VecDeque::new(), walker.unpacked_bytes());
+            let last = loop {
+                match walker.next() {
+                    None => break true,
+                    Some(Item::Message(message)) => raw.push_back(message),
+                    Some(Item::Attachment(_) | Item::Metadata(_)) => {}
+                }
+                // Messages hold the memory of their chunks.
+                if raw.len() == BATCH || walker.unpacked_bytes() - before >= BATCH_BYTES {
+                    break false;
+                }
+            };
             let damage = located(file, &walker.damage()[told..]).collect();
             told = walker.damage().len();
             if batches.send(Batch { raw, damage }).is_err() {

@@ -5,10 +5,12 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
-    fs::{File, TryLockError},
+    fs::TryLockError,
     io,
     path::{Path, PathBuf},
 };
+
+use crate::input_file;
 
 use super::{
     bag::{self, FileSummary, TopicInfo},
@@ -50,6 +52,8 @@ pub enum Outcome {
     Restored(Restored),
     /// It held nothing at all, not even the start of a recording, and was removed.
     Empty,
+    /// It was named as a recording in progress, but is none: it has another name now and is not looked at again.
+    SetAside { path: PathBuf },
     /// A running process writes it.
     InUse,
 }
@@ -147,7 +151,7 @@ fn recover_files(files: &[PathBuf]) -> RecoveryReport {
         let listed = match outcome {
             Outcome::InUse => true,
             Outcome::Complete { path, .. } => path == original && directory.join(bag::METADATA_FILE).exists(),
-            Outcome::Restored(_) | Outcome::Empty => false,
+            Outcome::Restored(_) | Outcome::Empty | Outcome::SetAside { .. } => false,
         };
         if !listed && is_bag(directory, original) && !changed.contains(&directory) {
             changed.push(directory);
@@ -173,7 +177,7 @@ fn is_bag(directory: &Path, file: &Path) -> bool {
 
 fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
     let recovery = |outcome| Recovery { original: path.to_owned(), outcome };
-    let lock = File::open(path).map_err(|source| read_error(path, source))?;
+    let lock = input_file::open(path, input_file::ANY_SIZE).map_err(|source| read_error(path, source))?;
     match lock.try_lock() {
         Ok(()) => {}
         Err(TryLockError::WouldBlock) => return Ok(recovery(Outcome::InUse)),
@@ -189,7 +193,14 @@ fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
     }
 
     // A first pass over everything: a sound file is left as it is.
-    let mut walker = open_walker(path, Depth::Messages)?;
+    let mut walker = match open_walker(path, Depth::Messages) {
+        Err(RecordingError::NotMcap { .. }) if is_active(path) => {
+            let kept = free_name(&with_suffix(&target, DAMAGED));
+            rename(path, &kept)?;
+            return Ok(recovery(Outcome::SetAside { path: kept }));
+        }
+        walker => walker?,
+    };
     let messages = walker.by_ref().filter(|item| matches!(item, Item::Message(_))).count() as u64;
     if walker.damage().is_empty() {
         if target != path {
