@@ -2,7 +2,7 @@
 
 /// A line on standard error; that nobody is there to read it is no error.
 macro_rules! note {
-    ($($text:tt)*) => { drop(std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("{}\n", format_args!($($text)*)))) };
+    ($($text:tt)*) => { $crate::terminal::note(format_args!($($text)*)) };
 }
 
 pub use squealcast_core::{fem, physics, reduction};
@@ -26,5 +26,6 @@ pub mod rig;
 pub mod session;
 pub mod settings;
 pub mod simulator;
+mod terminal;
 pub mod verify;
 pub mod wire;

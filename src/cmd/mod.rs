@@ -38,6 +38,7 @@ use crate::io::ros_args::RosArgs;
 use crate::io::whole_file::write_whole;
 use crate::physics::OperatingPoint;
 use crate::rig::Rig;
+use crate::terminal::printable;
 
 /// Predicts friction-induced vibration of a pad-on-disc tribometer, live, from its operating conditions.
 #[derive(Debug, Parser)]
@@ -192,10 +193,10 @@ fn positive(text: &str) -> Result<f64, String> {
     if value > 0.0 { Ok(value) } else { Err(format!("{value} is not more than 0")) }
 }
 
-/// Writes to standard output; a reader that has gone away is no error.
+/// Writes to standard output, control characters as escapes; a reader that has gone away is no error.
 fn print(text: &str) -> anyhow::Result<()> {
     let mut stdout = std::io::stdout().lock();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(printable(text).as_bytes()).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
         _ => Ok(()),
     }
