@@ -96,6 +96,9 @@ pub fn serve(
     let shortcut = Shortcut::new(sender.clone());
     if let Some(shm) = buses.shm() {
         outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
+        if let Some(told) = outputs.other_nodes() {
+            note!("warning: {told}");
+        }
         outputs.shm_sensitivity = Some(ShmSensitivity::new(&shm)?);
         if listening == Listening::ToTheBuses {
             let lost = &outputs.lost_inputs;

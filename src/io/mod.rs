@@ -17,6 +17,7 @@ pub mod recover;
 pub mod ros2;
 pub mod ros_args;
 pub mod shm;
+mod shm_place;
 pub mod tribometer_log;
 pub mod whole_file;
 

@@ -4,6 +4,7 @@
 //! writing side is a pair of ports that any thread may use and that never waits: a reader that is too slow loses the
 //! oldest samples, which it sees as gaps in the sequence numbers.
 
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Once};
 use std::thread::{self, JoinHandle};
@@ -25,6 +26,7 @@ use iceoryx2::waitset::{WaitSetAttachmentError, WaitSetCreateError};
 use thiserror::Error;
 
 use super::heard::{Bus, Counters, Counts, Gaps, Heard};
+use super::shm_place;
 use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
 
 /// The ports may be used from any thread; peers with single-threaded ports connect to them all the same.
@@ -76,8 +78,12 @@ pub enum ShmError {
     ServiceName(String),
     #[error("{0:?} is no file name prefix")]
     FilePrefix(String),
-    #[error("iceoryx2 node: {0:?}")]
-    Node(NodeCreationFailure),
+    #[error("iceoryx2 node in {}: {source:?}", path.display())]
+    Node { path: PathBuf, source: NodeCreationFailure },
+    #[error("iceoryx2's files: {}: {reason}", path.display())]
+    Place { path: PathBuf, reason: String },
+    #[error("{} has {free} bytes free, expected at least {limit}", path.display())]
+    NoRoom { path: PathBuf, free: u64, limit: u64 },
     #[error("service {service}: {source:?}")]
     Topic { service: String, source: PublishSubscribeOpenOrCreateError },
     #[error("event service {service}: {source:?}")]
@@ -163,6 +169,16 @@ impl<F: Form> ShmWriter<F> {
     /// How many readers there are, those included that were killed and not cleaned up after.
     pub fn readers(&self) -> usize {
         self.topic.dynamic_config().number_of_subscribers()
+    }
+
+    /// The name of the service.
+    pub fn service(&self) -> &str {
+        &self.service
+    }
+
+    /// How many writers there are besides this one, with the same exception.
+    pub fn other_writers(&self) -> usize {
+        self.topic.dynamic_config().number_of_publishers().saturating_sub(1)
     }
 }
 
@@ -347,15 +363,13 @@ fn new_node(options: &ShmOptions) -> Result<Node<Ipc>, ShmError> {
     static QUIET: Once = Once::new();
     QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
 
-    let mut config = Config::global_config().clone();
-    if let Some(prefix) = &options.file_prefix {
-        config.global.prefix = FileName::new(prefix.as_bytes()).map_err(|_| ShmError::FilePrefix(prefix.clone()))?;
-    }
+    let config = shm_place::config(options.file_prefix.as_deref())?;
+    let path = shm_place::path_of(config.global.root_path());
     let node = NodeBuilder::new()
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
         .create::<Ipc>()
-        .map_err(ShmError::Node)?;
+        .map_err(|source| ShmError::Node { path, source })?;
     node.try_cleanup_dead_nodes();
     Ok(node)
 }

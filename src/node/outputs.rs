@@ -120,6 +120,19 @@ impl Outputs {
         self.record(clock::now_ns(), Payload::Diagnostics(diagnostics));
     }
 
+    /// That others publish predictions over shared memory too: readers cannot tell them apart.
+    pub fn other_nodes(&self) -> Option<String> {
+        let shm = self.shm.as_ref()?;
+        let others = shm.other_writers();
+        (others > 0).then(|| {
+            format!(
+                "{others} more publish on the service {} over shared memory, whose readers get the predictions of all; \
+                 --shm-prefix keeps nodes apart",
+                shm.service()
+            )
+        })
+    }
+
     /// What the listening side of each bus counted.
     pub fn counts(&self) -> Vec<(&'static str, Counts)> {
         let shm = self.shm_input.as_ref().map(|shm| ("shm", shm.counts()));

@@ -114,6 +114,7 @@ impl Statistics {
         warnings.extend(self.sensitivity_failure.iter().map(|why| format!("no sensitivities: {why}")));
         warnings.extend(self.refused.take());
         warnings.extend(outputs.last_failure.iter().cloned());
+        warnings.extend(outputs.other_nodes());
         let passed_over = self.passed_over - self.passed_over_before;
         self.passed_over_before = self.passed_over;
         if passed_over > 0 {
