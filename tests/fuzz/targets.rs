@@ -1,0 +1,144 @@
+//! Every reader of bytes from outside, as a function that must return for any bytes: with a value or an error, never a panic,
+//! and within the ceilings of `squealcast::input_file`.
+
+#![allow(dead_code)] // the seeds are used in one of the two programs only
+
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+
+use squealcast::full_model::FullModelFile;
+use squealcast::io::message::Payload;
+use squealcast::io::recording::Recording;
+use squealcast::io::recover::recover;
+use squealcast::io::{params_file, tribometer_log};
+use squealcast::physics::chart::Scratch;
+use squealcast::physics::{Chart, OperatingPoint, Traces};
+use squealcast::rig::{Rig, RigFile, matrix_market, npz, scale, uff};
+use squealcast::simulator::Profile;
+use squealcast::wire::schema::Topic;
+use tempfile::TempDir;
+
+/// A reader by name.
+pub struct Target {
+    pub name: &'static str,
+    pub read: fn(&[u8]),
+}
+
+pub const TARGETS: [Target; 12] = [
+    Target {
+        name: "npz",
+        read: |bytes| {
+            let _ = npz::read("a.npz", bytes);
+            let _ = npz::read_pair_residual("a.npz", bytes, 2);
+        },
+    },
+    Target { name: "uff", read: |bytes| drop(uff::read("a.unv", bytes)) },
+    Target {
+        name: "matrix_market",
+        read: |bytes| {
+            if let Ok(listed) = matrix_market::read("a.mtx", bytes)
+                && listed.columns == listed.rows
+                && listed.entries.len() >= listed.rows
+            {
+                let _ = listed.to_sparse("a.mtx");
+            }
+        },
+    },
+    Target {
+        name: "rig",
+        read: |bytes| {
+            let _ = Rig::from_files(&[RigFile { name: "rig.toml".to_owned(), bytes: bytes.to_vec() }]);
+        },
+    },
+    Target { name: "scale", read: |bytes| drop(scale::parse(&String::from_utf8_lossy(bytes))) },
+    Target { name: "full_model", read: full_model },
+    Target { name: "profile", read: |bytes| drop(Profile::load(&file("profile.toml", bytes))) },
+    Target {
+        name: "parameters",
+        read: |bytes| {
+            let _ = params_file::read(&file("parameters.yaml", bytes), "/", "squealcast");
+        },
+    },
+    Target {
+        name: "log",
+        read: |bytes| {
+            let _ = tribometer_log::parse(&tribometer_log::decode_text(bytes), &Default::default());
+        },
+    },
+    Target { name: "recording", read: recording },
+    Target {
+        name: "cdr",
+        read: |bytes| {
+            if let Some((topic, bytes)) = bytes.split_first() {
+                let _ = Payload::from_cdr(Topic::ALL[usize::from(*topic) % Topic::ALL.len()], bytes);
+            }
+        },
+    },
+    // Behind the checksum of its file, which mutations would never get past.
+    Target { name: "chart", read: chart },
+];
+
+static FOLDER: LazyLock<TempDir> = LazyLock::new(|| tempfile::tempdir().expect("a temporary folder"));
+
+fn file(name: &str, bytes: &[u8]) -> PathBuf {
+    let path = FOLDER.path().join(name);
+    std::fs::write(&path, bytes).expect("a file in the temporary folder");
+    path
+}
+
+/// The files of a full model of one node; the first byte says which of them the rest stands for.
+const FULL_MODEL: [(&str, &str); 5] = [
+    ("model.toml", include_str!("full_model.toml")),
+    ("K.mtx", "%%MatrixMarket matrix coordinate real symmetric\n3 3 3\n1 1 2e6\n2 2 3e6\n3 3 4e6\n"),
+    ("M.sti", "1 1 1.0\n2 2 1.0\n3 3 1.0\n"),
+    ("nodes.inp", "*NODE, NSET=ALL\n7, 0.1, 0., 0.\n"),
+    ("rows.csv", "node,direction\n7,x\n7,y\n7,z\n"),
+];
+
+fn full_model(bytes: &[u8]) {
+    let Some((which, bytes)) = bytes.split_first() else { return };
+    for (k, (name, content)) in FULL_MODEL.iter().enumerate() {
+        file(name, if k == usize::from(*which) % FULL_MODEL.len() { bytes } else { content.as_bytes() });
+    }
+    let _ = FullModelFile::load(&FOLDER.path().join("model.toml"));
+}
+
+/// The seeds of `full_model`.
+pub fn full_models() -> Vec<Vec<u8>> {
+    (0..).zip(FULL_MODEL).map(|(k, (_, content))| [&[k][..], content.as_bytes()].concat()).collect()
+}
+
+fn recording(bytes: &[u8]) {
+    let path = file("a.mcap.active", bytes);
+    read_recording(&path);
+    let _ = recover(&path);
+    for entry in std::fs::read_dir(FOLDER.path()).expect("the temporary folder").flatten() {
+        let _ = std::fs::remove_file(entry.path());
+    }
+}
+
+fn read_recording(path: &Path) {
+    let Ok(recording) = Recording::open(path) else { return };
+    let mut messages = recording.messages();
+    messages.by_ref().for_each(drop);
+    assert!(messages.damage().len() <= 200 && recording.damage().len() <= 200, "damage without an end");
+}
+
+fn chart(bytes: &[u8]) {
+    let words: Vec<u64> = bytes.as_chunks::<8>().0.iter().map(|word| u64::from_le_bytes(*word)).collect();
+    let Some(chart) = Chart::from_words(&words) else { return };
+    let (mut scratch, mut modes) = (Scratch::default(), vec![]);
+    for friction_coefficient in [0.0, 0.35, 1.0, 2.5] {
+        let p = OperatingPoint { friction_coefficient, ..RIG.reference };
+        let known = Traces::new(&RIG.model).at(&RIG.model, &p);
+        let _ = chart.evaluate(&p, known, &mut scratch, &mut modes);
+    }
+}
+
+static RIG: LazyLock<Rig> = LazyLock::new(|| Rig::load("nine-dof").expect("embedded"));
+
+/// The seeds of `chart`.
+pub fn charts() -> Vec<Vec<u8>> {
+    let chart = squealcast::node::session_chart(&RIG, 1, &|| true).expect("a chart");
+    vec![chart.words().into_iter().flat_map(u64::to_le_bytes).collect()]
+}
