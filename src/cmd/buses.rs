@@ -18,7 +18,7 @@ pub struct BusOptions {
     /// ROS 2 domain, 0 to 232 [default: ROS_DOMAIN_ID, else 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
     domain: Option<u16>,
-    /// Announce on 127.0.0.1 only
+    /// Announce on 127.0.0.1 only, and hear nothing but the loopback interface
     #[arg(long)]
     loopback: bool,
     /// Put this before the names of the shared-memory services

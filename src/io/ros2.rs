@@ -4,6 +4,7 @@
 //! waits. A peer that was killed is only forgotten after its lease; who listens should look at sequence numbers.
 
 mod link;
+mod loopback;
 
 use std::env;
 use std::sync::Arc;
@@ -31,7 +32,7 @@ const MAX_DOMAIN_ID: u16 = 232;
 pub struct Ros2Options {
     /// 0 to 232; peers of another domain do not exist.
     pub domain_id: u16,
-    /// Announces itself on 127.0.0.1 only. A filter, not an access control.
+    /// Announces itself on 127.0.0.1 only, and hears what comes in by the loopback interface only.
     pub loopback_only: bool,
     /// Names and remappings.
     pub args: RosArgs,

@@ -15,6 +15,7 @@ use tokio::sync::oneshot;
 pub(super) use rustdds::policy::Durability;
 
 use super::super::heard::{Counters, Counts, Gaps, Heard};
+use super::loopback::keep_to_loopback;
 use super::{Ros2Error, Ros2Options, heard};
 
 /// How many messages publishers and subscriptions keep.
@@ -58,6 +59,9 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
             participant = participant.with_only_networks([Ipv4Addr::LOCALHOST]);
         }
         let participant = participant.build().map_err(|e| failed(e.to_string()))?;
+        if options.loopback_only {
+            keep_to_loopback().map_err(|e| failed(format!("cannot keep to the loopback interface: {e}")))?;
+        }
         let context = Context::from_domain_participant(participant).map_err(|e| failed(e.to_string()))?;
         let node = context.new_node(name.clone(), node).map_err(|e| failed(e.to_string()))?;
         Ok(Self {

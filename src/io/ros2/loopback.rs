@@ -1,0 +1,53 @@
+//! Keeps the UDP sockets of this process on the loopback interface.
+//!
+//! RustDDS can be told to announce itself on 127.0.0.1 only, but it binds its sockets to 0.0.0.0, and whoever reaches the
+//! machine reaches them. Binding the sockets to the device `lo` (`SO_BINDTODEVICE`, Linux 5.7 or later without
+//! privileges) has the kernel drop whatever came in by another interface.
+
+use std::fs;
+use std::io;
+use std::os::fd::{BorrowedFd, RawFd};
+
+use socket2::{SockRef, Type};
+
+/// Binds every UDP socket of this process to `lo`. What arrived between the socket's creation and now is still read.
+///
+/// # Errors
+/// `/proc` is not mounted, or the kernel refuses.
+pub(super) fn keep_to_loopback() -> io::Result<()> {
+    // Collected first: the directory is itself an open file.
+    let names = fs::read_dir("/proc/self/fd")?.map(|entry| Ok(entry?.file_name())).collect::<io::Result<Vec<_>>>()?;
+    for number in names.iter().filter_map(|name| name.to_str()?.parse::<RawFd>().ok()) {
+        // SAFETY: the descriptor is only asked what it is, and bound to a device if it is a UDP socket. One that was closed
+        // meanwhile gives EBADF; nothing is closed here.
+        let descriptor = unsafe { BorrowedFd::borrow_raw(number) };
+        let socket = SockRef::from(&descriptor);
+        let is_internet = || socket.local_addr().is_ok_and(|address| address.is_ipv4() || address.is_ipv6());
+        if matches!(socket.r#type(), Ok(Type::DGRAM)) && is_internet() {
+            socket.bind_device(Some(b"lo"))?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::UdpSocket;
+
+    use super::*;
+
+    #[test]
+    fn udp_sockets_are_bound_to_the_loopback_interface_and_others_are_left_alone() {
+        let udp = UdpSocket::bind("0.0.0.0:0").expect("bound");
+        let tcp = std::net::TcpListener::bind("127.0.0.1:0").expect("bound");
+        keep_to_loopback().expect("permitted");
+        assert_eq!(SockRef::from(&udp).device().expect("asked").as_deref(), Some(&b"lo"[..]));
+        assert_eq!(SockRef::from(&tcp).device().expect("asked"), None);
+        let port = udp.local_addr().expect("bound").port();
+        let sender = UdpSocket::bind("127.0.0.1:0").expect("bound");
+        sender.send_to(b"here", ("127.0.0.1", port)).expect("sent");
+        let mut bytes = [0; 8];
+        udp.set_read_timeout(Some(std::time::Duration::from_secs(10))).expect("set");
+        assert_eq!(udp.recv(&mut bytes).expect("received"), 4, "the loopback interface serves it");
+    }
+}
