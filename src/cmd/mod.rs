@@ -20,6 +20,7 @@ mod reduce;
 mod replay;
 mod report;
 mod reproduce;
+mod ros2_side;
 mod run;
 mod signals;
 mod simulate;
@@ -70,6 +71,8 @@ enum Command {
     Verify(verify::Options),
     Reproduce(reproduce::Options),
     Completions(completions::Options),
+    #[command(name = crate::io::ros2::process::COMMAND, hide = true)]
+    Ros2Side(ros2_side::Options),
 }
 
 /// What became of a command that did not fail.
@@ -112,6 +115,7 @@ pub fn main() -> ExitCode {
         Command::Verify(options) => options.run(),
         Command::Reproduce(options) => options.run(),
         Command::Completions(options) => options.run(),
+        Command::Ros2Side(options) => options.run(),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,

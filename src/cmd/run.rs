@@ -15,12 +15,12 @@ use crate::io::chart_file::ChartFile;
 use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig};
 use crate::io::ros_args::RosArgs;
-use crate::io::ros2::{Parameters, Ros2};
+use crate::io::ros2::process::{Ros2Process, Sinks};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::node::{self, Incoming, Node, Outputs, Shortcut, Watch};
 use crate::rig::{EMBEDDED, Rig};
 use crate::session::Counters;
-use crate::settings::{self, Settings};
+use crate::settings::Settings;
 
 /// Run the node on live buses
 #[derive(Debug, Args)]
@@ -118,20 +118,19 @@ pub fn serve(
             initial.set(name, *value)?;
         }
         let changes = sender.clone();
-        let parameters = Parameters {
-            values,
-            validate: Box::new(|name, value| settings::validate(name, value).map(drop).map_err(|e| e.to_string())),
-            accepted: Box::new(move |name, value| {
+        let lost = &outputs.lost_inputs;
+        let sinks = Sinks {
+            input: Box::new(hear(listening, &sender, lost, Incoming::Input)),
+            vibration: Box::new(hear(listening, &sender, lost, Incoming::Vibration)),
+            parameter: Box::new(move |name, value| {
                 // Not waited for: this is the thread that hears the bus.
                 if changes.try_send(Incoming::Parameter { name: name.to_owned(), value }).is_err() {
                     note!("parameter {name} = {value} came into a full queue and has no effect");
                 }
             }),
+            fell: Box::new(|why| note!("the ROS 2 side fell and is started again: {why}")),
         };
-        let lost = &outputs.lost_inputs;
-        let input = hear(listening, &sender, lost, Incoming::Input);
-        let vibration = hear(listening, &sender, lost, Incoming::Vibration);
-        let started = Ros2::start(&ros2, parameters, input, vibration);
+        let started = Ros2Process::start(&ros2, values, sinks);
         outputs.ros2 = Some(started.context("ROS 2; --no-ros stays off it")?);
     }
 
@@ -161,8 +160,10 @@ fn frame(rig: &Rig, display: Option<&Server>, node: Sender<Incoming>) -> live::F
         foot: Box::new(|snapshot| {
             let Counters { solved, charted, reused, faults, .. } = snapshot.counters;
             let passed_over = snapshot.passed_over;
+            let falls = snapshot.ros2_falls;
+            let ros2 = if falls == 0 { String::new() } else { format!("  ROS 2 started again {falls}") };
             format!(
-                "solved {solved}  from the chart {charted}  reused {reused}  faults {faults}  passed over {passed_over}"
+                "solved {solved}  from the chart {charted}  reused {reused}  faults {faults}  passed over {passed_over}{ros2}"
             )
         }),
         quit: Box::new(move || drop(node.send(Incoming::Stop))),

@@ -1,16 +1,16 @@
 //! The only place that reads clocks. What a prediction depends on are the stamps of messages, never these.
 
-use std::sync::LazyLock;
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-static START: LazyLock<Instant> = LazyLock::new(Instant::now);
+use iceoryx2_bb_posix::clock::{ClockType, Time};
+use serde::{Deserialize, Serialize};
 
 /// Both clocks, read together.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reading {
     /// Nanoseconds since the epoch; may jump.
     pub wall_ns: i64,
-    /// Nanoseconds since some moment of this process; never goes back. For durations.
+    /// Nanoseconds since some moment of this machine, the same for all processes; never goes back. For durations.
     pub monotonic_ns: u64,
 }
 
@@ -29,9 +29,11 @@ pub fn now_ns() -> i64 {
     }
 }
 
-/// Nanoseconds since the first call in this process; never goes back.
+/// Nanoseconds since some moment of this machine, the same for all processes; never goes back.
 pub fn monotonic_ns() -> u64 {
-    u64::try_from(START.elapsed().as_nanos()).unwrap_or(u64::MAX)
+    // It fails only where a system has no such clock.
+    let now = Time::now_with_clock(ClockType::Monotonic).map_or_else(|_| Duration::ZERO, |now| now.as_duration());
+    u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
 }
 
 #[cfg(test)]

@@ -4,6 +4,8 @@ use std::collections::HashMap;
 use std::hash::Hash;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use serde::{Deserialize, Serialize};
+
 use super::clock::Reading;
 
 /// The bus a message came over.
@@ -34,7 +36,7 @@ impl<M> Heard<M> {
 }
 
 /// What one listener counted so far.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
     /// Messages handed over.
     pub heard: u64,
@@ -44,6 +46,18 @@ pub struct Counts {
     pub malformed: u64,
     /// Times the bus itself failed to deliver or to wait.
     pub failures: u64,
+}
+
+impl Counts {
+    /// These and `others`, of a listener that took the place of the first.
+    pub(super) fn plus(self, others: Self) -> Self {
+        Self {
+            heard: self.heard + others.heard,
+            missed: self.missed + others.missed,
+            malformed: self.malformed + others.malformed,
+            failures: self.failures + others.failures,
+        }
+    }
 }
 
 /// The counters behind [`Counts`], shared with the thread that listens.

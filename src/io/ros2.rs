@@ -3,18 +3,22 @@
 //! Pure Rust DDS underneath (RustDDS): no ROS 2 installation is needed. Publishing works from any thread and never
 //! waits. A peer that was killed is only forgotten after its lease; who listens should look at sequence numbers.
 
+mod frame;
 mod link;
 mod loopback;
+pub mod process;
+pub mod side;
 
 use std::env;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::Duration;
 
 use ros2_client::{MessageTypeName, NodeOptions, ParameterValue, Publisher};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use self::link::{Durability, Link};
+use self::link::{Durability, Link, MAX_UNANSWERED};
 use super::heard::{Bus, Counts, Heard};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
 use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
@@ -28,7 +32,7 @@ pub const SOURCE_NODE_NAME: &str = "rig";
 const MAX_DOMAIN_ID: u16 = 232;
 
 /// How to join the ROS 2 network.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Ros2Options {
     /// 0 to 232; peers of another domain do not exist.
     pub domain_id: u16,
@@ -73,6 +77,9 @@ pub enum Ros2Error {
     Thread(#[from] std::io::Error),
     #[error("not published on {topic}: {reason}")]
     Publish { topic: &'static str, reason: String },
+    /// What the process of the ROS 2 side says, or why it cannot be started.
+    #[error("{0}")]
+    Side(String),
 }
 
 /// Judges a parameter's value before it is taken; the text of a refusal is what the peer gets to read.
@@ -126,10 +133,14 @@ impl Parameters {
 pub struct Ros2 {
     // First: publishers go before the node.
     prediction: Publisher<Prediction>,
+    /// The publisher before it, while its readers find the present one.
+    retired: Option<Publisher<Prediction>>,
+    max_unanswered: i32,
     rig: Publisher<RigInfo>,
     session_event: Publisher<SessionEvent>,
     sensitivity: Publisher<Sensitivity>,
     diagnostics: Publisher<DiagnosticArray>,
+    beats: Arc<AtomicU64>,
     link: Link<OperatingPoint>,
 }
 
@@ -145,18 +156,46 @@ impl Ros2 {
         sink: impl FnMut(Heard<OperatingPoint>) + Send + 'static,
         vibration: impl FnMut(Heard<Vibration>) + Send + 'static,
     ) -> Result<Self, Ros2Error> {
+        Self::start_with(options, parameters, MAX_UNANSWERED, sink, vibration)
+    }
+
+    /// As [`Self::start`]; publishing a prediction fails once a reader has left `max_unanswered` unacknowledged.
+    fn start_with(
+        options: &Ros2Options,
+        parameters: Parameters,
+        max_unanswered: i32,
+        sink: impl FnMut(Heard<OperatingPoint>) + Send + 'static,
+        vibration: impl FnMut(Heard<Vibration>) + Send + 'static,
+    ) -> Result<Self, Ros2Error> {
         let started = Arc::new(AtomicBool::new(false));
         let mut link = Link::join(options, NODE_NAME, parameters.declare(Arc::clone(&started)))?;
-        let prediction = link.publisher(topic::PREDICTION, ours("Prediction"), Durability::Volatile)?;
-        let rig = link.publisher(topic::RIG, ours("RigInfo"), Durability::TransientLocal)?;
-        let session_event = link.publisher(topic::SESSION_EVENT, ours("SessionEvent"), Durability::Volatile)?;
-        let sensitivity = link.publisher(topic::SENSITIVITY, ours("Sensitivity"), Durability::Volatile)?;
+        let prediction = prediction_publisher(&mut link, max_unanswered)?;
+        let rig = link.publisher(topic::RIG, ours("RigInfo"), Durability::TransientLocal, MAX_UNANSWERED)?;
+        let session_event =
+            link.publisher(topic::SESSION_EVENT, ours("SessionEvent"), Durability::Volatile, MAX_UNANSWERED)?;
+        let sensitivity =
+            link.publisher(topic::SENSITIVITY, ours("Sensitivity"), Durability::Volatile, MAX_UNANSWERED)?;
         let diagnostics_type = MessageTypeName::new("diagnostic_msgs", "DiagnosticArray");
-        let diagnostics = link.publisher(topic::DIAGNOSTICS, diagnostics_type, Durability::Volatile)?;
-        let aside = link.aside(topic::VIBRATION, ours("Vibration"), vibration)?;
+        let diagnostics = link.publisher(topic::DIAGNOSTICS, diagnostics_type, Durability::Volatile, MAX_UNANSWERED)?;
+        let vibration = link.aside(topic::VIBRATION, ours("Vibration"), vibration)?;
+        let beats = Arc::new(AtomicU64::new(0));
+        let beating = beats.clone();
+        let aside = Box::pin(async move {
+            tokio::join!(vibration, beat(&beating));
+        });
         link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink, Some(aside))?;
         started.store(true, Ordering::Release);
-        Ok(Self { prediction, rig, session_event, sensitivity, diagnostics, link })
+        Ok(Self {
+            prediction,
+            retired: None,
+            max_unanswered,
+            rig,
+            session_event,
+            sensitivity,
+            diagnostics,
+            beats,
+            link,
+        })
     }
 
     /// Publishes a prediction, without waiting.
@@ -165,6 +204,23 @@ impl Ros2 {
     /// [`Ros2Error::Publish`], as for the others: more than a minute's worth waits for a reader that does not answer.
     pub fn publish_prediction(&self, prediction: &Prediction) -> Result<(), Ros2Error> {
         publish(&self.prediction, topic::PREDICTION, prediction)
+    }
+
+    /// Puts another publisher of predictions in the place of the present one, which has no room left because a reader does not
+    /// acknowledge. The other readers take a moment to find it; the present one repairs until then, when
+    /// [`Self::retire`] drops it.
+    ///
+    /// # Errors
+    /// Whatever DDS refuses.
+    pub fn renew_prediction_publisher(&mut self) -> Result<(), Ros2Error> {
+        let renewed = prediction_publisher(&mut self.link, self.max_unanswered)?;
+        self.retired = Some(std::mem::replace(&mut self.prediction, renewed));
+        Ok(())
+    }
+
+    /// Drops the publisher of predictions before the present one, and what it kept for readers.
+    pub fn retire(&mut self) {
+        self.retired = None;
     }
 
     /// Publishes what the node predicts for; kept for readers that come later.
@@ -220,6 +276,11 @@ impl Ros2 {
         self.link.counts()
     }
 
+    /// A number that grows ten times a second while the thread that hears is well.
+    pub fn beats(&self) -> u64 {
+        self.beats.load(Ordering::Relaxed)
+    }
+
     /// The node's full name, after remapping.
     pub fn full_name(&self) -> String {
         self.link.node().fully_qualified_name()
@@ -247,8 +308,9 @@ impl Ros2Source {
     ) -> Result<Self, Ros2Error> {
         let node_options = Parameters::none().declare(Arc::new(AtomicBool::new(true)));
         let mut link = Link::join(options, SOURCE_NODE_NAME, node_options)?;
-        let operating_point = link.publisher(topic::OPERATING_POINT, ours("OperatingPoint"), Durability::Volatile)?;
-        let vibration = link.publisher(topic::VIBRATION, ours("Vibration"), Durability::Volatile)?;
+        let operating_point =
+            link.publisher(topic::OPERATING_POINT, ours("OperatingPoint"), Durability::Volatile, MAX_UNANSWERED)?;
+        let vibration = link.publisher(topic::VIBRATION, ours("Vibration"), Durability::Volatile, MAX_UNANSWERED)?;
         link.listen(topic::PREDICTION, ours("Prediction"), |prediction| prediction.input_seq, sink, None)?;
         Ok(Self { operating_point, vibration, link })
     }
@@ -293,6 +355,13 @@ impl Ros2Source {
     pub fn stop(self) {}
 }
 
+fn prediction_publisher(
+    link: &mut Link<OperatingPoint>,
+    max_unanswered: i32,
+) -> Result<Publisher<Prediction>, Ros2Error> {
+    link.publisher(topic::PREDICTION, ours("Prediction"), Durability::Volatile, max_unanswered)
+}
+
 /// A type of `squealcast_msgs`.
 fn ours(name: &str) -> MessageTypeName {
     MessageTypeName::new("squealcast_msgs", name)
@@ -302,6 +371,14 @@ fn publish<M: Serialize + Clone>(publisher: &Publisher<M>, topic: &'static str, 
     publisher
         .publish(message.clone())
         .map_err(|error| Ros2Error::Publish { topic, reason: error.forget_data().to_string() })
+}
+
+/// Shows that the thread it runs on is not held up.
+async fn beat(beats: &AtomicU64) {
+    loop {
+        beats.fetch_add(1, Ordering::Relaxed);
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
 }
 
 /// Everything heard here came over ROS 2.

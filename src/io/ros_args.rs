@@ -6,6 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::params_file::{self, ParamsFileError};
@@ -30,7 +31,7 @@ pub enum RosArgsError {
 }
 
 /// A remapping rule.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Rule {
     /// Only for the node of this name.
     node: Option<String>,
@@ -39,14 +40,14 @@ struct Rule {
 }
 
 /// Where parameter values come from, in the order they were given.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 enum ParameterSource {
     Value { node: Option<String>, name: String, value: f64 },
     File(PathBuf),
 }
 
 /// The ROS 2 arguments of a command line.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RosArgs {
     rules: Vec<Rule>,
     sources: Vec<ParameterSource>,

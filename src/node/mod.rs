@@ -429,9 +429,9 @@ impl Node {
 
     fn diagnose(&mut self, queued: usize) {
         let counters = self.session.counters();
-        let array =
-            self.statistics.report(now_header(), &self.rig, counters, queued, self.mapper.pending(), &self.outputs);
-        self.watch.counters(counters, self.statistics.passed_over);
+        let pending = self.mapper.pending();
+        let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, &mut self.outputs);
+        self.watch.counters(counters, self.statistics.passed_over, self.outputs.ros2_before.falls);
         self.outputs.diagnostics(array);
     }
 }

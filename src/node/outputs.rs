@@ -8,7 +8,7 @@ use crate::io::clock;
 use crate::io::heard::Counts;
 use crate::io::message::{Message, Payload};
 use crate::io::recorder::RecorderHandle;
-use crate::io::ros2::Ros2;
+use crate::io::ros2::process::{Health, Ros2Process};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::wire::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
 
@@ -19,13 +19,15 @@ pub struct Outputs {
     pub shm_sensitivity: Option<ShmSensitivity>,
     pub shm_input: Option<ShmInput>,
     pub shm_vibration: Option<ShmVibrationInput>,
-    pub ros2: Option<Ros2>,
+    pub ros2: Option<Ros2Process>,
     pub recorder: Option<RecorderHandle>,
     /// Inputs that came into a full queue.
     pub lost_inputs: Arc<AtomicU64>,
-    /// Messages a bus refused, and what it said last.
+    /// Messages a bus refused, and what it said last since the last report.
     pub failures: u64,
     pub last_failure: Option<String>,
+    /// The ROS 2 side at the last report.
+    pub ros2_before: Health,
     /// Predictions that were not encoded for ROS 2, since nobody heard them there.
     pub encodings_skipped: u64,
     /// Whether predictions have readers on ROS 2.
@@ -138,6 +140,22 @@ impl Outputs {
         let shm = self.shm_input.as_ref().map(|shm| ("shm", shm.counts()));
         let ros2 = self.ros2.as_ref().map(|ros2| ("ros2", ros2.counts()));
         shm.into_iter().chain(ros2).collect()
+    }
+
+    /// How the ROS 2 side has fared so far, and what was wrong with it since the last report.
+    pub fn ros2_health(&mut self) -> Option<(Health, Vec<String>)> {
+        let now = self.ros2.as_ref()?.health();
+        let before = std::mem::replace(&mut self.ros2_before, now.clone());
+        let mut wrong = vec![];
+        if now.falls > before.falls {
+            wrong.push(format!("the ROS 2 side fell and is started again: {}", now.last_fall));
+        } else if !now.up {
+            wrong.push(format!("the ROS 2 side is down: {}", now.last_fall));
+        }
+        if now.refused > before.refused {
+            wrong.push(format!("{} messages {}", now.refused - before.refused, now.last_refusal));
+        }
+        Some((now, wrong))
     }
 
     fn failed(&mut self, error: &dyn std::fmt::Display) {

@@ -65,7 +65,7 @@ impl Statistics {
         counters: Counters,
         queued: usize,
         map_pending: bool,
-        outputs: &Outputs,
+        outputs: &mut Outputs,
     ) -> DiagnosticArray {
         self.times.sort_unstable();
         let quantile = |q: f64| {
@@ -102,6 +102,12 @@ impl Statistics {
             values.push(pair("chart_leaves", leaves));
             values.push(pair("chart_bytes", bytes));
         }
+        let ros2 = outputs.ros2_health();
+        if let Some((health, _)) = &ros2 {
+            values.push(pair("ros2_side_falls", health.falls));
+            values.push(pair("ros2_side_process", health.process_id));
+            values.push(pair("ros2_refused", health.refused));
+        }
         for (bus, counts) in outputs.counts() {
             values.push(pair(&format!("{bus}_missed"), counts.missed));
             values.push(pair(&format!("{bus}_malformed"), counts.malformed));
@@ -113,7 +119,8 @@ impl Statistics {
         warnings.extend(self.chart_failure.iter().map(|why| format!("no chart: {why}")));
         warnings.extend(self.sensitivity_failure.iter().map(|why| format!("no sensitivities: {why}")));
         warnings.extend(self.refused.take());
-        warnings.extend(outputs.last_failure.iter().cloned());
+        warnings.extend(outputs.last_failure.take());
+        warnings.extend(ros2.into_iter().flat_map(|(_, wrong)| wrong));
         warnings.extend(outputs.other_nodes());
         let passed_over = self.passed_over - self.passed_over_before;
         self.passed_over_before = self.passed_over;

@@ -21,6 +21,8 @@ pub struct Snapshot {
     pub warn_margin: Option<f64>,
     pub counters: Counters,
     pub passed_over: u64,
+    /// How often the ROS 2 side fell and was started again.
+    pub ros2_falls: u64,
 }
 
 /// Unstable modes kept of a [`Sample`].
@@ -193,8 +195,10 @@ impl Watch {
         self.with(|watched| watched.snapshot.warn_margin = Some(warn_margin));
     }
 
-    pub(super) fn counters(&self, counters: Counters, passed_over: u64) {
-        self.with(|watched| (watched.snapshot.counters, watched.snapshot.passed_over) = (counters, passed_over));
+    pub(super) fn counters(&self, counters: Counters, passed_over: u64, ros2_falls: u64) {
+        self.with(|Watched { snapshot, .. }| {
+            (snapshot.counters, snapshot.passed_over, snapshot.ros2_falls) = (counters, passed_over, ros2_falls);
+        });
     }
 }
 

@@ -22,7 +22,7 @@ use super::{Ros2Error, Ros2Options, heard};
 const KEEP_LAST: i32 = 64;
 /// How many messages may wait for the answer of a reader before publishing fails. A killed reader is only forgotten
 /// after its lease, under a minute as a rule; RustDDS's 8192 would be full after 16 s at 500 Hz, for all readers.
-const MAX_UNANSWERED: i32 = 1 << 15;
+pub(super) const MAX_UNANSWERED: i32 = 1 << 15;
 
 /// What the thread of a node does for one subscription.
 pub(super) type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
@@ -75,15 +75,17 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         })
     }
 
-    /// A reliable publisher that never waits.
+    /// A reliable publisher that never waits; publishing fails once a reader has left `max_unanswered` messages
+    /// unacknowledged.
     pub(super) fn publisher<P: Serialize>(
         &mut self,
         topic: &'static str,
         kind: MessageTypeName,
         durability: Durability,
+        max_unanswered: i32,
     ) -> Result<Publisher<P>, Ros2Error> {
         let limits =
-            ResourceLimits { max_samples: MAX_UNANSWERED, max_instances: 1, max_samples_per_instance: MAX_UNANSWERED };
+            ResourceLimits { max_samples: max_unanswered, max_instances: 1, max_samples_per_instance: max_unanswered };
         // What is kept for readers that come later is the latest of it.
         let depth = if durability == Durability::TransientLocal { 1 } else { KEEP_LAST };
         let qos = qos(durability, depth).resource_limits(limits).build();

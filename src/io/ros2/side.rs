@@ -1,0 +1,293 @@
+//! The ROS 2 side of a node: the process that holds RustDDS, under a memory limit.
+//!
+//! RustDDS allocates what a datagram claims (a HEARTBEAT over 2^40 samples, a fragment of 4 GiB). Here that ends this
+//! process alone, and the node starts another.
+
+use std::collections::VecDeque;
+use std::io::{self, Write};
+use std::os::fd::AsFd;
+use std::os::unix::net::UnixStream;
+use std::process;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal, setrlimit};
+use serde::Serialize;
+
+use super::frame::{Frames, FromSide, MAX_TO_SIDE, Next, Start, Status, ToSide, encode};
+use super::{Parameters, Ros2, Ros2Error};
+use crate::io::heard::Heard;
+use crate::io::memory;
+use crate::wire::Prediction;
+
+/// The most private memory of this process, bytes (`RLIMIT_DATA`): an allocation beyond it aborts.
+const MEMORY_LIMIT: u64 = 256 << 20;
+/// Resident memory above which this process ends in order to be started anew, bytes: RustDDS keeps some of the memory
+/// of every peer that died.
+const RESIDENT_LIMIT: usize = 128 << 20;
+/// The longest CDR form of an input or a vibration that is passed on to the node, bytes; longer ones count as malformed.
+const MAX_INPUT: usize = 4096;
+/// Time between looks at the numbers of readers and writers.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// Time between status frames while nothing changes.
+const STATUS_EVERY: Duration = Duration::from_millis(250);
+/// How many predictions a reader may leave unacknowledged before the publisher is renewed: 8 s at 1 kHz. With 64 modes they
+/// take 40 MB.
+const MAX_UNANSWERED: i32 = 1 << 13;
+/// How long predictions are held back after their publisher was renewed, so that its readers have found it.
+const SETTLING: Duration = Duration::from_millis(100);
+/// How long the publisher before it goes on repairing.
+const RETIREMENT: Duration = Duration::from_secs(1);
+/// At most so many predictions are held back.
+const MAX_HELD_BACK: usize = 8192;
+/// How many of them are published for each new one.
+const HELD_BACK_AT_ONCE: usize = 4;
+/// After this many looks without a sign of life of the thread that hears, this process gives up: 5 s.
+const MAX_LOOKS_WITHOUT_BEAT: u32 = 250;
+
+/// Serves the node at the other end of standard input until it closes that socket. `validate` judges parameter values.
+///
+/// # Errors
+/// Standard input is not the socket of a node, or the limits cannot be set.
+pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Error> {
+    let socket = UnixStream::from(io::stdin().as_fd().try_clone_to_owned()?);
+    if socket.peer_addr().is_err() {
+        return Err(Ros2Error::Side("standard input is no socket of a node: this command is for `run`".to_owned()));
+    }
+    contain()?;
+    let node = ToNode(Arc::new(Mutex::new(socket.try_clone()?)));
+    let mut frames = Frames::new(socket.try_clone()?, MAX_TO_SIDE);
+    let start = loop {
+        match frames.next::<ToSide>().map_err(|error| Ros2Error::Side(error.to_string()))? {
+            Next::Frame(ToSide::Start(start)) => break start,
+            Next::Frame(other) => return Err(Ros2Error::Side(format!("{other:?} before the start"))),
+            Next::Nothing => {}
+            Next::End => return Ok(()),
+        }
+    };
+    let too_long = Arc::new(AtomicU64::new(0));
+    match join(start, validate, &node, &too_long) {
+        Ok(ros2) => {
+            node.send(&FromSide::Joined(ros2.full_name()));
+            socket.set_read_timeout(Some(LOOK_EVERY))?;
+            Side {
+                ros2,
+                node,
+                too_long,
+                renewed: None,
+                held_back: VecDeque::new(),
+                refused: 0,
+                last_refusal: String::new(),
+            }
+            .serve(&mut frames);
+        }
+        Err(error) => node.send(&FromSide::Refused(error.to_string())),
+    }
+    Ok(())
+}
+
+/// Limits what this process can do to the machine, and ends it with its node or with the first panic: a thread of
+/// RustDDS that panicked would leave a process that is deaf and looks alive.
+fn contain() -> io::Result<()> {
+    set_parent_process_death_signal(Some(Signal::KILL))?;
+    let limit = |most| Rlimit { current: Some(most), maximum: Some(most) };
+    setrlimit(Resource::Data, limit(MEMORY_LIMIT))?;
+    setrlimit(Resource::Core, limit(0))?;
+    std::panic::set_hook(Box::new(|panic| {
+        let payload = panic.payload();
+        let message = payload.downcast_ref::<&str>().copied().or(payload.downcast_ref::<String>().map(String::as_str));
+        let message = message.unwrap_or("no message").replace('\n', " ");
+        let place = panic.location().map(ToString::to_string).unwrap_or_default();
+        note!("panicked at {place}: {message}");
+        process::abort();
+    }));
+    Ok(())
+}
+
+fn join(
+    start: Start,
+    validate: fn(&str, f64) -> Result<(), String>,
+    node: &ToNode,
+    too_long: &Arc<AtomicU64>,
+) -> Result<Ros2, Ros2Error> {
+    let (inputs, vibrations, parameters) = (node.clone(), node.clone(), node.clone());
+    let (long_inputs, long_vibrations) = (too_long.clone(), too_long.clone());
+    let parameters = Parameters {
+        values: start.parameters,
+        validate: Box::new(validate),
+        accepted: Box::new(move |name, value| {
+            parameters.send(&FromSide::Parameter { name: name.to_owned(), value });
+        }),
+    };
+    Ros2::start_with(
+        &start.options,
+        parameters,
+        MAX_UNANSWERED,
+        move |Heard { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }, &long_inputs),
+        move |Heard { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }, &long_vibrations),
+    )
+}
+
+/// The socket to the node. A node that does not read is waited for.
+#[derive(Clone)]
+struct ToNode(Arc<Mutex<UnixStream>>);
+
+impl ToNode {
+    fn send(&self, frame: &impl Serialize) {
+        match encode(frame) {
+            Ok(bytes) => self.write(&bytes),
+            Err(error) => note!("not sent to the node: {error}"),
+        }
+    }
+
+    /// Sends a frame that others decided the length of.
+    fn send_short(&self, frame: &impl Serialize, too_long: &AtomicU64) {
+        match encode(frame) {
+            Ok(bytes) if bytes.len() <= MAX_INPUT => self.write(&bytes),
+            _ => drop(too_long.fetch_add(1, Ordering::Relaxed)),
+        }
+    }
+
+    fn write(&self, bytes: &[u8]) {
+        let mut socket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if socket.write_all(bytes).is_err() {
+            // The node has gone.
+            process::exit(0);
+        }
+    }
+}
+
+/// A ROS 2 side that joined the network.
+struct Side {
+    ros2: Ros2,
+    node: ToNode,
+    too_long: Arc<AtomicU64>,
+    /// When the publisher of predictions was renewed, until the one before it is dropped.
+    renewed: Option<Instant>,
+    held_back: VecDeque<Prediction>,
+    refused: u64,
+    last_refusal: String,
+}
+
+impl Side {
+    /// Publishes what the node sends, and tells it how things are, until it closes the socket.
+    fn serve(mut self, frames: &mut Frames<UnixStream>) {
+        let (mut looked, mut told) = (Instant::now(), None::<Instant>);
+        let (mut last_status, mut last_beat, mut looks_without_beat) = (Status::default(), 0, 0);
+        loop {
+            match frames.next::<ToSide>() {
+                Ok(Next::Frame(frame)) => self.publish(frame),
+                Ok(Next::Nothing) => {}
+                Ok(Next::End) => return,
+                Err(error) => {
+                    note!("socket of the node: {error}");
+                    return;
+                }
+            }
+            if looked.elapsed() < LOOK_EVERY {
+                continue;
+            }
+            looked = Instant::now();
+            self.publish_held_back();
+            let beat = self.ros2.beats();
+            looks_without_beat = if beat == last_beat { looks_without_beat + 1 } else { 0 };
+            last_beat = beat;
+            if looks_without_beat > MAX_LOOKS_WITHOUT_BEAT {
+                give_up("its thread that hears ROS 2 hangs");
+            }
+            let status = self.status();
+            let due = told.is_none_or(|told| told.elapsed() >= STATUS_EVERY);
+            if due && let Some(resident) = memory::resident_bytes().filter(|&bytes| bytes > RESIDENT_LIMIT) {
+                give_up(&format!("{} MB in memory, more than {} MB", resident >> 20, RESIDENT_LIMIT >> 20));
+            }
+            if due || status != last_status {
+                told = Some(looked);
+                last_status.clone_from(&status);
+                self.node.send(&FromSide::Status(status));
+            }
+        }
+    }
+
+    fn publish(&mut self, frame: ToSide) {
+        let published = match frame {
+            ToSide::Start(_) => Ok(()),
+            ToSide::Prediction(message) => self.publish_prediction(message.into_owned()),
+            ToSide::Rig(message) => self.ros2.publish_rig(&message),
+            ToSide::SessionEvent(message) => self.ros2.publish_session_event(&message),
+            ToSide::Sensitivity(message) => self.ros2.publish_sensitivity(&message),
+            ToSide::Diagnostics(message) => self.ros2.publish_diagnostics(&message),
+        };
+        self.count_refusal(published);
+    }
+
+    /// Publishes a prediction. Where a reader has not acknowledged for so long that there is no room for more, the publisher
+    /// is renewed, so that this reader holds up no other.
+    fn publish_prediction(&mut self, prediction: Prediction) -> Result<(), Ros2Error> {
+        if !self.settling() && self.held_back.is_empty() {
+            let published = self.ros2.publish_prediction(&prediction);
+            if published.is_ok() || self.renewed.is_some() {
+                return published;
+            }
+            self.ros2.renew_prediction_publisher()?;
+            self.renewed = Some(Instant::now());
+            // One alone: what the first heartbeat of a publisher announces, and has not come yet, some readers never ask for.
+            return self.ros2.publish_prediction(&prediction);
+        }
+        self.held_back.push_back(prediction);
+        if self.held_back.len() > MAX_HELD_BACK {
+            self.held_back.pop_front();
+            self.refused += 1;
+        }
+        self.publish_held_back();
+        Ok(())
+    }
+
+    /// Whether readers may not have found the renewed publisher yet.
+    fn settling(&self) -> bool {
+        self.renewed.is_some_and(|renewed| renewed.elapsed() < SETTLING)
+    }
+
+    /// Publishes some of what was held back, in order, and drops the publisher before the present one in its time.
+    fn publish_held_back(&mut self) {
+        if self.renewed.is_some_and(|renewed| renewed.elapsed() >= RETIREMENT) {
+            self.renewed = None;
+            self.ros2.retire();
+        }
+        if self.settling() {
+            return;
+        }
+        // Not all at once: readers keep no more than their depth of it.
+        for _ in 0..HELD_BACK_AT_ONCE {
+            let Some(prediction) = self.held_back.pop_front() else { return };
+            let published = self.ros2.publish_prediction(&prediction);
+            self.count_refusal(published);
+        }
+    }
+
+    fn count_refusal(&mut self, published: Result<(), Ros2Error>) {
+        if let Err(error) = published {
+            self.refused += 1;
+            self.last_refusal = error.to_string();
+        }
+    }
+
+    fn status(&self) -> Status {
+        let mut counts = self.ros2.counts();
+        counts.malformed += self.too_long.load(Ordering::Relaxed);
+        Status {
+            prediction_readers: self.ros2.prediction_readers() as u64,
+            sensitivity_readers: self.ros2.sensitivity_readers() as u64,
+            operating_point_writers: self.ros2.operating_point_writers() as u64,
+            counts,
+            refused: self.refused,
+            last_refusal: self.last_refusal.clone(),
+        }
+    }
+}
+
+/// Ends this process; the node reads why and starts another.
+fn give_up(why: &str) -> ! {
+    note!("{why}");
+    process::exit(1);
+}
