@@ -35,6 +35,13 @@ fn the_stiffness_behind_known_frequencies_is_found() {
     let figure = fs::read_to_string(&svg).unwrap();
     assert!(figure.starts_with("<svg") && figure.contains("contact stiffness of a pair"), "{figure:.200}");
 
+    // As a spreadsheet in a country of decimal commas saves it.
+    let german = format!("mode;frequency_hz\n{}", listed.replace(',', ";").replace('.', ","));
+    let german = write(temp.path(), "german.csv", &german);
+    assert_eq!(json(["identify", &rig, "--targets", &german, "--json"]), found);
+    let mixed = write(temp.path(), "mixed.csv", "mode;frequency_hz\nm;1.234,5\n");
+    run(["identify", &rig, "--targets", &mixed]).exits(1).complains("line 2: frequency_hz is `1.234,5`");
+
     run(["identify", &rig, "--targets", &targets]).exits(0).says("1.000000e0 N/m a pair").says("0.8749");
     let few = json(["identify", &rig, "--targets", &targets, "--json", "--first", "5"]);
     assert!((number(&few, "stiffness_factor") - 8.0).abs() < 1e-5, "{few}");

@@ -160,7 +160,7 @@ fn a_log_with_decimal_commas_becomes_a_recording() {
     let out = text(&folder.path().join("bad.mcap"));
     run(["import", &bad, "-o", &out]).exits(1).complains("bad.csv").complains("line 3").complains("five");
     assert!(!Path::new(&out).exists(), "nothing is left of an import that failed");
-    run(["import", &bad, "-o", &out, "--skip-bad-lines"]).exits(3).complains("1 lines left out").complains("five");
+    run(["import", &bad, "-o", &out, "--skip-bad-lines"]).exits(3).complains("1 line left out").complains("five");
     assert_eq!(Recording::open(Path::new(&out)).expect("a recording").messages().count(), 2);
 }
 

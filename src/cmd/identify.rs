@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::{Outcome, positive, print, write_file};
 use crate::input_file;
+use crate::io::tribometer_log::decode_text;
 use crate::physics::identification::{IdentificationError, Identified, identify};
 use crate::physics::{OperatingPoint, Solver, Vectors};
 use crate::plot;
@@ -110,11 +111,14 @@ fn at_rest_hz(rig: &Rig, normal_load_n: f64, factor: f64) -> anyhow::Result<Vec<
     Ok(spectrum.modes().iter().map(|root| root.frequency_hz()).collect())
 }
 
-/// The column `frequency_hz`, ascending.
+/// The column `frequency_hz`, ascending; separated by `,`, `;` or tabs. Where it is not `,`, it may be the decimal sign.
 fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
     let file = path.display();
     let bytes = input_file::read(path, input_file::TARGETS).with_context(|| format!("{file}: cannot be read"))?;
-    let mut reader = csv::Reader::from_reader(bytes.as_slice());
+    let text = decode_text(&bytes);
+    let header = text.lines().next().unwrap_or_default();
+    let separator = [b';', b'\t'].into_iter().find(|&s| header.contains(char::from(s))).unwrap_or(b',');
+    let mut reader = csv::ReaderBuilder::new().delimiter(separator).from_reader(text.as_bytes());
     let headers = reader.headers().with_context(|| format!("{file}: no header"))?;
     let column = headers
         .iter()
@@ -125,7 +129,9 @@ fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
         let record = record.with_context(|| file.to_string())?;
         let line = record.position().map_or(0, csv::Position::line);
         let value = record.get(column).unwrap_or_default().trim();
-        match value.parse::<f64>() {
+        // A decimal comma only: `1.234,5` would be one of several things.
+        let number = if separator == b',' || value.contains('.') { value.to_owned() } else { value.replace(',', ".") };
+        match number.parse::<f64>() {
             Ok(hz) if hz.is_finite() && hz > 0.0 => targets.push(hz),
             _ => bail!("{file}, line {line}: frequency_hz is `{value}`, expected a number above 0"),
         }

@@ -4,7 +4,7 @@ use clap::Args;
 
 use super::Outcome;
 use crate::io::import::{ImportOptions, import};
-use crate::io::tribometer_log::{Field, LogOptions};
+use crate::io::tribometer_log::{Field, LogOptions, TribometerLog};
 
 /// Make a recording of a tribometer's log
 #[derive(Debug, Args)]
@@ -14,6 +14,16 @@ pub struct Options {
     /// The recording to write
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    #[command(flatten)]
+    log: LogArgs,
+    /// Replace a recording of that name
+    #[arg(long)]
+    overwrite: bool,
+}
+
+/// How a tribometer's log is read
+#[derive(Clone, Debug, Args)]
+pub struct LogArgs {
     /// Take a quantity from a column by its name: time_s, normal_load_n, disc_speed_rad_s, friction_coefficient or
     /// friction_force_n
     #[arg(long = "column", value_name = "QUANTITY=NAME", value_parser = column)]
@@ -24,9 +34,6 @@ pub struct Options {
     /// Leave bad lines out instead of refusing the log
     #[arg(long)]
     skip_bad_lines: bool,
-    /// Replace a recording of that name
-    #[arg(long)]
-    overwrite: bool,
 }
 
 fn column(text: &str) -> Result<(Field, String), String> {
@@ -45,21 +52,47 @@ fn decimal(text: &str) -> Result<char, String> {
     }
 }
 
-impl Options {
-    pub fn run(self) -> anyhow::Result<Outcome> {
-        let log = LogOptions {
-            columns: self.columns,
+impl LogArgs {
+    /// As the reader of logs takes them.
+    pub fn options(&self) -> LogOptions {
+        LogOptions {
+            columns: self.columns.clone(),
             decimal: self.decimal,
             skip_bad_lines: self.skip_bad_lines,
             ..Default::default()
-        };
-        let imported = import(&self.session, &self.output, &ImportOptions { log, overwrite: self.overwrite })?;
-        note!("{}: {} operating points", imported.path.display(), imported.messages);
-        if imported.log.skipped == 0 {
-            return Ok(Outcome::Done);
         }
-        let first = imported.log.first_skipped.map(|error| format!(", the first: {error}")).unwrap_or_default();
-        note!("{} lines left out{first}", imported.log.skipped);
-        Ok(Outcome::Differences)
     }
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let options = ImportOptions { log: self.log.options(), overwrite: self.overwrite };
+        let imported = import(&self.session, &self.output, &options)?;
+        let outcome = describe(&imported.log);
+        let path = imported.path.display();
+        note!("{path}: {} operating points", imported.messages);
+        note!("to predict them: squealcast predict-log {path} --rig RIG -o DIR");
+        Ok(outcome)
+    }
+}
+
+/// Says what was read of a log and what was left out.
+pub fn describe(log: &TribometerLog) -> Outcome {
+    for column in &log.columns {
+        let unit = match column.unit.as_str() {
+            "" | "-" | "1" => String::new(),
+            unit => format!(" in {unit}"),
+        };
+        note!("{} from column {:?}{unit}", column.field, column.header);
+    }
+    if !log.left_out.is_empty() {
+        let names: Vec<String> = log.left_out.iter().map(|name| format!("{name:?}")).collect();
+        note!("left out: {}", names.join(", "));
+    }
+    if log.skipped == 0 {
+        return Outcome::Done;
+    }
+    let first = log.first_skipped.as_ref().map(|error| format!(", the first: {error}")).unwrap_or_default();
+    note!("{} {} left out{first}", log.skipped, if log.skipped == 1 { "line" } else { "lines" });
+    Outcome::Differences
 }

@@ -12,7 +12,7 @@ use sha2::{Digest, Sha256};
 use super::{
     message::Payload,
     recording_file::{RecordingFile, WriteError, with_suffix},
-    tribometer_log::{self, LogError, LogOptions, TribometerLog},
+    tribometer_log::{self, LogError, LogOptions, Sample, TribometerLog},
 };
 use crate::hex::hex;
 use crate::input_file;
@@ -60,10 +60,7 @@ pub struct Imported {
 ///
 /// A log that cannot be read, whose lines make no sense, or an output that exists or cannot be written.
 pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Imported, ImportError> {
-    let bytes = input_file::read(input, input_file::LOG)
-        .map_err(|source| ImportError::Read { path: input.to_owned(), source })?;
-    let log = tribometer_log::parse(&tribometer_log::decode_text(&bytes), &options.log)
-        .map_err(|source| ImportError::Log { path: input.to_owned(), source })?;
+    let (bytes, log) = read_log(input, &options.log)?;
     if output.exists() && !options.overwrite {
         return Err(WriteError::Exists { path: output.to_owned() }.into());
     }
@@ -83,6 +80,30 @@ pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Im
     Ok(Imported { path: output.to_owned(), messages: summary.messages(), span_ns: summary.span_ns, log })
 }
 
+/// Reads the log `input`; its bytes, and what they hold.
+///
+/// # Errors
+///
+/// A file that cannot be read, or whose lines make no sense.
+pub fn read_log(input: &Path, options: &LogOptions) -> Result<(Vec<u8>, TribometerLog), ImportError> {
+    let bytes = input_file::read(input, input_file::LOG)
+        .map_err(|source| ImportError::Read { path: input.to_owned(), source })?;
+    let log = tribometer_log::parse(&tribometer_log::decode_text(&bytes), options)
+        .map_err(|source| ImportError::Log { path: input.to_owned(), source })?;
+    Ok((bytes, log))
+}
+
+/// The message of the sample with number `seq`.
+pub fn operating_point(seq: u64, sample: &Sample) -> OperatingPoint {
+    OperatingPoint {
+        header: Header { stamp: Time::from_ns(sample.stamp_ns), frame_id: String::new() },
+        seq,
+        normal_load_n: sample.normal_load_n,
+        disc_speed_rad_s: sample.disc_speed_rad_s,
+        friction_coefficient: sample.friction_coefficient,
+    }
+}
+
 fn write(file: &mut RecordingFile, input: &Path, bytes: &[u8], log: &TribometerLog) -> Result<(), ImportError> {
     let source = input.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let digest = hex(&Sha256::digest(bytes));
@@ -98,14 +119,7 @@ fn write(file: &mut RecordingFile, input: &Path, bytes: &[u8], log: &TribometerL
     file.write_metadata(&Metadata { name: METADATA_NAME.to_owned(), metadata })?;
     let channel = file.own_channel(Topic::OperatingPoint)?;
     for (seq, sample) in (0_u32..).zip(&log.samples) {
-        let point = OperatingPoint {
-            header: Header { stamp: Time::from_ns(sample.stamp_ns), frame_id: String::new() },
-            seq: seq.into(),
-            normal_load_n: sample.normal_load_n,
-            disc_speed_rad_s: sample.disc_speed_rad_s,
-            friction_coefficient: sample.friction_coefficient,
-        };
-        let cdr = Payload::OperatingPoint(point)
+        let cdr = Payload::OperatingPoint(operating_point(seq.into(), sample))
             .to_cdr()
             .map_err(|error| ImportError::Encode { path: input.to_owned(), reason: error.to_string() })?;
         let stamp_ns = u64::try_from(sample.stamp_ns).unwrap_or(0);

@@ -3,124 +3,22 @@
 //! Pure: text in, samples out. What programs write differs, so the separator (`;`, tab, `,`), the decimal sign, lines
 //! before the header, a byte order mark and Latin-1 are recognised; what remains ambiguous is an error, not a guess.
 
-use std::{borrow::Cow, f64::consts::TAU, fmt};
+mod field;
+mod times;
+
+use std::borrow::Cow;
+
+pub use field::Field;
+use times::{date_ns, decimal_ns, is_stamp};
 
 /// Longest line that is read, in bytes.
 const LONGEST_LINE: usize = 64 << 10;
 
-/// A quantity a column can hold, in the unit it is kept in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Field {
-    /// Time of measurement.
-    Time,
-    NormalLoadN,
-    DiscSpeedRadS,
-    FrictionCoefficient,
-    /// Instead of the friction coefficient: divided by the normal load.
-    FrictionForceN,
-}
-
-impl Field {
-    /// All of them.
-    pub const ALL: [Self; 5] =
-        [Self::Time, Self::NormalLoadN, Self::DiscSpeedRadS, Self::FrictionCoefficient, Self::FrictionForceN];
-
-    /// As options and messages name it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Time => "time_s",
-            Self::NormalLoadN => "normal_load_n",
-            Self::DiscSpeedRadS => "disc_speed_rad_s",
-            Self::FrictionCoefficient => "friction_coefficient",
-            Self::FrictionForceN => "friction_force_n",
-        }
-    }
-
-    /// The field of a [`name`](Self::name).
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|field| field.name() == name)
-    }
-
-    /// What its columns are called, words joined by `_`.
-    fn synonyms(self) -> &'static [&'static str] {
-        match self {
-            Self::Time => {
-                &["time", "t", "timestamp", "time_stamp", "datetime", "date_time", "stamp", "elapsed", "zeit"]
-            }
-            Self::NormalLoadN => {
-                &["normal_load", "load", "normal_force", "force_normal", "fn", "f_n", "normalkraft", "contact_force"]
-            }
-            Self::DiscSpeedRadS => &[
-                "disc_speed",
-                "disk_speed",
-                "speed",
-                "rotational_speed",
-                "rotation_speed",
-                "angular_speed",
-                "angular_velocity",
-                "omega",
-                "ω",
-                "drehzahl",
-                "rpm",
-            ],
-            Self::FrictionCoefficient => &[
-                "friction_coefficient",
-                "coefficient_of_friction",
-                "friction",
-                "mu",
-                "μ",
-                "cof",
-                "reibwert",
-                "reibungszahl",
-                "reibungskoeffizient",
-            ],
-            Self::FrictionForceN => {
-                &["friction_force", "tangential_force", "ft", "f_t", "ff", "f_f", "reibkraft", "reibungskraft"]
-            }
-        }
-    }
-
-    /// Units and how many of the kept unit one of them is; of time: how many ns.
-    fn units(self) -> &'static [(&'static str, f64)] {
-        const FORCES: &[(&str, f64)] = &[("N", 1.0), ("daN", 10.0), ("kN", 1e3)];
-        match self {
-            Self::Time => &[("s", 1e9), ("ms", 1e6), ("us", 1e3), ("ns", 1.0), ("min", 60e9), ("h", 3600e9)],
-            Self::NormalLoadN | Self::FrictionForceN => FORCES,
-            Self::DiscSpeedRadS => &[
-                ("rad/s", 1.0),
-                ("rad_s", 1.0),
-                ("rpm", TAU / 60.0),
-                ("1/min", TAU / 60.0),
-                ("min-1", TAU / 60.0),
-                ("min^-1", TAU / 60.0),
-                ("U/min", TAU / 60.0),
-                ("rev/min", TAU / 60.0),
-                ("Hz", TAU),
-                ("rev/s", TAU),
-                ("deg/s", TAU / 360.0),
-            ],
-            Self::FrictionCoefficient => &[("-", 1.0), ("1", 1.0), ("", 1.0)],
-        }
-    }
-
-    fn unit(self, text: &str) -> Option<(&'static str, f64)> {
-        let text = text.trim().replace(['µ', 'μ'], "u");
-        let exact = self.units().iter().find(|(unit, _)| *unit == text);
-        exact.or_else(|| self.units().iter().find(|(unit, _)| unit.eq_ignore_ascii_case(&text))).copied()
-    }
-}
-
-impl fmt::Display for Field {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
-
 /// What is wrong with a log. Lines count from 1.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum LogError {
-    #[error("no line names the columns needed: {missing} not found; line {line} comes closest: {header:?}")]
-    NoHeader { line: usize, header: String, missing: String },
+    #[error("no line names the columns needed: {missing} not found; line {line} comes closest: {header:?}{hint}")]
+    NoHeader { line: usize, header: String, missing: String, hint: String },
     #[error("line {line}: no column is called {header:?}, which {field} is to be read from")]
     NoSuchColumn { line: usize, field: Field, header: String },
     #[error("line {line}: both {first:?} and {second:?} may be {field}: say which with --column {field}=NAME")]
@@ -195,7 +93,7 @@ pub struct Column {
     pub field: Field,
     /// Its name in the log.
     pub header: String,
-    /// Empty where it has none (ISO 8601 times, friction coefficients).
+    /// Empty where it has none (dates, friction coefficients).
     pub unit: String,
     index: usize,
     factor: f64,
@@ -206,6 +104,8 @@ pub struct Column {
 pub struct TribometerLog {
     pub samples: Vec<Sample>,
     pub columns: Vec<Column>,
+    /// The names of the columns that were not read, those without a name left out.
+    pub left_out: Vec<String>,
     pub separator: char,
     pub decimal: char,
     /// Lines left out, and what was wrong with the first.
@@ -256,8 +156,11 @@ pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError
         None => decimal_sign(rows(unit_rows), &columns, iso)?,
     };
 
+    let read = |index: &usize| columns.iter().any(|column| column.index == *index);
+    let left_out = header.cells.iter().enumerate().filter(|(index, cell)| !read(index) && !cell.is_empty());
     let mut log = TribometerLog {
         samples: Vec::new(),
+        left_out: left_out.map(|(_, cell)| cell.clone()).collect(),
         columns,
         separator: char::from(header.separator),
         decimal,
@@ -295,6 +198,8 @@ pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError
 struct Header {
     line: usize,
     separator: u8,
+    /// All names of the line.
+    cells: Vec<String>,
     columns: Vec<Column>,
     /// Byte where the lines below begin.
     end: usize,
@@ -310,7 +215,7 @@ fn find_header(text: &str, options: &LogOptions) -> Result<Header, LogError> {
         for separator in [b';', b'\t', b','] {
             let Some(cells) = split_line(line, separator) else { continue };
             match header_columns(&cells, number + 1, options) {
-                Ok(columns) => return Ok(Header { line: number + 1, separator, columns, end }),
+                Ok(columns) => return Ok(Header { line: number + 1, separator, cells, columns, end }),
                 Err((found, error)) if closest.as_ref().is_none_or(|(best, _)| found > *best) => {
                     closest = Some((found, error));
                 }
@@ -318,7 +223,8 @@ fn find_header(text: &str, options: &LogOptions) -> Result<Header, LogError> {
             }
         }
     }
-    let nothing = LogError::NoHeader { line: 1, header: String::new(), missing: "time".to_owned() };
+    let nothing =
+        LogError::NoHeader { line: 1, header: String::new(), missing: "time".to_owned(), hint: String::new() };
     Err(closest.map_or(nothing, |(_, error)| error))
 }
 
@@ -373,17 +279,20 @@ fn header_columns(cells: &[String], line: usize, options: &LogOptions) -> Result
     }
     let found = columns.len();
     let has = |field| columns.iter().any(|column| column.field == field);
-    let mut missing: Vec<String> = [Field::Time, Field::NormalLoadN, Field::DiscSpeedRadS]
-        .into_iter()
-        .filter(|field| !has(*field))
-        .map(|field| field.name().to_owned())
-        .collect();
-    if !has(Field::FrictionCoefficient) && !has(Field::FrictionForceN) {
-        missing.push("friction_coefficient or friction_force_n".to_owned());
-    }
+    let needed = [Field::Time, Field::NormalLoadN, Field::DiscSpeedRadS].into_iter().filter(|field| !has(*field));
+    let friction = !has(Field::FrictionCoefficient) && !has(Field::FrictionForceN);
+    let missing: Vec<Field> = needed.chain(friction.then_some(Field::FrictionCoefficient)).collect();
     if !missing.is_empty() {
-        let missing = missing.join(", ");
-        return Err((found, trouble.unwrap_or(LogError::NoHeader { line, header: cells.join(" | "), missing })));
+        let free = |index: usize| columns.iter().all(|column| column.index != index);
+        let free: Vec<&String> = cells.iter().enumerate().filter(|(k, _)| free(*k)).map(|(_, cell)| cell).collect();
+        let hint = missing.iter().find_map(|field| hint(*field, &free)).unwrap_or_default();
+        let name = |field: &Field| match field {
+            Field::FrictionCoefficient => format!("{field} or {}", Field::FrictionForceN),
+            _ => field.to_string(),
+        };
+        let missing = missing.iter().map(name).collect::<Vec<_>>().join(", ");
+        let header = cells.join(" | ");
+        return Err((found, trouble.unwrap_or(LogError::NoHeader { line, header, missing, hint })));
     }
     if let Some(trouble) = trouble {
         return Err((found, trouble));
@@ -392,6 +301,14 @@ fn header_columns(cells: &[String], line: usize, options: &LogOptions) -> Result
         columns.retain(|column| column.field != Field::FrictionForceN);
     }
     Ok(columns)
+}
+
+/// How to read a missing field from one of the columns not read: by its unit it may be the one, but that is for the user to
+/// know (a force may be normal or tangential).
+fn hint(field: Field, free: &[&String]) -> Option<String> {
+    let fits = |cell: &&&String| split_unit(cell).1.is_some_and(|unit| !unit.is_empty() && field.unit(&unit).is_some());
+    let column = free.iter().find(fits)?;
+    Some(format!("; if {column:?} is {field}, say so with --column '{field}={column}'"))
 }
 
 /// Name and unit of `name [unit]`, `name (unit)`, `name / unit` or `name in unit`.
@@ -591,6 +508,8 @@ fn decimal_sign(
     Ok(if comma.is_some() { ',' } else { '.' })
 }
 
+const DATE: &str = "an ISO 8601 time, or one as 31.12.2025 13:45:07, between 1970 and 2038";
+
 fn sample(
     row: &Row,
     columns: &[Column],
@@ -610,7 +529,7 @@ fn sample(
         };
         if column.field == Field::Time {
             sample.stamp_ns = if iso {
-                iso_ns(cell).ok_or_else(|| wrong("an ISO 8601 time between 1970 and 2038"))?
+                date_ns(cell).ok_or_else(|| wrong(DATE))?
             } else {
                 let text = plain_number(cell, decimal).ok_or_else(|| wrong("a number"))?;
                 let ns = decimal_ns(&text, column.factor as i64).ok_or_else(|| wrong("a time in range"))?;
@@ -677,46 +596,10 @@ fn plain_number(cell: &str, decimal: char) -> Option<String> {
     (body.starts_with(|c: char| c.is_ascii_digit() || c == '.') && text.parse::<f64>().is_ok()).then_some(text)
 }
 
-/// A decimal number of units of `unit_ns`, in ns; exact, where `f64` would lose the ns of times since the epoch.
-fn decimal_ns(text: &str, unit_ns: i64) -> Option<i64> {
-    if text.contains(['e', 'E']) {
-        let ns = (text.parse::<f64>().ok()? * unit_ns as f64).round();
-        return (ns.abs() < i64::MAX as f64).then_some(ns as i64);
-    }
-    let (negative, digits) = match text.strip_prefix('-') {
-        Some(digits) => (true, digits),
-        None => (false, text.trim_start_matches('+')),
-    };
-    let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
-    let whole: i128 = if whole.is_empty() { 0 } else { whole.parse().ok()? };
-    let fraction = fraction.get(..fraction.len().min(18))?;
-    let parts: i128 = if fraction.is_empty() { 0 } else { fraction.parse().ok()? };
-    let scale = 10_i128.checked_pow(u32::try_from(fraction.len()).ok()?)?;
-    let unit = i128::from(unit_ns);
-    let ns = whole.checked_mul(unit)?.checked_add((parts * unit + scale / 2) / scale)?;
-    i64::try_from(if negative { -ns } else { ns }).ok()
-}
-
-/// Whether `builtin_interfaces/Time`, whose seconds are an `int32`, holds a time; before 1970 is a mistake.
-fn is_stamp(ns: &i64) -> bool {
-    (0..(1 << 31) * 1_000_000_000).contains(ns)
-}
-
-/// An ISO 8601 time in ns since the epoch; without an offset it is UTC.
-fn iso_ns(cell: &str) -> Option<i64> {
-    let text = cell.trim().replacen(',', ".", 1);
-    let stamp = match text.parse::<jiff::Timestamp>() {
-        Ok(stamp) => stamp,
-        Err(_) => {
-            let civil = text.parse::<jiff::civil::DateTime>().ok()?;
-            civil.to_zoned(jiff::tz::TimeZone::UTC).ok()?.timestamp()
-        }
-    };
-    i64::try_from(stamp.as_nanosecond()).ok().filter(is_stamp)
-}
-
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::TAU;
+
     use super::*;
     use proptest::prelude::*;
 
