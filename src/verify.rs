@@ -11,7 +11,7 @@ use std::sync::Arc;
 use crate::ahead::Ahead;
 use crate::io::chart_file::ChartFile;
 use crate::io::message::Payload;
-use crate::io::recording::{Recorded, Recording, RecordingError};
+use crate::io::recording::{FileDamage, Recorded, Recording};
 use crate::node::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map};
 use crate::physics::{OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
@@ -42,6 +42,8 @@ pub struct Verification {
     pub growth_rate_difference_per_s: f64,
     /// The first differences in words.
     pub described: Vec<String>,
+    /// What of the recording could not be read.
+    pub damage: Vec<FileDamage>,
 }
 
 impl Verification {
@@ -57,15 +59,22 @@ impl Verification {
     }
 }
 
+/// Where the charts of a verification come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Charts {
+    /// A chart that is kept on disk serves if it has the recorded hash.
+    Kept,
+    /// Charts are built anew, so that the builder is verified too.
+    Anew,
+}
+
 /// Why nothing could be compared.
 #[derive(Debug, thiserror::Error)]
 pub enum VerifyError {
-    #[error(transparent)]
-    Recording(#[from] RecordingError),
     #[error("the recording begins in the middle of a session (split {split}): give the directory of all its files")]
     Split { split: String },
-    #[error("the recording holds no predictions")]
-    NoPredictions,
+    #[error("the recording holds no prediction that can be read{}", .damage.iter().map(|d| format!("; {d}")).collect::<String>())]
+    NoPredictions { damage: Vec<FileDamage> },
     #[error("cannot compute the stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s: {reason}")]
     Map { normal_load_n: f64, disc_speed_rad_s: f64, reason: String },
     #[error("cannot chart the rig: {0}")]
@@ -80,21 +89,23 @@ pub enum VerifyError {
 ///
 /// # Errors
 /// [`VerifyError`].
-pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, VerifyError> {
+pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<Verification, VerifyError> {
     if let Some(split) = recording.session_metadata("split_index").filter(|&split| split != "0") {
         return Err(VerifyError::Split { split: split.to_owned() });
     }
     let mut answered: HashSet<(Time, u64)> = HashSet::new();
-    for entry in recording.messages() {
+    let mut messages = recording.messages();
+    for entry in messages.by_ref() {
         if let Recorded::Known(Payload::Prediction(prediction)) = &entry.message {
             answered.insert((prediction.header.stamp, prediction.input_seq));
         }
     }
+    let damage = messages.damage().to_vec();
     if answered.is_empty() {
-        return Err(VerifyError::NoPredictions);
+        return Err(VerifyError::NoPredictions { damage });
     }
 
-    let mut found = Verification::default();
+    let mut found = Verification { damage, ..Verification::default() };
     let mut session = Session::new(rig.clone(), Settings::for_rig(rig));
     let mut solver = Solver::new(rig.model.dimension());
     let mut computed: VecDeque<Prediction> = VecDeque::new();
@@ -123,7 +134,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, Ver
             }
             Recorded::Known(Payload::SessionEvent(event)) => {
                 let map = session.map().cloned();
-                let event = session_event(event, rig, map.as_deref(), &mut solver, &mut found)?;
+                let event = session_event(event, rig, charts, map.as_deref(), &mut solver, &mut found)?;
                 step(&mut session, &mut computed, event);
             }
             Recorded::Known(Payload::Prediction(recorded)) => match computed.pop_front() {
@@ -147,6 +158,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>) -> Result<Verification, Ver
 fn session_event(
     event: SessionEvent,
     rig: &Rig,
+    charts: Charts,
     map: Option<&StabilityMap>,
     solver: &mut Solver,
     found: &mut Verification,
@@ -182,9 +194,12 @@ fn session_event(
             Ok(Event::EndsReady(Arc::new(ends)))
         }
         event_kind::CHART => {
-            // Whoever built it, a chart with the recorded hash is the recorded one, to the last bit.
-            let kept = ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);
+            let kept = match charts {
+                Charts::Kept => ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash),
+                Charts::Anew => None,
+            };
             let kept = kept.and_then(|file| file.load().ok().flatten());
+            // Whoever built it, a chart with the recorded hash is the recorded one, to the last bit.
             let chart = match kept.filter(|chart| chart.is_complete() && chart_hash(chart) == event.hash) {
                 Some(chart) => chart,
                 None => session_chart(rig, std::thread::available_parallelism().map_or(1, usize::from), &|| true)

@@ -667,17 +667,31 @@ fn recordings_of_others_are_read() {
         return;
     }
     for path in [directory.clone(), temp.path().join("lz4.mcap"), temp.path().join("plain.mcap")] {
-        let entries = read(&path);
+        // Its type alone does not make a topic the node's.
+        let unread = Recording::open(&path).unwrap();
+        assert_eq!(unread.topics().name_of(Topic::OperatingPoint), None, "{path:?}");
+        assert!(unread.topics().unread()[0].to_string().contains("/lab/conditions is not read"), "{path:?}");
+        let options = ReadOptions { topics: vec!["/lab/conditions".to_owned()] };
+        let recording = Recording::open_with(&path, options).unwrap();
+        assert!(recording.is_complete(), "{:?}", recording.damage());
+        let entries: Vec<Entry> = recording.messages().collect();
         assert_eq!(sequence_numbers(&entries), (0..100).collect::<Vec<_>>(), "{path:?}");
         let Some(Payload::OperatingPoint(point)) = known(&entries[6]) else { panic!("{:?}", entries[6]) };
         assert_eq!((point.normal_load_n, point.disc_speed_rad_s, point.friction_coefficient), (503.0, 13.0, 0.3));
         assert_eq!(entries.iter().filter(|entry| entry.message == Recorded::Other).count(), 100);
 
-        let options = ReadOptions { operating_point_topic: Some("/lab/conditions".to_owned()) };
-        let recording = Recording::open_with(&path, options).unwrap();
-        assert_eq!(sequence_numbers(&recording.messages().collect::<Vec<_>>()).len(), 100);
-        let options = ReadOptions { operating_point_topic: Some("/elsewhere".to_owned()) };
-        let recording = Recording::open_with(&path, options).unwrap();
-        assert_eq!(sequence_numbers(&recording.messages().collect::<Vec<_>>()).len(), 0);
+        let options = ReadOptions { topics: vec!["/elsewhere".to_owned()] };
+        let error = Recording::open_with(&path, options).unwrap_err().to_string();
+        assert!(error.contains("holds no topic /elsewhere") && error.contains("/lab/conditions"), "{error}");
+    }
+    // As `ros2 bag record` compresses: one message at a time, or whole files; and its older format.
+    let compressed = Recording::open(&temp.path().join("foreign-message")).unwrap();
+    let mut messages = compressed.messages();
+    assert_eq!(sequence_numbers(&messages.by_ref().collect::<Vec<_>>()), [0; 0]);
+    let damage = messages.damage().iter().map(ToString::to_string).collect::<String>();
+    assert!(damage.contains("100 messages cannot be decoded") && damage.contains("message by message"), "{damage}");
+    for (name, named) in [("foreign-file", "compressed as a whole"), ("foreign-sqlite3", "sqlite3")] {
+        let error = Recording::open(&temp.path().join(name)).unwrap_err().to_string();
+        assert!(error.contains(named) && error.contains("ros2 bag convert"), "{error}");
     }
 }

@@ -14,7 +14,9 @@ mod import;
 mod live;
 mod memory;
 mod on_basis;
+mod player;
 mod predict;
+mod recordings;
 mod recover;
 mod reduce;
 mod replay;
@@ -76,7 +78,7 @@ enum Command {
 }
 
 /// What became of a command that did not fail.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Outcome {
     /// Exit code 0.
     Done,
@@ -121,14 +123,14 @@ pub fn main() -> ExitCode {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::Differences) => ExitCode::from(3),
         Err(error) => {
-            note!("error: {}", told(&error));
+            note!("error: {}", failure(&error));
             ExitCode::FAILURE
         }
     }
 }
 
-/// An error with its causes; a cause that the message before already ends with is not told twice.
-fn told(error: &anyhow::Error) -> String {
+/// An error with its causes; a cause that the message before already ends with is not repeated.
+fn failure(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain().map(ToString::to_string).filter(|cause| !cause.is_empty()) {
         if !text.ends_with(&cause) {

@@ -1,39 +1,48 @@
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail, ensure};
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 
 use super::buses::BusOptions;
-use super::{Outcome, live, not_negative, positive, print, signals};
+use super::player::Player;
+use super::recordings::{Recordings, without_predictions};
+use super::{Outcome, failure, live, not_negative, positive, print, signals};
 use crate::io::message::Payload;
 use crate::io::pace::{Due, Pacer, Pacing};
 use crate::io::recording::{Recorded, Recording};
 use crate::io::ros_args::RosArgs;
-use crate::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
-use crate::io::shm::{ShmOptions, ShmOutput, ShmSource, ShmVibrationSource};
 use crate::node::Watch;
 use crate::rig::{Rig, RigFile};
-use crate::verify::{Verification, verify};
-use crate::wire::topic;
+use crate::verify::{Charts, Verification, verify};
+use crate::wire::Time;
+use crate::wire::schema::Topic;
 
-/// Play a recording on live buses, or predict it again and compare
+/// Play a recording on live buses, or predict recordings again and compare
 #[derive(Debug, Args)]
 pub struct Options {
-    /// A recording: a file, or the directory of all its files
-    file: PathBuf,
+    #[command(flatten)]
+    recordings: Recordings,
     /// Predict again as fast as possible and compare with what was recorded; exit code 3 where it differs
     #[arg(long)]
     verify: bool,
     /// With --verify: predict with this rig instead of the recorded one
     #[arg(long, value_name = "RIG", requires = "verify")]
     rig: Option<String>,
+    /// With --verify: chart the rig anew instead of taking the chart that is kept
+    #[arg(long, requires = "verify")]
+    no_chart_cache: bool,
+    /// Seconds to wait for a reader before playing, and until no further one has come for half a second; 0 plays at once
+    #[arg(long, value_name = "S", value_parser = not_negative, default_value = "5")]
+    wait: f64,
     /// Playback speed; 2 plays twice as fast
     #[arg(long, value_name = "R", value_parser = positive, default_value = "1")]
     rate: f64,
-    /// Begin again at the end, until stopped
+    /// Begin again at the end, until stopped. Stamps go on: from the second round on they are later by the length of the
+    /// rounds before
     #[arg(long = "loop")]
     repeat: bool,
     /// Recorded seconds to skip at the start
@@ -43,7 +52,7 @@ pub struct Options {
     #[arg(long, value_name = "S", value_parser = positive)]
     playback_duration: Option<f64>,
     /// Topics to play [default: all of the node's]
-    #[arg(long, value_name = "TOPIC", num_args = 1.., value_parser = KNOWN_TOPICS)]
+    #[arg(long, value_name = "TOPIC", num_args = 1.., value_parser = topics())]
     topics: Vec<String>,
     /// Print log lines instead of a live table, on a terminal too
     #[arg(long)]
@@ -52,39 +61,73 @@ pub struct Options {
     buses: BusOptions,
 }
 
-const KNOWN_TOPICS: [&str; 6] =
-    [topic::OPERATING_POINT, topic::PREDICTION, topic::RIG, topic::SESSION_EVENT, topic::DIAGNOSTICS, topic::VIBRATION];
+/// Between two rounds of a recording that is played again and again, in recorded time.
+const BETWEEN_ROUNDS_NS: u64 = 10_000_000;
+
+/// The names of all topics, for clap.
+fn topics() -> PossibleValuesParser {
+    PossibleValuesParser::new(Topic::ALL.map(Topic::name))
+}
 
 impl Options {
     pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
-        let recording = Recording::open(&self.file)?;
-        for damage in recording.damage() {
-            note!("damaged: {damage}");
-        }
-        if self.verify { self.verify(&recording) } else { self.play(&recording, ros_args) }
+        if self.verify { self.verify_all() } else { self.play(ros_args) }
     }
 
-    fn verify(&self, recording: &Recording) -> anyhow::Result<Outcome> {
+    /// Verifies all recordings; one that cannot be does not keep the others.
+    fn verify_all(&self) -> anyhow::Result<Outcome> {
+        let paths = self.recordings.paths()?;
+        if let [path] = &paths[..] {
+            return self.verify(path);
+        }
+        let (mut outcome, mut failed) = (Outcome::Done, 0);
+        for path in &paths {
+            print(&format!("{}: ", path.display()))?;
+            match self.verify(path) {
+                Ok(found) => outcome = outcome.max(found),
+                Err(error) => {
+                    print("not verified\n")?;
+                    note!("error: {}", failure(&error));
+                    failed += 1;
+                }
+            }
+        }
+        ensure!(failed == 0, "{failed} of {} recordings could not be verified", paths.len());
+        Ok(outcome)
+    }
+
+    fn verify(&self, path: &Path) -> anyhow::Result<Outcome> {
+        let recording = self.recordings.open(path)?;
+        if recording.topics().name_of(Topic::Prediction).is_none() {
+            return Err(without_predictions(path, &recording));
+        }
         let rig = match &self.rig {
             Some(rig) => Rig::load(rig)?,
-            None => recorded_rig(recording)?,
+            None => recorded_rig(&recording)?,
         };
+        let charts = if self.no_chart_cache { Charts::Anew } else { Charts::Kept };
         let started = Instant::now();
-        let found = verify(recording, &Arc::new(rig))?;
+        let found = verify(&recording, &Arc::new(rig), charts)?;
+        for damage in found.damage.iter().filter(|damage| !recording.damage().contains(damage)) {
+            note!("damaged: {damage}");
+        }
         print(&report(&found, started.elapsed()))?;
-        let lost = recording.damage().iter().any(|damage| damage.damage.loses_data);
+        let lost = recording.damage().iter().chain(&found.damage).any(|damage| damage.damage.loses_data);
         Ok(if found.agrees() && !lost { Outcome::Done } else { Outcome::Differences })
     }
 
-    fn play(&self, recording: &Recording, ros_args: RosArgs) -> anyhow::Result<Outcome> {
+    fn play(&self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
+        let (path, recording) = self.recordings.only()?;
+        let recording = &recording;
         let player = Player::join(self.buses.shm(), self.buses.ros2(ros_args)?)?;
         let first = recording.messages().next().context("the recording is empty")?;
         let stopped = Arc::new(AtomicBool::new(false));
         let stop = stopped.clone();
         signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;
+        self.wait(recording, &player, &stopped);
         let watch = Watch::default();
         let played = Arc::new(AtomicU64::new(0));
-        let shown = live::show(self.frame(recording, &played, &stopped), watch.clone(), self.plain);
+        let shown = live::show(frame(&path, recording, &played, &stopped), watch.clone(), self.plain);
         let done = self.play_rounds(recording, first.log_time_ns, &player, &watch, &played, &stopped);
         shown.stop();
         done?;
@@ -92,18 +135,25 @@ impl Options {
         Ok(Outcome::Done)
     }
 
-    /// What is around the table of what is played.
-    fn frame(&self, recording: &Recording, played: &Arc<AtomicU64>, stopped: &Arc<AtomicBool>) -> live::Frame {
-        let file = self.file.file_name().unwrap_or(self.file.as_os_str()).to_string_lossy().into_owned();
-        // A recording that was imported carries no rig: then every damping below zero grows.
-        let rig = recorded_rig(recording).ok();
-        let title = rig.as_ref().map_or_else(|| file.clone(), |rig| format!("{}, {file}", rig.name));
-        let (played, stopped) = (played.clone(), stopped.clone());
-        live::Frame {
-            title,
-            instability_threshold: rig.map_or(0.0, |rig| rig.instability_threshold),
-            foot: Box::new(move |_| format!("played {} messages", played.load(Ordering::Relaxed))),
-            quit: Box::new(move || stopped.store(true, Ordering::Relaxed)),
+    /// Whether the messages of a topic are to be played.
+    fn wants(&self, topic: Topic) -> bool {
+        self.topics.is_empty() || self.topics.iter().any(|wanted| wanted == topic.name())
+    }
+
+    fn wait(&self, recording: &Recording, player: &Player, stopped: &AtomicBool) {
+        if self.wait == 0.0 {
+            return;
+        }
+        let played = |topic: &Topic| self.wants(*topic) && recording.topics().name_of(*topic).is_some();
+        let topics: Vec<Topic> = Topic::ALL.into_iter().filter(played).collect();
+        if topics.is_empty() {
+            return;
+        }
+        note!("waiting up to {} s for a reader; --wait 0 plays at once", self.wait);
+        // What is too long for a duration never ends.
+        let limit = Duration::try_from_secs_f64(self.wait).unwrap_or(Duration::MAX);
+        if !player.wait_for_readers(&topics, limit, stopped) && !stopped.load(Ordering::Relaxed) {
+            note!("no reader within {} s: playing all the same", self.wait);
         }
     }
 
@@ -116,9 +166,6 @@ impl Options {
         played: &AtomicU64,
         stopped: &AtomicBool,
     ) -> anyhow::Result<()> {
-        let wanted = |payload: &Payload| {
-            self.topics.is_empty() || self.topics.iter().any(|topic| topic == payload.topic().name())
-        };
         let pacing = Pacing {
             rate: self.rate,
             start_offset_s: self.start_offset,
@@ -128,11 +175,13 @@ impl Options {
         let pacer = Pacer::new(pacing, first_ns)?;
         let started = Instant::now();
         let mut round_start_ns = Some(0);
+        let mut shift_ns = 0;
         while let Some(start_ns) = round_start_ns {
             let mut last_ns = first_ns;
+            let mut stamps = Span::default();
             for entry in recording.messages() {
-                let Recorded::Known(payload) = entry.message else { continue };
-                if !wanted(&payload) {
+                let Recorded::Known(mut payload) = entry.message else { continue };
+                if !self.wants(payload.topic()) {
                     continue;
                 }
                 match pacer.due(start_ns, entry.log_time_ns) {
@@ -146,19 +195,62 @@ impl Options {
                     return Ok(());
                 }
                 last_ns = entry.log_time_ns;
+                if let Payload::OperatingPoint(input) = &payload {
+                    stamps.take(input.header.stamp.as_ns());
+                }
+                if let Some(stamp) = payload.stamp_mut().filter(|_| shift_ns != 0) {
+                    *stamp = Time::from_ns(stamp.as_ns().saturating_add(shift_ns));
+                }
                 player.publish(&payload)?;
                 played.fetch_add(1, Ordering::Relaxed);
                 match payload {
                     Payload::OperatingPoint(input) => watch.input(&input),
                     Payload::Prediction(prediction) => watch.prediction(&prediction),
-                    _ => {}
+                    Payload::SessionEvent(_)
+                    | Payload::RigInfo(_)
+                    | Payload::Sensitivity(_)
+                    | Payload::Diagnostics(_)
+                    | Payload::Vibration(_) => {}
                 }
             }
             let nothing = played.load(Ordering::Relaxed) == 0;
             ensure!(!nothing, "nothing to play: no such messages in that part of the recording");
-            round_start_ns = pacer.next_round(start_ns, last_ns, 10_000_000);
+            // A node takes stamps that run backward for a fault: a round begins where the one before has ended.
+            let length_ns = stamps.length_ns().unwrap_or(last_ns.saturating_sub(first_ns));
+            shift_ns = shift_ns.saturating_add_unsigned(length_ns.saturating_add(BETWEEN_ROUNDS_NS));
+            round_start_ns = pacer.next_round(start_ns, last_ns, BETWEEN_ROUNDS_NS);
         }
         Ok(())
+    }
+}
+
+/// Smallest and largest stamp of a round.
+#[derive(Default)]
+struct Span(Option<(i64, i64)>);
+
+impl Span {
+    fn take(&mut self, ns: i64) {
+        let (low, high) = self.0.unwrap_or((ns, ns));
+        self.0 = Some((low.min(ns), high.max(ns)));
+    }
+
+    fn length_ns(&self) -> Option<u64> {
+        self.0.map(|(low, high)| high.abs_diff(low))
+    }
+}
+
+/// What is around the table of what is played.
+fn frame(path: &Path, recording: &Recording, played: &Arc<AtomicU64>, stopped: &Arc<AtomicBool>) -> live::Frame {
+    let file = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+    // A recording that was imported carries no rig: then every damping below zero grows.
+    let rig = recorded_rig(recording).ok();
+    let title = rig.as_ref().map_or_else(|| file.clone(), |rig| format!("{}, {file}", rig.name));
+    let (played, stopped) = (played.clone(), stopped.clone());
+    live::Frame {
+        title,
+        instability_threshold: rig.map_or(0.0, |rig| rig.instability_threshold),
+        foot: Box::new(move |_| format!("played {} messages", played.load(Ordering::Relaxed))),
+        quit: Box::new(move || stopped.store(true, Ordering::Relaxed)),
     }
 }
 
@@ -203,51 +295,4 @@ fn report(found: &Verification, took: Duration) -> String {
         text += &format!("  {difference}\n");
     }
     text
-}
-
-/// Publishes what was recorded.
-struct Player {
-    shm: Option<(ShmSource, ShmOutput, ShmVibrationSource)>,
-    ros2: Option<(Ros2Source, Ros2)>,
-}
-
-impl Player {
-    fn join(shm: Option<ShmOptions>, ros2: Option<Ros2Options>) -> anyhow::Result<Self> {
-        ensure!(shm.is_some() || ros2.is_some(), "nothing to play to: both --no-shm and --no-ros are given");
-        let ports = |shm| anyhow::Ok((ShmSource::new(shm)?, ShmOutput::new(shm)?, ShmVibrationSource::new(shm)?));
-        let shm = shm.as_ref().map(ports).transpose();
-        let ros2 = ros2.map(|mut ros2| {
-            let source = Ros2Source::start(&ros2, |_| {})?;
-            // The node's own name stays free for a node that listens.
-            ros2.args = ros2.args.renamed("squealcast_replay");
-            anyhow::Ok((source, Ros2::start(&ros2, Parameters::none(), |_| {}, |_| {})?))
-        });
-        Ok(Self {
-            shm: shm.context("shared memory; --no-shm stays off it")?,
-            ros2: ros2.transpose().context("ROS 2; --no-ros stays off it")?,
-        })
-    }
-
-    fn publish(&self, payload: &Payload) -> anyhow::Result<()> {
-        if let Some((inputs, predictions, vibrations)) = &self.shm {
-            match payload {
-                Payload::OperatingPoint(message) => drop(inputs.publish(message)?),
-                Payload::Prediction(message) => drop(predictions.publish(message)?),
-                Payload::Vibration(message) => drop(vibrations.publish(message)?),
-                _ => {}
-            }
-        }
-        if let Some((inputs, others)) = &self.ros2 {
-            match payload {
-                Payload::OperatingPoint(message) => inputs.publish(message)?,
-                Payload::Prediction(message) => others.publish_prediction(message)?,
-                Payload::SessionEvent(message) => others.publish_session_event(message)?,
-                Payload::RigInfo(message) => others.publish_rig(message)?,
-                Payload::Sensitivity(message) => others.publish_sensitivity(message)?,
-                Payload::Diagnostics(message) => others.publish_diagnostics(message)?,
-                Payload::Vibration(message) => inputs.publish_vibration(message)?,
-            }
-        }
-        Ok(())
-    }
 }

@@ -1,18 +1,21 @@
-use std::path::PathBuf;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::Args;
 
 use super::display::CriteriaOptions;
+use super::recordings::Recordings;
 use super::{Outcome, print, view, write_file};
 use crate::display::report::{Origin, report};
 
-/// Write a report of a recording: one HTML file that needs nothing else, and the events as CSV
+/// Write a report of each recording: one HTML file that needs nothing else, and the events as CSV
 #[derive(Debug, Args)]
 pub struct Options {
-    /// A recording: a file, or the directory of all its files
-    file: PathBuf,
-    /// Directory to write into; it is made where it is missing
+    #[command(flatten)]
+    recordings: Recordings,
+    /// Directory to write into; it is made where it is missing. Of several recordings each gets a directory in it, of its
+    /// own name
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Maps of this rig instead of the recorded one
@@ -24,18 +27,32 @@ pub struct Options {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let (recording, recorded) = view::read(&self.file, self.rig.as_deref(), self.criteria.criteria())?;
+        let paths = self.recordings.paths()?;
+        let mut names = BTreeSet::new();
+        let mut outcome = Outcome::Done;
+        for path in &paths {
+            let name = path.file_stem().unwrap_or(path.as_os_str());
+            let directory = if paths.len() == 1 { self.output.clone() } else { self.output.join(name) };
+            ensure!(names.insert(name), "{}: another recording has this name too", path.display());
+            outcome = outcome.max(self.write(path, &directory)?);
+        }
+        Ok(outcome)
+    }
+
+    /// Writes the report of one recording.
+    fn write(&self, path: &Path, directory: &Path) -> anyhow::Result<Outcome> {
+        let recording = self.recordings.open(path)?;
+        let recorded = view::read(path, &recording, self.rig.as_deref(), self.criteria.criteria())?;
         let origin = Origin {
-            file: self.file.file_name().unwrap_or(self.file.as_os_str()).to_string_lossy().into_owned(),
+            file: path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
             version: recording.session_metadata("squealcast_version").map(str::to_owned),
         };
         let html = report(&recorded, &origin)?;
-        let directory = &self.output;
         std::fs::create_dir_all(directory).with_context(|| format!("{}: cannot make it", directory.display()))?;
         write_file(&directory.join("report.html"), html.as_bytes())?;
         write_file(&directory.join("events.csv"), recorded.events.to_csv().as_bytes())?;
         print(&format!("{}\n", directory.join("report.html").display()))?;
-        let lost = recorded.damage.iter().any(|damage| damage.damage.loses_data);
+        let lost = recording.damage().iter().chain(&recorded.damage).any(|damage| damage.damage.loses_data);
         Ok(if lost { Outcome::Differences } else { Outcome::Done })
     }
 }

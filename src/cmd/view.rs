@@ -1,4 +1,4 @@
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
@@ -6,18 +6,20 @@ use clap::Args;
 use crossbeam_channel::bounded;
 
 use super::display::{self, CriteriaOptions, DisplayOptions};
+use super::recordings::{Recordings, without_predictions};
 use super::replay::recorded_rig;
 use super::{Outcome, signals};
 use crate::display::comparison::Criteria;
 use crate::display::recorded::Recorded;
 use crate::io::recording::Recording;
 use crate::rig::Rig;
+use crate::wire::schema::Topic;
 
 /// Open a recording in the page, with a time line
 #[derive(Debug, Args)]
 pub struct Options {
-    /// A recording: a file, or the directory of all its files
-    file: PathBuf,
+    #[command(flatten)]
+    recordings: Recordings,
     /// Maps and shapes of this rig instead of the recorded one
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
@@ -30,26 +32,29 @@ pub struct Options {
 /// Reads a recording for people, with its own rig or the one given; `criteria` say what squeal is in a measured vibration.
 ///
 /// # Errors
-/// No recording, no rig, or no prediction in it.
-pub fn read(file: &std::path::Path, rig: Option<&str>, criteria: Criteria) -> anyhow::Result<(Recording, Recorded)> {
-    let recording = Recording::open(file)?;
+/// No prediction in it, or no rig.
+pub fn read(path: &Path, recording: &Recording, rig: Option<&str>, criteria: Criteria) -> anyhow::Result<Recorded> {
+    if recording.topics().name_of(Topic::Prediction).is_none() {
+        return Err(without_predictions(path, recording));
+    }
     let rig = match rig {
         Some(rig) => Rig::load(rig)?,
-        None => recorded_rig(&recording)?,
+        None => recorded_rig(recording)?,
     };
-    let recorded = Recorded::read(&recording, Arc::new(rig), criteria);
-    for damage in recording.damage().iter().chain(&recorded.damage) {
+    let recorded = Recorded::read(recording, Arc::new(rig), criteria);
+    for damage in recorded.damage.iter().filter(|damage| !recording.damage().contains(damage)) {
         note!("damaged: {damage}");
     }
-    ensure!(!recorded.moments.is_empty(), "{}: holds no predictions", file.display());
-    Ok((recording, recorded))
+    ensure!(!recorded.moments.is_empty(), "{}: holds no prediction that can be read", path.display());
+    Ok(recorded)
 }
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let addresses = self.display.addresses()?;
         ensure!(!addresses.is_empty(), "--no-display leaves nothing to view");
-        let (_, recorded) = read(&self.file, self.rig.as_deref(), self.criteria.criteria())?;
+        let (path, recording) = self.recordings.only()?;
+        let recorded = read(&path, &recording, self.rig.as_deref(), self.criteria.criteria())?;
         let (stop, stopped) = bounded::<()>(1);
         signals::on_stop(move || {
             // Nobody waits any more: it has stopped.

@@ -40,7 +40,8 @@ impl<M> Heard<M> {
 pub struct Counts {
     /// Messages handed over.
     pub heard: u64,
-    /// Messages that were lost on the way, by the gaps in their sequence numbers.
+    /// Messages that were lost on the way, by the gaps in their sequence numbers. A publisher that leaves numbers out on purpose
+    /// cannot be told from one whose messages were lost: it has to count by one.
     pub missed: u64,
     /// Samples that were no message.
     pub malformed: u64,

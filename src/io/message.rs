@@ -1,7 +1,8 @@
 //! A recorded message of any of the node's topics.
 
 use crate::wire::{
-    self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, schema::Topic,
+    self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Time, Vibration,
+    schema::Topic,
 };
 
 /// The content of a recorded message; which it is decides its topic.
@@ -27,6 +28,19 @@ impl Payload {
             Self::Sensitivity(_) => Topic::Sensitivity,
             Self::Diagnostics(_) => Topic::Diagnostics,
             Self::Vibration(_) => Topic::Vibration,
+        }
+    }
+
+    /// Its stamp, for change; a rig's description has none.
+    pub fn stamp_mut(&mut self) -> Option<&mut Time> {
+        match self {
+            Self::OperatingPoint(message) => Some(&mut message.header.stamp),
+            Self::Prediction(message) => Some(&mut message.header.stamp),
+            Self::SessionEvent(message) => Some(&mut message.header.stamp),
+            Self::RigInfo(_) => None,
+            Self::Sensitivity(message) => Some(&mut message.header.stamp),
+            Self::Diagnostics(message) => Some(&mut message.header.stamp),
+            Self::Vibration(message) => Some(&mut message.header.stamp),
         }
     }
 

@@ -10,6 +10,7 @@ pub mod message;
 pub mod pace;
 pub mod params_file;
 pub mod record_walker;
+pub mod recorded_topics;
 pub mod recorder;
 pub mod recording;
 pub mod recording_file;

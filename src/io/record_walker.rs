@@ -109,7 +109,8 @@ pub struct Damage {
 pub enum Depth {
     /// Everything is read.
     Messages,
-    /// Chunks and messages are passed over unread: attachments, metadata and where the file ends.
+    /// Chunks and messages are passed over unread: attachments, metadata, the channels that the summary lists, and where
+    /// the file ends.
     Structure,
 }
 
@@ -196,6 +197,11 @@ impl RecordWalker {
         self.unpacked
     }
 
+    /// The channels found so far; complete once the iterator has ended.
+    pub fn channels(&self) -> impl Iterator<Item = &Arc<Channel>> {
+        self.channels.values()
+    }
+
     /// At most `length` bytes from here, fewer at the end of the file. Memory grows with what is there.
     fn read(&mut self, length: u64) -> io::Result<Vec<u8>> {
         let mut bytes = Vec::with_capacity(length.min(self.length.saturating_sub(self.offset)) as usize);
@@ -256,7 +262,8 @@ impl RecordWalker {
         }
         let skipped = match opcode {
             op::CHUNK | op::MESSAGE => self.depth == Depth::Structure || !data,
-            op::SCHEMA | op::CHANNEL | op::ATTACHMENT | op::METADATA => !data,
+            op::SCHEMA | op::CHANNEL => !data && self.depth == Depth::Messages,
+            op::ATTACHMENT | op::METADATA => !data,
             op::DATA_END | op::FOOTER => false,
             _ => true,
         };
@@ -288,7 +295,7 @@ impl RecordWalker {
                     self.unpacked += length;
                 }
                 if let Err(what) = self.record(opcode, &body) {
-                    self.note(start, what, true);
+                    self.note(start, what, data);
                 }
             }
         }

@@ -2,7 +2,7 @@
 
 use std::{
     collections::VecDeque,
-    io,
+    io::{self, Read},
     panic::resume_unwind,
     path::{Path, PathBuf},
     sync::Arc,
@@ -14,10 +14,13 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 use mcap::records::Metadata;
 
 use super::{
+    bag,
     message::Payload,
     record_walker::{Attachment, Channel, Damage, Depth, Item, RawMessage, RecordWalker},
+    recorded_topics::{ChoiceError, RecordedTopics, Unread},
 };
-use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic, same_fields};
+use crate::input_file;
+use crate::wire::schema::Topic;
 
 /// Messages read at a time, at most of chunks that unpack to the second number of bytes, and how many times ahead of their
 /// use.
@@ -27,6 +30,11 @@ const BATCHES_AHEAD: usize = 2;
 /// What the attachments of a recording may take together, each counted once.
 const MAX_ATTACHMENT_BYTES: usize = 2 << 30;
 
+/// First bytes of files and messages that others write.
+const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
+const ZSTD_MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
+const LZ4_MAGIC: [u8; 4] = [0x04, 0x22, 0x4d, 0x18];
+
 /// Why a recording cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordingError {
@@ -34,15 +42,25 @@ pub enum RecordingError {
     Io { path: PathBuf, source: io::Error },
     #[error("{}: not an MCAP file: it does not begin with its magic bytes", .path.display())]
     NotMcap { path: PathBuf },
+    #[error("{}: a recording in the sqlite3 format, expected MCAP; `ros2 bag convert` makes one of it", .path.display())]
+    Sqlite { path: PathBuf },
+    #[error(
+        "{}: an MCAP file that was compressed as a whole, expected one as it is or with compressed chunks; `ros2 bag convert` \
+         makes one of it",
+        .path.display()
+    )]
+    Compressed { path: PathBuf },
     #[error("{}: holds no *.mcap and no *.mcap.active file", .path.display())]
     NoFiles { path: PathBuf },
+    #[error("{}: {source}", .path.display())]
+    Choice { path: PathBuf, source: ChoiceError },
 }
 
 /// How a recording is read.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Operating points are taken from this topic alone. Without it from every topic of their type, whatever its name.
-    pub operating_point_topic: Option<String>,
+    /// Topics that are read in place of the node's own of their type; see [`RecordedTopics`].
+    pub topics: Vec<String>,
 }
 
 /// A message of a recording.
@@ -81,7 +99,7 @@ pub struct FileDamage {
 #[derive(Debug)]
 pub struct Recording {
     files: Vec<PathBuf>,
-    options: ReadOptions,
+    topics: RecordedTopics,
     attachments: Vec<Attachment>,
     metadata: Vec<Metadata>,
     damage: Vec<FileDamage>,
@@ -92,7 +110,8 @@ impl Recording {
     ///
     /// # Errors
     ///
-    /// A path that cannot be read, holds no recording, or is no MCAP file. Damage is no error: see [`Self::damage`].
+    /// A path that cannot be read, holds no recording, or is no MCAP file. Damage is no error: see [`Self::damage`]. Neither
+    /// is a topic that cannot be read: see [`Self::topics`].
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         Self::open_with(path, ReadOptions::default())
     }
@@ -104,8 +123,9 @@ impl Recording {
     /// As [`Self::open`].
     pub fn open_with(path: &Path, options: ReadOptions) -> Result<Self, RecordingError> {
         let files = files_of(path)?;
-        let mut recording =
-            Self { files: Vec::new(), options, attachments: Vec::new(), metadata: Vec::new(), damage: Vec::new() };
+        let (topics, damage) = (RecordedTopics::default(), Vec::new());
+        let mut recording = Self { files: Vec::new(), topics, attachments: Vec::new(), metadata: Vec::new(), damage };
+        let mut channels: Vec<Channel> = Vec::new();
         for file in &files {
             let mut walker = open_walker(file, Depth::Structure)?;
             for item in walker.by_ref() {
@@ -138,7 +158,19 @@ impl Recording {
                 }
             }
             recording.damage.extend(located(file, walker.damage()));
+            // Without a summary the channels are known once all chunks were read.
+            if !walker.damage().is_empty() || walker.channels().next().is_none() {
+                walker = open_walker(file, Depth::Messages)?;
+                walker.by_ref().for_each(drop);
+            }
+            for channel in walker.channels() {
+                if !channels.iter().any(|known| known.topic == channel.topic && known.schema == channel.schema) {
+                    channels.push((**channel).clone());
+                }
+            }
         }
+        let choice = RecordedTopics::decide(&channels, &options.topics);
+        recording.topics = choice.map_err(|source| RecordingError::Choice { path: path.to_owned(), source })?;
         recording.files = files;
         Ok(recording)
     }
@@ -146,6 +178,11 @@ impl Recording {
     /// The files, in order.
     pub fn files(&self) -> &[PathBuf] {
         &self.files
+    }
+
+    /// Which of its topics are read as which of the node's, and what is not read.
+    pub fn topics(&self) -> &RecordedTopics {
+        &self.topics
     }
 
     /// The files within it, such as those of the rig; each once, in the order they were written.
@@ -187,6 +224,7 @@ impl Recording {
             batches: received,
             raw: VecDeque::new(),
             judged: Vec::new(),
+            undecoded: None,
             damage: Vec::new(),
         }
     }
@@ -246,7 +284,9 @@ pub struct Messages<'a> {
     batches: Receiver<Batch>,
     raw: VecDeque<RawMessage>,
     /// What was found of each channel: comparing its fields with ours for every message would take most of the time.
-    judged: Vec<(Arc<Channel>, Readable)>,
+    judged: Vec<(Arc<Channel>, Result<Option<Topic>, Unread>)>,
+    /// How many messages could not be decoded, and what was wrong with the first.
+    undecoded: Option<(u64, String)>,
     damage: Vec<FileDamage>,
 }
 
@@ -260,11 +300,22 @@ impl Messages<'_> {
     fn entry(&mut self, raw: RawMessage) -> Entry {
         let known = self.judged.iter().position(|(channel, _)| Arc::ptr_eq(channel, &raw.channel));
         let known = known.unwrap_or_else(|| {
-            let readable = judge(&raw.channel, self.recording.options.operating_point_topic.as_deref());
-            self.judged.push((raw.channel.clone(), readable));
+            self.judged.push((raw.channel.clone(), self.recording.topics.read_as(&raw.channel)));
             self.judged.len() - 1
         });
-        let message = decode(&raw, &self.judged[known].1);
+        let message = match &self.judged[known].1 {
+            Ok(None) => Recorded::Other,
+            Ok(Some(topic)) => match Payload::from_cdr(*topic, &raw.data) {
+                Ok(payload) => Recorded::Known(payload),
+                Err(error) => {
+                    let reason = format!("{}: {}", raw.channel.topic, undecodable(&raw.data, &error));
+                    self.undecoded.get_or_insert_with(|| (0, reason.clone())).0 += 1;
+                    Recorded::Unreadable(reason)
+                }
+            },
+            // Said once for the whole recording.
+            Err(unread) => Recorded::Unreadable(unread.to_string()),
+        };
         Entry {
             channel: raw.channel,
             sequence: raw.sequence,
@@ -288,6 +339,11 @@ impl Iterator for Messages<'_> {
                 if let Err(panic) = self.reader.take()?.join() {
                     resume_unwind(panic);
                 }
+                if let (Some((count, first)), Some(file)) = (self.undecoded.take(), self.recording.files.first()) {
+                    let what = format!("{count} messages cannot be decoded, the first: {first}");
+                    self.damage
+                        .push(FileDamage { file: file.clone(), damage: Damage { offset: 0, what, loses_data: true } });
+                }
                 return None;
             };
             self.raw = batch.raw;
@@ -296,38 +352,12 @@ impl Iterator for Messages<'_> {
     }
 }
 
-/// Whether the messages of a channel can be read.
-#[derive(Debug)]
-enum Readable {
-    As(Topic),
-    Not(String),
-    Other,
-}
-
-fn judge(channel: &Channel, operating_point_topic: Option<&str>) -> Readable {
-    let Some(schema) = &channel.schema else { return Readable::Other };
-    let Some(topic) = Topic::of_type(&schema.name) else { return Readable::Other };
-    if topic == Topic::OperatingPoint && operating_point_topic.is_some_and(|wanted| wanted != channel.topic) {
-        return Readable::Other;
+/// Why a message cannot be decoded.
+fn undecodable(data: &[u8], error: &cdr_encoding::Error) -> String {
+    if data.starts_with(&ZSTD_MAGIC) {
+        return "compressed message by message; `ros2 bag convert` makes a recording without".to_owned();
     }
-    if channel.message_encoding != MESSAGE_ENCODING {
-        return Readable::Not(format!("encoding {:?}: only {MESSAGE_ENCODING:?} is read", channel.message_encoding));
-    }
-    if schema.encoding == SCHEMA_ENCODING && !same_fields(topic.definition(), &String::from_utf8_lossy(&schema.data)) {
-        return Readable::Not(format!("{} has other fields in this recording", schema.name));
-    }
-    Readable::As(topic)
-}
-
-fn decode(raw: &RawMessage, readable: &Readable) -> Recorded {
-    match readable {
-        Readable::Other => Recorded::Other,
-        Readable::Not(reason) => Recorded::Unreadable(reason.clone()),
-        Readable::As(topic) => match Payload::from_cdr(*topic, &raw.data) {
-            Ok(payload) => Recorded::Known(payload),
-            Err(error) => Recorded::Unreadable(format!("{}: {error}", topic.type_name())),
-        },
-    }
+    error.to_string()
 }
 
 fn located<'a>(file: &'a Path, damage: &'a [Damage]) -> impl Iterator<Item = FileDamage> + use<'a> {
@@ -337,9 +367,78 @@ fn located<'a>(file: &'a Path, damage: &'a [Damage]) -> impl Iterator<Item = Fil
 pub(super) fn open_walker(path: &Path, depth: Depth) -> Result<RecordWalker, RecordingError> {
     match RecordWalker::open(path, depth) {
         Ok(Some(walker)) => Ok(walker),
-        Ok(None) => Err(RecordingError::NotMcap { path: path.to_owned() }),
+        Ok(None) => Err(not_mcap(path)),
         Err(source) => Err(RecordingError::Io { path: path.to_owned(), source }),
     }
+}
+
+/// What a file is that is no MCAP file.
+fn not_mcap(path: &Path) -> RecordingError {
+    let mut head = Vec::new();
+    let read = input_file::open(path, input_file::ANY_SIZE).and_then(|file| file.take(16).read_to_end(&mut head));
+    let path = path.to_owned();
+    match read {
+        Err(source) => RecordingError::Io { path, source },
+        Ok(_) if head.starts_with(SQLITE_MAGIC) => RecordingError::Sqlite { path },
+        Ok(_) if head.starts_with(&ZSTD_MAGIC) || head.starts_with(&LZ4_MAGIC) => RecordingError::Compressed { path },
+        Ok(_) => RecordingError::NotMcap { path },
+    }
+}
+
+/// Whether a file is a recording, by its first bytes; else it may be a log.
+///
+/// # Errors
+/// It cannot be read, or is a recording of another format, or only by its name one.
+pub fn is_recording(path: &Path) -> Result<bool, RecordingError> {
+    let io_error = |source| RecordingError::Io { path: path.to_owned(), source };
+    let mut head = Vec::new();
+    let file = input_file::open(path, input_file::ANY_SIZE).map_err(io_error)?;
+    file.take(mcap::MAGIC.len() as u64).read_to_end(&mut head).map_err(io_error)?;
+    if head == mcap::MAGIC {
+        return Ok(true);
+    }
+    match not_mcap(path) {
+        RecordingError::NotMcap { .. } if split_name(path).is_none() => Ok(false),
+        error => Err(error),
+    }
+}
+
+/// The recordings at a path: itself if it is a file or the directory of one recording's files; else those of the directories,
+/// or the single files, directly in it, by name.
+///
+/// # Errors
+/// A path that cannot be read or holds no recording.
+pub fn recordings_at(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
+    let io_error = |source| RecordingError::Io { path: path.to_owned(), source };
+    if !std::fs::metadata(path).map_err(io_error)?.is_dir() {
+        return Ok(vec![path.to_owned()]);
+    }
+    let own = mcap_files(path).map_err(io_error)?;
+    if !own.is_empty() {
+        let mut bases: Vec<String> = own.iter().filter_map(|file| split_name(file)).map(|(base, _)| base).collect();
+        bases.dedup();
+        // Files of several names, which nothing declares to be one recording.
+        let apart = bases.len() == own.len() && !path.join(bag::METADATA_FILE).exists();
+        return Ok(if apart { own } else { vec![path.to_owned()] });
+    }
+    let mut below = Vec::new();
+    for entry in std::fs::read_dir(path).map_err(io_error)? {
+        let directory = entry.map_err(io_error)?.path();
+        if directory.is_dir() && mcap_files(&directory).is_ok_and(|files| !files.is_empty()) {
+            below.push(directory);
+        }
+    }
+    below.sort();
+    if below.is_empty() { Err(no_files(path)) } else { Ok(below) }
+}
+
+/// Why a directory holds no recording.
+pub(super) fn no_files(path: &Path) -> RecordingError {
+    let entries = std::fs::read_dir(path).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.path());
+    let foreign = entries.filter(|file| file.is_file()).map(|file| not_mcap(&file));
+    let known =
+        |error: &RecordingError| matches!(error, RecordingError::Sqlite { .. } | RecordingError::Compressed { .. });
+    foreign.into_iter().find(known).unwrap_or(RecordingError::NoFiles { path: path.to_owned() })
 }
 
 /// The files of a recording in order: itself, or the MCAP files of a directory by their split number.
@@ -349,10 +448,17 @@ fn files_of(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
         return Ok(vec![path.to_owned()]);
     }
     let files = mcap_files(path).map_err(io_error)?;
-    if files.is_empty() {
-        return Err(RecordingError::NoFiles { path: path.to_owned() });
-    }
-    Ok(files)
+    if files.is_empty() { Err(no_files(path)) } else { Ok(files) }
+}
+
+/// The name of a recording and the number of a file of it; `None` for other files.
+fn split_name(path: &Path) -> Option<(String, u64)> {
+    let name = path.file_name()?.to_str()?;
+    let stem = name.strip_suffix(".active").unwrap_or(name).strip_suffix(".mcap")?;
+    Some(match stem.rsplit_once('_').map(|(base, index)| (base, index.parse::<u64>())) {
+        Some((base, Ok(index))) => (base.to_owned(), index),
+        _ => (stem.to_owned(), 0),
+    })
 }
 
 /// The `*.mcap` and `*.mcap.active` files of a directory in the order of their split numbers, then of their names.
@@ -360,13 +466,7 @@ pub(super) fn mcap_files(directory: &Path) -> io::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(directory)? {
         let path = entry?.path();
-        let Some(name) = path.file_name().and_then(|name| name.to_str()) else { continue };
-        let Some(stem) = name.strip_suffix(".active").unwrap_or(name).strip_suffix(".mcap") else { continue };
-        let (base, index) = match stem.rsplit_once('_').map(|(base, index)| (base, index.parse::<u64>())) {
-            Some((base, Ok(index))) => (base.to_owned(), index),
-            _ => (stem.to_owned(), 0),
-        };
-        if path.is_file() {
+        if let Some((base, index)) = split_name(&path).filter(|_| path.is_file()) {
             files.push((base, index, path));
         }
     }

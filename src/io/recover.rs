@@ -15,7 +15,7 @@ use crate::input_file;
 use super::{
     bag::{self, FileSummary, TopicInfo},
     record_walker::{Damage, Depth, Item, RecordWalker},
-    recording::{RecordingError, mcap_files, open_walker},
+    recording::{RecordingError, mcap_files, no_files, open_walker},
     recording_file::{RecordingFile, WriteError, directory_of, with_suffix},
 };
 
@@ -120,7 +120,7 @@ pub fn recover(path: &Path) -> Result<RecoveryReport, RecoverError> {
     }
     let files = files_below(path).map_err(|source| read_error(path, source))?;
     if files.is_empty() {
-        return Err(RecordingError::NoFiles { path: path.to_owned() }.into());
+        return Err(no_files(path).into());
     }
     Ok(recover_files(&files))
 }

@@ -21,6 +21,7 @@ use thiserror::Error;
 use self::link::{Durability, Link, MAX_UNANSWERED};
 use super::heard::{Bus, Counts, Heard};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
+use crate::wire::schema::Topic;
 use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
 /// The name of the node, before remapping.
@@ -263,6 +264,20 @@ impl Ros2 {
     /// How many readers the predictions have, those included that were killed less than their lease ago.
     pub fn prediction_readers(&self) -> usize {
         self.prediction.get_subscription_count(self.link.node())
+    }
+
+    /// How many readers a topic has that is published here, those included that were killed less than their lease ago.
+    pub fn readers(&self, topic: Topic) -> usize {
+        let node = self.link.node();
+        match topic {
+            Topic::Prediction => self.prediction.get_subscription_count(node),
+            Topic::RigInfo => self.rig.get_subscription_count(node),
+            Topic::SessionEvent => self.session_event.get_subscription_count(node),
+            Topic::Sensitivity => self.sensitivity.get_subscription_count(node),
+            Topic::Diagnostics => self.diagnostics.get_subscription_count(node),
+            // Published by the rig.
+            Topic::OperatingPoint | Topic::Vibration => 0,
+        }
     }
 
     /// How many publishers of operating points are known, those included that were killed less than their lease ago.

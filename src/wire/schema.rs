@@ -81,9 +81,9 @@ impl Topic {
         }
     }
 
-    /// The topic whose messages have this ROS 2 type, `package/msg/Type`.
-    pub fn of_type(type_name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|topic| topic.type_name() == type_name)
+    /// Whether the type of its messages is the project's own, and nobody else's.
+    pub fn is_own_type(self) -> bool {
+        self.type_name().starts_with("squealcast_msgs/")
     }
 
     /// Whether a late subscriber gets the last message (`TRANSIENT_LOCAL`).
@@ -143,25 +143,55 @@ pub const SCHEMA_ENCODING: &str = "ros2msg";
 /// The encoding of the messages, as MCAP names it.
 pub const MESSAGE_ENCODING: &str = "cdr";
 
-/// Whether two `ros2msg` definitions lay out the same fields: comments, blank lines, spacing and constants do not
-/// count, and nothing after the first separator (dependencies) does.
-pub fn same_fields(a: &str, b: &str) -> bool {
-    fn fields(text: &str) -> impl Iterator<Item = Vec<&str>> {
-        text.lines()
-            .take_while(|line| !line.starts_with("===="))
-            .map(|line| line.split('#').next().unwrap_or_default())
-            .filter(|line| !line.contains('='))
-            .map(|line| line.split_whitespace().collect::<Vec<_>>())
-            .filter(|words| !words.is_empty())
-            .map(|mut words| {
-                // `std_msgs/Header`, `std_msgs/msg/Header` and `Header` are one type.
-                if let Some(kind) = words.first_mut() {
-                    *kind = kind.rsplit('/').next().unwrap_or(kind);
-                }
-                words
-            })
+/// How the fields of `theirs` differ from those of `ours`, two `ros2msg` schemas; `None` where they are the same.
+/// Comments, blank lines, spacing and constants are no fields. Of the messages they refer to, the project's own count:
+/// those of ROS 2 do not change, but are written in several ways.
+pub fn field_difference(ours: &str, theirs: &str) -> Option<String> {
+    let theirs = messages(theirs);
+    for (name, fields) in messages(ours) {
+        if !name.is_empty() && !name.starts_with("squealcast_msgs/") {
+            continue;
+        }
+        let short = |name: &str| name.rsplit('/').next().unwrap_or_default().to_owned();
+        let place =
+            if name.is_empty() { "the recorded one".to_owned() } else { format!("the recorded {}", short(name)) };
+        let Some((_, recorded)) = theirs.iter().find(|(other, _)| short(other) == short(name)) else {
+            return Some(format!("{place} is not there"));
+        };
+        if let Some(missing) = fields.iter().find(|field| !recorded.contains(field)) {
+            return Some(format!("{place} lacks `{missing}`"));
+        }
+        if let Some(more) = recorded.iter().find(|field| !fields.contains(field)) {
+            return Some(format!("{place} has `{more}`"));
+        }
+        if *recorded != fields {
+            return Some(format!("{place} has them in another order"));
+        }
     }
-    fields(a).eq(fields(b))
+    None
+}
+
+/// The messages of a schema, each with its name, which the first has not, and its fields.
+fn messages(text: &str) -> Vec<(&str, Vec<String>)> {
+    let mut found: Vec<(&str, Vec<String>)> = vec![("", vec![])];
+    for line in text.lines().map(|line| line.split('#').next().unwrap_or_default().trim()) {
+        if let Some(name) = line.strip_prefix("MSG:") {
+            found.push((name.trim(), vec![]));
+            continue;
+        }
+        // A constant, or the line between two messages.
+        if line.contains('=') {
+            continue;
+        }
+        let mut words: Vec<&str> = line.split_whitespace().collect();
+        // `std_msgs/Header`, `std_msgs/msg/Header` and `Header` are one type.
+        let Some(kind) = words.first_mut() else { continue };
+        *kind = kind.rsplit('/').next().unwrap_or(kind);
+        if let Some((_, fields)) = found.last_mut() {
+            fields.push(words.join(" "));
+        }
+    }
+    found
 }
 
 #[cfg(test)]
@@ -192,11 +222,13 @@ mod tests {
 
     #[test]
     fn comments_and_constants_do_not_make_a_schema_differ() {
-        let ours = Topic::Prediction.definition();
+        let ours = Topic::Prediction.schema();
         let theirs: String = ours.lines().filter(|l| !l.starts_with('#')).map(|l| format!("{l}  # note\n\n")).collect();
-        assert!(same_fields(ours, &theirs));
-        assert!(same_fields("std_msgs/msg/Header header\n", "std_msgs/Header   header"));
-        assert!(!same_fields(ours, &ours.replace("bool reused\n", "")));
-        assert!(!same_fields("float64 a\nfloat64 b", "float64 b\nfloat64 a"));
+        assert_eq!(field_difference(&ours, &theirs), None);
+        assert_eq!(field_difference("std_msgs/msg/Header header\n", "std_msgs/Header   header"), None);
+        let without = ours.replace("bool reused\n", "");
+        assert_eq!(field_difference(&ours, &without).as_deref(), Some("the recorded one lacks `bool reused`"));
+        let order = field_difference("float64 a\nfloat64 b", "float64 b\nfloat64 a");
+        assert_eq!(order.as_deref(), Some("the recorded one has them in another order"));
     }
 }

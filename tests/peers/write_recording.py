@@ -1,5 +1,6 @@
 """Writes recordings of operating points as other programs do: a rosbag2 directory by `rosbags`, and beside it a file
-with LZ4 chunks and one without chunks by `mcap`.
+with LZ4 chunks and one without chunks by `mcap`, and three directories in forms that are not read: compressed message by
+message (of the node's own topic), compressed as a whole, and in the sqlite3 format.
 
 Usage: write_recording.py DIRECTORY
 """
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 POINT = "squealcast_msgs/msg/OperatingPoint"
@@ -38,9 +39,12 @@ def messages():
         yield stamp, TYPESTORE.serialize_cdr(point, POINT), TYPESTORE.serialize_cdr(types[TEXT](data="hello"), TEXT)
 
 
-def with_rosbags(directory):
-    with Writer(directory, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        points = writer.add_connection("/lab/conditions", POINT, typestore=TYPESTORE)
+def with_rosbags(directory, topic, storage, compression=CompressionMode.NONE):
+    bag = Writer(directory, version=9, storage_plugin=storage)
+    if compression != CompressionMode.NONE:
+        bag.set_compression(compression, CompressionFormat.ZSTD)
+    with bag as writer:
+        points = writer.add_connection(topic, POINT, typestore=TYPESTORE)
         texts = writer.add_connection("/chatter", TEXT, typestore=TYPESTORE)
         for stamp, point, text in messages():
             writer.write(points, stamp, point)
@@ -63,7 +67,11 @@ def with_mcap(path, **options):
 
 def main():
     directory = Path(sys.argv[1])
-    with_rosbags(directory)
+    with_rosbags(directory, "/lab/conditions", StoragePlugin.MCAP)
+    beside = lambda kind: directory.with_name(f"{directory.name}-{kind}")
+    with_rosbags(beside("message"), "/rig/operating_point", StoragePlugin.MCAP, CompressionMode.MESSAGE)
+    with_rosbags(beside("file"), "/rig/operating_point", StoragePlugin.MCAP, CompressionMode.FILE)
+    with_rosbags(beside("sqlite3"), "/rig/operating_point", StoragePlugin.SQLITE3)
     with_mcap(directory.parent / "lz4.mcap", compression=CompressionType.LZ4)
     with_mcap(directory.parent / "plain.mcap", use_chunking=False)
 

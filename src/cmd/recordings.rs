@@ -1,0 +1,98 @@
+//! The recordings a command reads.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::bail;
+use clap::Args;
+
+use crate::io::recording::{ReadOptions, Recording, recordings_at};
+use crate::wire::schema::Topic;
+
+/// Which recordings to read, and how
+#[derive(Clone, Debug, Args)]
+pub struct Recordings {
+    /// Recordings: files, directories of the files of one, or folders that hold several
+    #[arg(value_name = "RECORDING", required = true)]
+    recordings: Vec<PathBuf>,
+    #[command(flatten)]
+    topics: TopicOptions,
+}
+
+/// Which topics of a recording to read
+#[derive(Clone, Debug, Args)]
+pub struct TopicOptions {
+    /// Read this recorded topic in place of the node's own of its type, such as /brake1/operating_point in place of
+    /// /rig/operating_point; once for each topic
+    #[arg(long = "read-topic", value_name = "TOPIC")]
+    read_topics: Vec<String>,
+}
+
+impl TopicOptions {
+    /// Opens a recording, and says what of it cannot be read.
+    ///
+    /// # Errors
+    /// No recording, or none with these topics.
+    pub fn open(&self, path: &Path) -> anyhow::Result<Recording> {
+        let recording = Recording::open_with(path, ReadOptions { topics: self.read_topics.clone() })?;
+        for damage in recording.damage() {
+            note!("damaged: {damage}");
+        }
+        for unread in recording.topics().unread() {
+            note!("{}: {unread}", path.display());
+        }
+        Ok(recording)
+    }
+}
+
+impl Recordings {
+    /// All of them, at least one.
+    ///
+    /// # Errors
+    /// A path without a recording.
+    pub fn paths(&self) -> anyhow::Result<Vec<PathBuf>> {
+        let mut paths = vec![];
+        for path in &self.recordings {
+            paths.extend(recordings_at(path)?);
+        }
+        Ok(paths)
+    }
+
+    /// Opens one of [`Recordings::paths`], and says what of it cannot be read.
+    ///
+    /// # Errors
+    /// No recording, or none with the topics asked for.
+    pub fn open(&self, path: &Path) -> anyhow::Result<Recording> {
+        self.topics.open(path)
+    }
+
+    /// The one recording, where a command takes only one: of a folder that holds several the last by name, which of
+    /// sessions is the latest.
+    ///
+    /// # Errors
+    /// As [`Recordings::paths`]; several paths.
+    pub fn only(&self) -> anyhow::Result<(PathBuf, Recording)> {
+        if self.recordings.len() > 1 {
+            let [first, ..] = &self.recordings[..] else { unreachable!("more than one") };
+            bail!("{} recordings are given, expected one, such as {}", self.recordings.len(), first.display());
+        }
+        let mut paths = self.paths()?;
+        let count = paths.len();
+        let Some(path) = paths.pop() else { unreachable!("at least one") };
+        if count > 1 {
+            note!("{count} recordings: the last by name, {}", path.display());
+        }
+        let recording = self.open(&path)?;
+        Ok((path, recording))
+    }
+}
+
+/// What to do with a recording that holds no predictions.
+pub fn without_predictions(path: &Path, recording: &Recording) -> anyhow::Error {
+    let path = path.display();
+    match recording.topics().name_of(Topic::OperatingPoint) {
+        Some(_) => anyhow::anyhow!(
+            "{path}: holds no predictions; `squealcast predict-log {path} --rig RIG -o DIR` makes a recording with them"
+        ),
+        None => anyhow::anyhow!("{path}: holds no predictions, and no operating points to predict"),
+    }
+}
