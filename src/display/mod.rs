@@ -16,3 +16,4 @@ pub mod report;
 pub mod server;
 pub mod shape;
 pub mod state;
+mod time_line;

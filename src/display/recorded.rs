@@ -10,12 +10,13 @@ use super::history::History;
 use super::server::{About, Note, Source};
 use super::shape::shape;
 use super::state::{Shown, State, spread, trend_per_s};
+use super::time_line::TimeLine;
 use crate::io::message::Payload;
 use crate::io::recording::{FileDamage, Recorded as Content, Recording};
 use crate::node::{Sample, VibrationSample, session_map};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
-use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind};
+use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind, level};
 
 /// Bins of the history; they get longer with the recording.
 const BINS: usize = 3000;
@@ -32,6 +33,7 @@ const MAPS: usize = 8;
 /// One prediction with its conditions.
 #[derive(Clone, Debug)]
 pub struct Moment {
+    /// By the stamps; see [`TimeLine`].
     pub time_ns: i64,
     pub input: Option<OperatingPoint>,
     pub prediction: Prediction,
@@ -60,7 +62,7 @@ pub struct Recorded {
     /// What the node counted last.
     pub counted: Option<DiagnosticArray>,
     pub reused: u64,
-    /// Settings and maps, in order, with the time they were recorded.
+    /// Settings and maps, in order, with their time on the time line of the stamps.
     pub session_events: Vec<(i64, SessionEvent)>,
     pub damage: Vec<FileDamage>,
     level_before: Option<u8>,
@@ -90,9 +92,10 @@ impl Recorded {
             maps: Mutex::default(),
         };
         let mut inputs: VecDeque<OperatingPoint> = VecDeque::new();
+        let mut line = TimeLine::default();
         let mut messages = recording.messages();
         for entry in messages.by_ref() {
-            let time_ns = i64::try_from(entry.log_time_ns).unwrap_or(i64::MAX);
+            let log_ns = i64::try_from(entry.log_time_ns).unwrap_or(i64::MAX);
             match entry.message {
                 Content::Known(Payload::OperatingPoint(input)) => {
                     recorded.inputs += 1;
@@ -103,16 +106,30 @@ impl Recorded {
                 }
                 Content::Known(Payload::Prediction(prediction)) => {
                     let input = inputs.iter().rev().find(|input| input.seq == prediction.input_seq);
+                    // A fault for want of inputs names the last one and has a stamp of the node's clock.
+                    let stamp = prediction.header.stamp;
+                    let measured = input.map_or(prediction.level != level::FAULT, |input| input.header.stamp == stamp);
+                    let time_ns = if measured { line.stamped(stamp, log_ns) } else { line.unstamped(log_ns) };
+                    if recorded.moments.is_empty() {
+                        // What was before it had no stamp to follow.
+                        for (event_ns, _) in &mut recorded.session_events {
+                            *event_ns = time_ns.saturating_sub(log_ns.saturating_sub(*event_ns));
+                        }
+                    }
                     recorded.take(time_ns, input, prediction);
                 }
                 Content::Known(Payload::Vibration(vibration)) => {
-                    let sample = VibrationSample::new(time_ns, &vibration);
+                    let sample = VibrationSample::new(line.beside(vibration.header.stamp, log_ns), &vibration);
                     recorded.history.push_vibration(&sample);
                     recorded.vibration.push(&sample);
                 }
                 Content::Known(Payload::Diagnostics(counted)) => recorded.counted = Some(counted),
-                Content::Known(Payload::SessionEvent(event)) => recorded.session_events.push((time_ns, event)),
-                _ => {}
+                Content::Known(Payload::SessionEvent(event)) => {
+                    recorded.session_events.push((line.unstamped(log_ns), event))
+                }
+                Content::Known(Payload::RigInfo(_) | Payload::Sensitivity(_))
+                | Content::Unreadable(_)
+                | Content::Other => {}
             }
         }
         recorded.damage = messages.damage().to_vec();
@@ -126,7 +143,6 @@ impl Recorded {
         let count: u64 = self.levels.iter().sum();
         self.levels[usize::from(prediction.level).min(3)] += 1;
         self.reused += u64::from(prediction.reused);
-        // A fault for want of inputs names the last one and has a stamp of its own.
         self.answered += u64::from(input.is_some_and(|input| input.header.stamp == prediction.header.stamp));
         let changed = self.level_before != Some(prediction.level);
         self.level_before = Some(prediction.level);
