@@ -1,101 +1,265 @@
-//! A session without buses and without waiting: given inputs, predicted and recorded as fast as possible.
+//! A session without buses and without waiting: what was measured is predicted and recorded as fast as possible.
+//!
+//! Time is that of the stamps, silence included. Unlike a node's, no prediction here waits for its stability map: the map is
+//! computed before the input that needs it.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use crate::ahead::Ahead;
 use crate::io::message::{Message, Payload};
 use crate::io::recorder::{Recorder, RecorderConfig, RecorderError};
-use crate::node::{at_load_and_speed, ends_hash, map_hash, parameter_event, rig_info, session_ends, session_map};
-use crate::physics::Solver;
+use crate::node::{
+    at_load_and_speed, chart_hash, ends_hash, map_hash, parameter_event, rig_info, session_ends, session_map,
+};
+use crate::physics::{self, Chart, Solver};
 use crate::rig::Rig;
 use crate::session::{Event, Session, Want};
 use crate::settings::Settings;
 use crate::wire::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
 
-/// Stamp of the first input of an offline session, ns since the epoch: 2024-01-01T00:00:00Z, so that the same command
-/// makes the same messages.
+/// Stamp of the first input of a simulated offline session, ns since the epoch: 2024-01-01T00:00:00Z, so that the same
+/// command makes the same messages.
 pub const START_NS: i64 = 1_704_067_200_000_000_000;
+
+/// Messages that may wait for the disk.
+const MOST_QUEUED: usize = 1000;
 
 /// Why a session could not be recorded.
 #[derive(Debug, thiserror::Error)]
 pub enum OfflineError {
     #[error(transparent)]
     Recorder(#[from] RecorderError),
-    #[error("no stability map: {0}")]
-    Map(String),
     #[error("{dropped} messages were not recorded: {reason}")]
     Dropped { dropped: u64, reason: String },
 }
 
-/// Predicts conditions with `rig` and records the session, with the vibration measured at the same time, into a new directory in `directory`; that directory.
+/// Something that was measured, and when it was recorded.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Measured {
+    pub log_time_ns: u64,
+    pub publish_time_ns: u64,
+    pub quantity: Quantity,
+}
+
+/// What was measured.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Quantity {
+    Conditions(OperatingPoint),
+    Vibration(Vibration),
+}
+
+impl Measured {
+    /// Recorded when it was measured.
+    pub fn at_its_stamp(quantity: Quantity) -> Self {
+        let stamp = match &quantity {
+            Quantity::Conditions(input) => input.header.stamp,
+            Quantity::Vibration(vibration) => vibration.header.stamp,
+        };
+        let time_ns = u64::try_from(stamp.as_ns()).unwrap_or(0);
+        Self { log_time_ns: time_ns, publish_time_ns: time_ns, quantity }
+    }
+}
+
+/// A session that was predicted.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Predicted {
+    /// Of its recording.
+    pub directory: PathBuf,
+    pub inputs: u64,
+    /// Predictions by level: OK, WARN, SQUEAL, FAULT.
+    pub levels: [u64; 4],
+    /// Why a stability map could not be computed, the first time.
+    pub map_failure: Option<String>,
+}
+
+/// Predicts what was `measured` with `rig` and records the session into a new directory in `directory`. Predictions are read
+/// off `chart` where one is given. `points` are the conditions in `measured`, in the same order, to solve ahead of the
+/// session; they may end early.
 ///
 /// # Errors
 /// [`OfflineError`].
 pub fn record(
     rig: &Arc<Rig>,
-    measured: impl Iterator<Item = (OperatingPoint, Option<Vibration>)>,
+    chart: Option<Arc<Chart>>,
+    points: impl Iterator<Item = physics::OperatingPoint>,
+    measured: impl Iterator<Item = Measured>,
     directory: &Path,
-) -> Result<PathBuf, OfflineError> {
-    let recorder = Recorder::start(RecorderConfig {
-        rig_name: rig.name.clone(),
-        rig_content_hash: rig.content_hash.clone(),
-        rig_files: rig.files.clone(),
-        ..RecorderConfig::new(directory)
-    })?;
-    // There is no hurry here: rather wait for the disk than drop.
-    let write = |stamp: Time, payload: Payload| {
-        let time_ns = u64::try_from(stamp.as_ns()).unwrap_or(0);
-        while recorder.status().queued > 1000 {
+) -> Result<Predicted, OfflineError> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut ahead = Ahead::new(points, &rig.model, threads);
+    let mut offline = Offline::start(rig, directory)?;
+    let mut chart = Some(chart);
+    for Measured { log_time_ns, publish_time_ns, quantity } in measured {
+        match quantity {
+            Quantity::Vibration(vibration) => {
+                offline.write(log_time_ns, publish_time_ns, Payload::Vibration(vibration));
+            }
+            Quantity::Conditions(input) => {
+                if let Some(chart) = chart.take() {
+                    offline.begin(input.header.stamp, log_time_ns, chart);
+                }
+                offline.silence(input.header.stamp, log_time_ns);
+                offline.prepare(&input, log_time_ns);
+                ahead.step(&mut offline.session, &rig.model);
+                offline.input(input, log_time_ns, publish_time_ns);
+            }
+        }
+    }
+    offline.finish()
+}
+
+/// A session on its way into a recording.
+struct Offline {
+    rig: Arc<Rig>,
+    recorder: Recorder,
+    session: Session,
+    solver: Solver,
+    /// Stamp and log time of the latest input.
+    last: Option<(Time, u64)>,
+    /// No map can be computed at this load and speed.
+    given_up: Option<physics::OperatingPoint>,
+    inputs: u64,
+    levels: [u64; 4],
+    map_failure: Option<String>,
+}
+
+impl Offline {
+    fn start(rig: &Arc<Rig>, directory: &Path) -> Result<Self, OfflineError> {
+        let recorder = Recorder::start(RecorderConfig {
+            rig_name: rig.name.clone(),
+            rig_content_hash: rig.content_hash.clone(),
+            rig_files: rig.files.clone(),
+            ..RecorderConfig::new(directory)
+        })?;
+        Ok(Self {
+            session: Session::new(rig.clone(), Settings::for_rig(rig)),
+            solver: Solver::new(rig.model.dimension()),
+            rig: rig.clone(),
+            recorder,
+            last: None,
+            given_up: None,
+            inputs: 0,
+            levels: [0; 4],
+            map_failure: None,
+        })
+    }
+
+    fn write(&self, log_time_ns: u64, publish_time_ns: u64, payload: Payload) {
+        // Nothing is live here: wait for the disk rather than drop.
+        while self.recorder.status().queued > MOST_QUEUED {
             std::thread::sleep(Duration::from_millis(1));
         }
-        recorder.record(Message { log_time_ns: time_ns, publish_time_ns: time_ns, payload });
-    };
-    let mut session = Session::new(rig.clone(), Settings::for_rig(rig));
-    let mut solver = Solver::new(rig.model.dimension());
-    let mut begun = false;
-    for (input, vibration) in measured {
-        let stamp = input.header.stamp;
-        let header = Header { stamp, ..Default::default() };
-        if !begun {
-            begun = true;
-            write(stamp, Payload::RigInfo(rig_info(rig)));
-            for (name, value) in session.settings().values() {
-                write(stamp, Payload::SessionEvent(parameter_event(header.clone(), name, value)));
-            }
-        }
-        if let Some(vibration) = vibration {
-            write(stamp, Payload::Vibration(vibration));
-        }
-        write(stamp, Payload::OperatingPoint(input.clone()));
-        // Settings are the rig's own here, and inputs are no settings: nothing can be refused.
-        let effects = session.step(Event::Input(input)).unwrap_or_default();
-        if let Some(prediction) = effects.publish {
-            write(stamp, Payload::Prediction(prediction.clone()));
-        }
-        let Some(want) = effects.want else { continue };
-        let (kind, point, hash, event) = match want {
-            Want::Map(point) => {
-                let map = session_map(rig, &mut solver, &point).map_err(OfflineError::Map)?;
-                (event_kind::STABILITY_MAP, point, map_hash(&map), Event::MapReady(Arc::new(map)))
-            }
-            Want::Ends(point) => {
-                let Some(map) = session.map() else { continue };
-                let found = session_ends(rig, &mut solver, map, &point).map_err(OfflineError::Map)?;
-                let Some(ends) = found else { continue };
-                (event_kind::WINDOW_ENDS, point, ends_hash(&ends), Event::EndsReady(Arc::new(ends)))
-            }
-        };
-        let event_at = SessionEvent { header, ..at_load_and_speed(kind, &point, hash) };
-        write(stamp, Payload::SessionEvent(event_at));
-        let _ = session.step(event);
+        self.recorder.record(Message { log_time_ns, publish_time_ns, payload });
     }
-    let finished = recorder.finish(Duration::from_secs(600))?;
-    match finished.status.dropped() {
-        0 => Ok(finished.directory),
-        dropped => {
-            let reason = finished.status.last_error.unwrap_or_else(|| "the queue was full".to_owned());
-            Err(OfflineError::Dropped { dropped, reason })
+
+    /// Records an event, then hands it to the session.
+    fn event(&mut self, stamp: Time, log_time_ns: u64, record: SessionEvent, event: Event) {
+        let header = Header { stamp, ..Default::default() };
+        self.write(log_time_ns, log_time_ns, Payload::SessionEvent(SessionEvent { header, ..record }));
+        self.step(log_time_ns, event);
+    }
+
+    /// One step of the session; its prediction is recorded, and what it would use is returned.
+    fn step(&mut self, log_time_ns: u64, event: Event) -> Option<Want> {
+        // Settings are the rig's own here, and no event changes them: nothing can be refused.
+        let effects = self.session.step(event).unwrap_or_default();
+        let (prediction, want) = (effects.publish.cloned(), effects.want);
+        if let Some(prediction) = prediction {
+            self.levels[usize::from(prediction.level).min(3)] += 1;
+            self.write(log_time_ns, log_time_ns, Payload::Prediction(prediction));
+        }
+        want
+    }
+
+    /// Records what the session starts from.
+    fn begin(&mut self, stamp: Time, log_time_ns: u64, chart: Option<Arc<Chart>>) {
+        self.write(log_time_ns, log_time_ns, Payload::RigInfo(rig_info(&self.rig)));
+        let header = Header { stamp, ..Default::default() };
+        let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
+        for (name, value) in settings {
+            let event = parameter_event(header.clone(), name, value);
+            self.write(log_time_ns, log_time_ns, Payload::SessionEvent(event));
+        }
+        if let Some(chart) = chart {
+            let record = SessionEvent { kind: event_kind::CHART, hash: chart_hash(&chart), ..Default::default() };
+            self.event(stamp, log_time_ns, record, Event::ChartReady(chart));
+        }
+    }
+
+    /// The silence before an input, where its stamp is that much later than the one before.
+    fn silence(&mut self, stamp: Time, log_time_ns: u64) {
+        let timeout = Duration::try_from_secs_f64(self.session.settings().silence_timeout_s).ok();
+        let timeout_ns = timeout.and_then(|timeout| i64::try_from(timeout.as_nanos()).ok());
+        if let (Some((last, last_log_ns)), Some(timeout_ns)) = (self.last, timeout_ns)
+            && stamp.as_ns().saturating_sub(last.as_ns()) > timeout_ns
+        {
+            let silent = Time::from_ns(last.as_ns() + timeout_ns);
+            let log_ns = last_log_ns.saturating_add(timeout_ns.unsigned_abs()).min(log_time_ns);
+            let record = SessionEvent { kind: event_kind::SILENCE, ..Default::default() };
+            self.event(silent, log_ns, record, Event::Silence { stamp: silent });
+        }
+        self.last = Some((stamp, log_time_ns));
+    }
+
+    /// Computes the map that the prediction for `input` needs, where there is none.
+    fn prepare(&mut self, input: &OperatingPoint, log_time_ns: u64) {
+        let point = input.point();
+        if self.session.lacks_map(&point) {
+            self.map(input.header.stamp, log_time_ns, &point);
+        }
+    }
+
+    fn input(&mut self, input: OperatingPoint, log_time_ns: u64, publish_time_ns: u64) {
+        self.inputs += 1;
+        let stamp = input.header.stamp;
+        self.write(log_time_ns, publish_time_ns, Payload::OperatingPoint(input.clone()));
+        match self.step(log_time_ns, Event::Input(input)) {
+            None => {}
+            Some(Want::Map(point)) => self.map(stamp, log_time_ns, &point),
+            Some(Want::Ends(point)) => self.ends(stamp, log_time_ns, &point),
+        }
+    }
+
+    fn map(&mut self, stamp: Time, log_time_ns: u64, point: &physics::OperatingPoint) {
+        let place = point.with_friction(0.0);
+        if self.given_up == Some(place) {
+            return;
+        }
+        match session_map(&self.rig, &mut self.solver, point) {
+            Ok(map) => {
+                let record = at_load_and_speed(event_kind::STABILITY_MAP, point, map_hash(&map));
+                self.event(stamp, log_time_ns, record, Event::MapReady(Arc::new(map)));
+            }
+            Err(reason) => {
+                self.given_up = Some(place);
+                self.map_failure.get_or_insert(reason);
+            }
+        }
+    }
+
+    fn ends(&mut self, stamp: Time, log_time_ns: u64, point: &physics::OperatingPoint) {
+        let Some(map) = self.session.map().cloned() else { return };
+        match session_ends(&self.rig, &mut self.solver, &map, point) {
+            Ok(Some(ends)) => {
+                let record = at_load_and_speed(event_kind::WINDOW_ENDS, point, ends_hash(&ends));
+                self.event(stamp, log_time_ns, record, Event::EndsReady(Arc::new(ends)));
+            }
+            Ok(None) => self.map(stamp, log_time_ns, point),
+            Err(reason) => drop(self.map_failure.get_or_insert(reason)),
+        }
+    }
+
+    fn finish(self) -> Result<Predicted, OfflineError> {
+        let Self { recorder, inputs, levels, map_failure, .. } = self;
+        let finished = recorder.finish(Duration::from_secs(600))?;
+        match finished.status.dropped() {
+            0 => Ok(Predicted { directory: finished.directory, inputs, levels, map_failure }),
+            dropped => {
+                let reason = finished.status.last_error.unwrap_or_else(|| "the queue was full".to_owned());
+                Err(OfflineError::Dropped { dropped, reason })
+            }
         }
     }
 }

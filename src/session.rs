@@ -210,6 +210,14 @@ impl Session {
         self.reuses(point) || self.usable_chart(point).is_some_and(|chart| chart.covers(point))
     }
 
+    /// Whether the prediction for `point`, if it came next, would have no margin for want of a stability map.
+    pub fn lacks_map(&self, point: &OperatingPoint) -> bool {
+        check_limits(point, &self.rig.limits).is_ok()
+            && self.rig.model.contact_state(point) == ContactState::Sliding
+            && !self.reuses(point)
+            && self.map_at(point).is_none()
+    }
+
     /// Takes spectra of conditions that it may come to, solved with both vectors; those of before are dropped. Where it comes to
     /// them it does not solve again: what it predicts is the same.
     pub fn hand_in(&mut self, spectra: Vec<Spectrum>) {

@@ -16,6 +16,7 @@ mod memory;
 mod on_basis;
 mod player;
 mod predict;
+mod predict_log;
 mod recordings;
 mod recover;
 mod reduce;
@@ -63,6 +64,7 @@ enum Command {
     View(view::Options),
     Report(report::Options),
     Import(import::Options),
+    PredictLog(predict_log::Options),
     Recover(recover::Options),
     Check(check::Options),
     Identify(identify::Options),
@@ -104,6 +106,7 @@ pub fn main() -> ExitCode {
         Command::View(options) => options.run(),
         Command::Report(options) => options.run(),
         Command::Import(options) => options.run(),
+        Command::PredictLog(options) => options.run(),
         Command::Recover(options) => options.run(),
         Command::Predict(options) => options.run(),
         Command::Sweep(options) => options.run(),

@@ -12,7 +12,7 @@ use crate::io::clock;
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::Ros2Source;
 use crate::io::shm::{ShmSource, ShmVibrationSource};
-use crate::offline;
+use crate::offline::{self, Measured, Quantity};
 use crate::rig::Rig;
 use crate::simulator::{Peak, Profile, Simulator, Tone};
 use crate::wire::{Header, OperatingPoint, Time, Vibration};
@@ -131,8 +131,13 @@ impl Options {
                 let stamp_ns = offline::START_NS + (time_s * 1e9).round() as i64;
                 (time_s < duration_s).then(|| measuring.measure(seq, stamp_ns))
             });
-            let written = offline::record(&rig, measured, directory)?;
-            note!("{}", written.display());
+            let measured = measured.flat_map(|(conditions, vibration)| {
+                let vibration = vibration.map(|vibration| Measured::at_its_stamp(Quantity::Vibration(vibration)));
+                vibration.into_iter().chain([Measured::at_its_stamp(Quantity::Conditions(conditions))])
+            });
+            // A simulator is not asked twice: nothing is known ahead.
+            let predicted = offline::record(&rig, None, std::iter::empty(), measured, directory)?;
+            note!("{}", predicted.directory.display());
             return Ok(Outcome::Done);
         }
         self.publish(profile, period, ros_args)

@@ -51,7 +51,10 @@ pub fn session_chart(rig: &Rig, threads: usize, go_on: &dyn Fn() -> bool) -> Res
 }
 
 /// The chart a session uses, from where it is `kept`, or built on from what is; `go_on` stops the work by saying no.
-fn kept_chart(rig: &Rig, kept: &ChartFile, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
+///
+/// # Errors
+/// Why there is none, in words.
+pub fn kept_chart(rig: &Rig, kept: &ChartFile, threads: usize, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
     let begun = kept.load().unwrap_or_else(|error| {
         note!("{error}: the rig is charted anew");
         None
@@ -65,7 +68,8 @@ fn kept_chart(rig: &Rig, kept: &ChartFile, go_on: &dyn Fn() -> bool) -> Result<C
             note!("the chart is not kept: {error}");
         }
     };
-    let chart = resume(&rig.model, &chart_options(rig), begun, &mut |progress| {
+    let options = ChartOptions { threads, ..chart_options(rig) };
+    let chart = resume(&rig.model, &options, begun, &mut |progress| {
         if progress.unit_finished && saved.elapsed() >= SAVE_EVERY {
             save(progress.chart);
             saved = Instant::now();
@@ -112,7 +116,7 @@ pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming
         yield_to_predictions();
         let go_on = || !stopped.load(Ordering::Relaxed);
         let built = catch_unwind(AssertUnwindSafe(|| match &kept {
-            Some(kept) => kept_chart(&rig, kept, &go_on),
+            Some(kept) => kept_chart(&rig, kept, 1, &go_on),
             None => session_chart(&rig, 1, &go_on),
         }));
         let chart = built.unwrap_or_else(|_| Err("internal error while the rig was charted".to_owned()));

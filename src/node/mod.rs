@@ -18,7 +18,9 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
 
-pub use mapper::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map, yield_to_predictions};
+pub use mapper::{
+    chart_hash, ends_hash, kept_chart, map_hash, session_chart, session_ends, session_map, yield_to_predictions,
+};
 pub use outputs::Outputs;
 pub use sensitivity::end_derivatives;
 pub use shortcut::Shortcut;
