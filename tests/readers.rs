@@ -315,7 +315,11 @@ fn reports_tell_the_time_of_the_stamps() {
 fn a_hash_that_differs_is_a_difference() {
     let folder = folder();
     let rig = std::fs::read_to_string(launch("nine-dof-case-2.toml")).expect("an embedded rig");
-    let rig = write(folder.path(), "stiffening.toml", &format!("{rig}\n[load]\nexponent = 0.4\n"));
+    let rig = write(
+        folder.path(),
+        "stiffening.toml",
+        &format!("{rig}\n[load]\nexponent = 0.4\n[chart]\nnormal_load_n = [490.0, 520.0]\n"),
+    );
     let rising =
         |k: u64| written("/rig/operating_point", T0 + k * S / 10, point(k, T0 + k * S / 10, 500.0 + k as f64, 0.3));
     let input = bag(&folder.path().join("rising.mcap"), &(0..8).map(rising).collect::<Vec<_>>());

@@ -56,8 +56,13 @@ impl RecordedTopics {
         let mut decided = Self::default();
         let mut known = BTreeSet::new();
         for topic in Topic::ALL {
-            let of_type: BTreeSet<&str> =
-                channels.iter().filter(|channel| type_name(channel) == topic.type_name()).map(|c| &*c.topic).collect();
+            // Another of the node's topics by its name, which has the wrong type there, is no candidate.
+            let candidate = |name: &str| Topic::ALL.into_iter().all(|own| own == topic || own.name() != name);
+            let of_type: BTreeSet<&str> = channels
+                .iter()
+                .filter(|channel| type_name(channel) == topic.type_name() && candidate(&channel.topic))
+                .map(|channel| &*channel.topic)
+                .collect();
             known.extend(of_type.iter().map(|&name| name.to_owned()));
             match choose(topic, &of_type, chosen)? {
                 Ok(Some(name)) => drop(decided.names.insert(topic, name.to_owned())),
