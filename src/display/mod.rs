@@ -7,6 +7,7 @@
 
 mod assets;
 pub mod comparison;
+mod connections;
 pub mod curves;
 pub mod events;
 pub mod history;

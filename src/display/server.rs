@@ -1,15 +1,13 @@
 //! Hands a [`Source`] to browsers: HTTP/1.1, GET only, one stream of states.
 //!
 //! Runs on a thread of its own. All pages together get one encoding of a state, at most 30 times a second; a page that
-//! reads too slowly misses states, one that does not read at all is dropped. No request changes anything.
+//! reads too slowly misses states. [`connections`] bounds what clients can take. No request changes anything.
 
 use std::convert::Infallible;
 use std::io;
-use std::net::{IpAddr, SocketAddr};
-use std::pin::Pin;
+use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::Router;
@@ -21,30 +19,22 @@ use axum::response::sse::{Event as Sent, Sse};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use serde::{Deserialize, Serialize};
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot, watch};
-use tokio::time::{Instant, MissedTickBehavior, Sleep, interval, sleep};
+use tokio::net::TcpListener;
+use tokio::sync::{oneshot, watch};
+use tokio::time::{MissedTickBehavior, interval};
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::WatchStream;
 
 use super::assets;
 use super::comparison::Comparison;
+use super::connections::{self, Bounds};
 use super::events::Events;
 use crate::rig::Rig;
 
 /// Time between two states: not more than 30 a second.
 const EVERY: Duration = Duration::from_millis(34);
-/// A client that takes nothing for this long is dropped.
-const PATIENCE: Duration = Duration::from_secs(10);
-/// A connection over which nothing goes in either direction for this long is dropped.
-const IDLE: Duration = Duration::from_secs(30);
 /// Maps, shapes and histories that are prepared at a time; more wait. Two may wait for each other's map.
 const BLOCKING_THREADS: usize = 4;
-/// Connections at a time; more wait.
-const MOST_CONNECTIONS: usize = 256;
-/// Pages that listen at a time; more are refused.
-const MOST_LISTENERS: usize = 64;
 
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; \
                       base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
@@ -134,7 +124,7 @@ impl Server {
         // Few threads for what takes longer: the allocator keeps memory for each.
         let mut runtime = tokio::runtime::Builder::new_current_thread();
         let runtime = runtime.enable_io().enable_time().max_blocking_threads(BLOCKING_THREADS).build()?;
-        let listener = runtime.block_on(TcpListener::bind(addresses))?;
+        let listener = runtime.block_on(async { connections::listen(addresses) })?;
         let address = listener.local_addr()?;
         let (stop, stopped) = oneshot::channel();
         let thread = std::thread::Builder::new().name("display".to_owned()).spawn(move || {
@@ -187,9 +177,8 @@ async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Sourc
         .fallback(get(asset))
         .layer(from_fn_with_state(app.clone(), guard))
         .with_state(app.clone());
-    let listener = Patient { listener, permits: Arc::new(Semaphore::new(MOST_CONNECTIONS)) };
     tokio::select! {
-        _ = axum::serve(listener, router) => {}
+        () = connections::serve(listener, router, Bounds::default()) => {}
         () = send_states(app) => {}
     }
 }
@@ -231,14 +220,25 @@ async fn guard(Shared(app): Shared<App>, request: Request, next: Next) -> Respon
 
 /// Whether a Host header names an address rather than a name of somebody else's; on loopback, a loopback address.
 fn is_own_name(host: &str, bound: IpAddr) -> bool {
-    let name = match host.strip_prefix('[') {
-        Some(rest) => rest.split(']').next().unwrap_or(""),
-        None => host.split(':').next().unwrap_or(""),
-    };
-    match name.parse::<IpAddr>() {
-        Ok(address) => !bound.is_loopback() || address.is_loopback(),
-        Err(_) => name.eq_ignore_ascii_case("localhost"),
+    let bracketed = || host.strip_prefix('[')?.strip_suffix(']')?.parse::<Ipv6Addr>().ok().map(IpAddr::from);
+    let with_port = host.parse::<SocketAddr>().ok().map(|address| address.ip());
+    match with_port.or_else(|| host.parse().ok()).or_else(bracketed) {
+        Some(address) => !bound.is_loopback() || address.is_loopback(),
+        None => {
+            let (name, port) = host.split_once(':').unwrap_or((host, "0"));
+            name.eq_ignore_ascii_case("localhost") && port.parse::<u16>().is_ok()
+        }
     }
+}
+
+/// Whether an `Accept-Encoding` header takes zstd: named, and not with a weight of 0.
+fn takes_zstd(accepted: &str) -> bool {
+    accepted.split(',').any(|encoding| {
+        let mut parts = encoding.split(';').map(str::trim);
+        let named = parts.next().is_some_and(|name| name.eq_ignore_ascii_case("zstd"));
+        let weight = parts.find_map(|part| part.strip_prefix("q=").or(part.strip_prefix("Q=")));
+        named && weight.is_none_or(|weight| weight.trim().parse::<f64>().is_ok_and(|weight| weight > 0.0))
+    })
 }
 
 /// Counts a page for as long as it listens.
@@ -251,10 +251,8 @@ impl Drop for Listening {
 }
 
 async fn stream(Shared(app): Shared<App>) -> Response {
+    app.listeners.fetch_add(1, Ordering::Relaxed);
     let listening = Listening(app.listeners.clone());
-    if app.listeners.fetch_add(1, Ordering::Relaxed) >= MOST_LISTENERS {
-        return (StatusCode::SERVICE_UNAVAILABLE, format!("{MOST_LISTENERS} pages listen already")).into_response();
-    }
     let states = WatchStream::from_changes(app.states.subscribe()).map(move |state| {
         let _counted = &listening;
         Ok::<_, Infallible>(Sent::default().data(&*state))
@@ -336,7 +334,7 @@ async fn asset(headers: HeaderMap, request: Request) -> Response {
     };
     let accepted = headers.get(header::ACCEPT_ENCODING).and_then(|value| value.to_str().ok()).unwrap_or("");
     let media_type = (header::CONTENT_TYPE, asset.media_type);
-    if accepted.split(',').any(|encoding| encoding.split(';').next().is_some_and(|name| name.trim() == "zstd")) {
+    if takes_zstd(accepted) {
         ([media_type, (header::CONTENT_ENCODING, "zstd")], asset.compressed()).into_response()
     } else {
         ([media_type], asset.bytes).into_response()
@@ -355,102 +353,6 @@ async fn aside(work: impl FnOnce() -> Response + Send + 'static) -> Response {
     }
 }
 
-/// Accepts a bounded number of connections, each of which fails when its other end takes nothing for too long, or when
-/// nothing at all happens on it.
-struct Patient {
-    listener: TcpListener,
-    permits: Arc<Semaphore>,
-}
-
-struct PatientStream {
-    stream: TcpStream,
-    waiting: Option<Pin<Box<Sleep>>>,
-    idle: Pin<Box<Sleep>>,
-    _permit: Option<OwnedSemaphorePermit>,
-}
-
-impl axum::serve::Listener for Patient {
-    type Io = PatientStream;
-    type Addr = SocketAddr;
-
-    async fn accept(&mut self) -> (PatientStream, SocketAddr) {
-        // The semaphore is never closed: there is always a permit in the end.
-        let permit = self.permits.clone().acquire_owned().await.ok();
-        loop {
-            match self.listener.accept().await {
-                Ok((stream, address)) => {
-                    let _ = stream.set_nodelay(true);
-                    let idle = Box::pin(sleep(IDLE));
-                    return (PatientStream { stream, waiting: None, idle, _permit: permit }, address);
-                }
-                // Out of file descriptors, or the client has gone again.
-                Err(_) => sleep(Duration::from_millis(50)).await,
-            }
-        }
-    }
-
-    fn local_addr(&self) -> io::Result<SocketAddr> {
-        self.listener.local_addr()
-    }
-}
-
-impl PatientStream {
-    fn judge<T>(&mut self, written: Poll<io::Result<T>>, context: &mut Context<'_>) -> Poll<io::Result<T>> {
-        if written.is_ready() {
-            self.waiting = None;
-            self.idle.as_mut().reset(Instant::now() + IDLE);
-            return written;
-        }
-        let waiting = self.waiting.get_or_insert_with(|| Box::pin(sleep(PATIENCE)));
-        match waiting.as_mut().poll(context) {
-            Poll::Ready(()) => Poll::Ready(Err(io::ErrorKind::TimedOut.into())),
-            Poll::Pending => Poll::Pending,
-        }
-    }
-}
-
-impl AsyncRead for PatientStream {
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        let read = Pin::new(&mut self.stream).poll_read(cx, buffer);
-        if read.is_ready() {
-            self.idle.as_mut().reset(Instant::now() + IDLE);
-            return read;
-        }
-        match self.idle.as_mut().poll(cx) {
-            Poll::Ready(()) => Poll::Ready(Err(io::ErrorKind::TimedOut.into())),
-            Poll::Pending => Poll::Pending,
-        }
-    }
-}
-
-impl AsyncWrite for PatientStream {
-    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        let written = Pin::new(&mut self.stream).poll_write(cx, bytes);
-        self.judge(written, cx)
-    }
-
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        parts: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        let written = Pin::new(&mut self.stream).poll_write_vectored(cx, parts);
-        self.judge(written, cx)
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(cx)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -461,10 +363,33 @@ mod tests {
         for host in ["127.0.0.1:8765", "localhost:8765", "LOCALHOST", "[::1]:8765"] {
             assert!(is_own_name(host, loopback), "{host}");
         }
-        for host in ["", "evil.example:8765", "127.0.0.1.evil.example", "192.168.1.5:8765"] {
+        for host in [
+            "",
+            "evil.example:8765",
+            "127.0.0.1.evil.example",
+            "192.168.1.5:8765",
+            "[::1].evil.example",
+            "[::1].evil.example:8765",
+            "[::1]evil.example",
+            "[::1",
+            "[127.0.0.1]",
+            "127.0.0.1:8765.evil.example",
+            "localhost:8765.evil.example",
+            "localhost:evil.example",
+        ] {
             assert!(!is_own_name(host, loopback), "{host}");
         }
         assert!(is_own_name("192.168.1.5:8765", anywhere));
         assert!(!is_own_name("evil.example", anywhere));
+    }
+
+    #[test]
+    fn an_encoding_of_weight_zero_is_not_taken() {
+        for accepted in ["zstd", "gzip, zstd;q=0.5", "br;q=0, ZSTD ; q=1", "zstd;q=0.001"] {
+            assert!(takes_zstd(accepted), "{accepted}");
+        }
+        for refused in ["", "gzip", "zstd;q=0", "gzip, zstd; q=0.000", "zstd;q=none", "zstdx"] {
+            assert!(!takes_zstd(refused), "{refused}");
+        }
     }
 }
