@@ -68,7 +68,7 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
         let point = self.load_and_speed.point(&rig);
-        let (modes, windows) = sweep(&rig, &point, self.mu, self.svg.is_some())?;
+        let Sweep { modes, beside_ends, windows } = sweep(&rig, &point, self.mu, self.svg.is_some())?;
         let csv = to_csv(&modes)?;
         match (&self.csv, &self.svg) {
             (Some(path), _) => write_file(path, csv.as_bytes())?,
@@ -76,8 +76,9 @@ impl Options {
             (None, Some(_)) => {}
         }
         if let Some(path) = &self.svg {
-            let points: Vec<Point> = modes
+            let mut points: Vec<Point> = modes
                 .iter()
+                .chain(&beside_ends)
                 .map(|(mu, mode)| Point {
                     mu: *mu,
                     id: mode.id,
@@ -85,6 +86,7 @@ impl Options {
                     growth_rate_per_s: mode.root.growth_rate_per_s(),
                 })
                 .collect();
+            points.sort_by(|a, b| a.mu.total_cmp(&b.mu));
             let title = format!("{}, {} N, {} rad/s", rig.name, point.normal_load_n, point.disc_speed_rad_s);
             write_file(path, plot::sweep(&title, &points, &windows)?.as_bytes())?;
         }
@@ -95,8 +97,19 @@ impl Options {
 /// A mode at a friction coefficient.
 type Swept = (f64, Mode);
 
+/// How far outside a window of instability its end is drawn.
+const BESIDE: f64 = 1e-6;
+
+/// What was swept.
+struct Sweep {
+    modes: Vec<Swept>,
+    /// The modes just outside the windows, where growth has not begun: without them a coarse line rises too early.
+    beside_ends: Vec<Swept>,
+    windows: Vec<Window>,
+}
+
 /// Every mode of the band at every friction coefficient of the range, and the windows of instability if asked for.
-fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<(Vec<Swept>, Vec<Window>)> {
+fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<Sweep> {
     let mut solver = Solver::new(rig.model.dimension());
     let followed = MapOptions { mu_min: range.from.min(0.0), mu_max: range.to.max(0.0), windows, ..map_options(rig) };
     let map = StabilityMap::build(&rig.model, &mut solver, point, &followed)?;
@@ -126,7 +139,14 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
     for part in parts {
         modes.extend(part?);
     }
-    Ok((modes, map.windows))
+    let mut beside_ends = vec![];
+    for window in &map.windows {
+        let outside = [Some(window.mu_from - BESIDE), window.mu_to.map(|mu| mu + BESIDE)];
+        for mu in outside.into_iter().flatten().filter(|mu| (range.from..=range.to).contains(mu)) {
+            beside_ends.extend(modes_at(&mut solver, mu)?);
+        }
+    }
+    Ok(Sweep { modes, beside_ends, windows: map.windows })
 }
 
 fn to_csv(modes: &[Swept]) -> anyhow::Result<String> {
@@ -139,4 +159,30 @@ fn to_csv(modes: &[Swept]) -> anyhow::Result<String> {
         writer.write_record([&mu.to_string(), &mode.id.to_string(), hz, growth, damping])?;
     }
     Ok(String::from_utf8(writer.into_inner()?)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_coarse_sweep_does_not_grow_before_its_window() {
+        let rig = Rig::load("nine-dof-case-2").unwrap();
+        let range = "0:1.6:0.2".parse().unwrap();
+        let Sweep { modes, beside_ends, windows } = sweep(&rig, &rig.reference, range, true).unwrap();
+        assert!(!windows.is_empty());
+        for window in &windows {
+            // What is drawn between the last step before the window and its end: no growth worth a pixel.
+            let last = |swept: &&Swept| swept.0 < window.mu_from;
+            let grows = |swept: &Swept| swept.1.root.growth_rate_per_s() / swept.1.root.lambda.norm();
+            let before: Vec<&Swept> = beside_ends.iter().filter(last).collect();
+            let nearest = before.iter().map(|swept| swept.0).fold(0.0, f64::max);
+            assert!(window.mu_from - nearest < 2.0 * BESIDE, "{nearest}, the window begins at {}", window.mu_from);
+            let ids: Vec<u32> = before.iter().filter(|swept| swept.0 == nearest).map(|swept| swept.1.id).collect();
+            assert!(window.mode_ids.iter().all(|id| ids.contains(id)), "the pair has ids there: {ids:?}");
+            let pair = before.iter().filter(|swept| swept.0 == nearest && window.mode_ids.contains(&swept.1.id));
+            assert!(pair.into_iter().all(|swept| grows(swept) < 1e-6));
+        }
+        assert!(modes.iter().all(|(mu, _)| ((mu / 0.2).round() * 0.2 - mu).abs() < 1e-12), "the table keeps its steps");
+    }
 }
