@@ -30,7 +30,12 @@ pub fn facts<N: AsRef<str>, V: AsRef<str>>(rows: impl IntoIterator<Item = (N, V)
 pub fn figure(svg: &str, caption: &str) -> String {
     // Without the declaration a file of its own would have.
     let svg = svg.find("<svg").map_or(svg, |start| &svg[start..]);
-    format!("<figure>{svg}<figcaption>{caption}</figcaption></figure>\n")
+    // Reached by keyboard too, where it is wider than the screen and scrolls.
+    format!(
+        "<figure><p class=\"wide\">Wider than the screen: scroll it sideways →</p>\
+         <div class=\"figure\" tabindex=\"0\" role=\"group\" aria-label=\"Figure, scrolls sideways\">{svg}</div>\
+         <figcaption>{caption}</figcaption></figure>\n"
+    )
 }
 
 /// Text that is no markup.
@@ -46,6 +51,8 @@ mod tests {
     fn what_is_no_markup_stays_none() {
         assert_eq!(escaped("<a href=\"x\">&"), "&lt;a href=&quot;x&quot;&gt;&amp;");
         assert!(page("a < b", "").contains("<title>a &lt; b</title>"));
-        assert!(figure("<?xml?>\n<svg></svg>", "c").starts_with("<figure><svg>"));
+        let figure = figure("<?xml?>\n<svg></svg>", "c");
+        assert!(figure.contains("><svg></svg></div>") && !figure.contains("<?xml"), "{figure}");
+        assert!(figure.contains("scroll it sideways") && figure.contains("tabindex=\"0\""), "{figure}");
     }
 }
