@@ -433,11 +433,12 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
     let x = range(trials.iter().map(|trial| at(trial.factor)));
     let y = padded(range(trials.iter().flat_map(|trial| [height(trial.mean_error), height(trial.largest_error)])));
     let x_label = match stiffness_n_per_m {
-        Some(_) => "contact stiffness of a pair, log10 N/m",
-        None => "contact stiffness relative to the rig's, log10",
+        Some(_) => "contact stiffness of a pair, N/m",
+        None => "contact stiffness relative to the rig's",
     };
     figure(title, (1000, 560), |area| {
-        let mut chart = axes(area, x, y, x_label, "error of the frequencies, log10 %")?;
+        let labels = (x_label, "error of the frequencies, %");
+        let mut chart = axes_with_ticks(area, x, y, labels, (logarithmic, logarithmic))?;
         let [from, to] = found.doubled;
         let (from, to) = (from.map_or(x.0, &at), to.map_or(x.1, &at));
         chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
@@ -539,6 +540,24 @@ fn power_of_ten(value: f64, _range: (f64, f64)) -> String {
     format!("10{}{raised}", if power < 0.0 { "⁻" } else { "" })
 }
 
+/// The label of a tick of a logarithmic axis within few decades: the value, two digits of it.
+fn logarithmic(value: f64, _range: (f64, f64)) -> String {
+    let value = 10f64.powf(value);
+    let power = value.log10().floor();
+    let rounded = format!("{:.1}", value / 10f64.powf(power));
+    let (digits, power) = if rounded == "10.0" { ("1.0", power + 1.0) } else { (rounded.as_str(), power) };
+    if (-3.0..4.0).contains(&power) {
+        let decimals = (1.0 - power).max(0.0) as usize;
+        let text = format!("{value:.decimals$}");
+        return if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text };
+    }
+    let power = power_of_ten(power, (0.0, 0.0));
+    match digits {
+        "1.0" => power,
+        _ => format!("{}·{power}", digits.trim_end_matches(".0")),
+    }
+}
+
 /// The whole powers of ten around a range of logarithms.
 fn decades((low, high): (f64, f64)) -> (f64, f64) {
     ((low - 0.04 * (high - low)).floor(), (high + 0.04 * (high - low)).ceil())
@@ -561,4 +580,29 @@ fn padded((low, high): (f64, f64)) -> (f64, f64) {
 
 fn failed(error: impl std::fmt::Display) -> PlotError {
     PlotError(error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_of_logarithmic_axes_are_values() {
+        for (value, label) in [
+            (0.0, "1"),
+            (2.0, "100"),
+            (-1.0, "0.1"),
+            (-2.4, "0.004"),
+            (1.5, "32"),
+            (0.2, "1.6"),
+            (3.0, "1000"),
+            (6.0, "10⁶"),
+            (7.2, "1.6·10⁷"),
+            (6.9999, "10⁷"),
+            (-5.0, "10⁻⁵"),
+            (-5.5, "3.2·10⁻⁶"),
+        ] {
+            assert_eq!(logarithmic(value, (0.0, 1.0)), label, "10^{value}");
+        }
+    }
 }
