@@ -15,6 +15,7 @@ HERE = Path(__file__).resolve().parent
 
 ARGUMENTS = [
     DeclareLaunchArgument("rig", default_value="tribometer", description="rig file, or name of an embedded rig"),
+    DeclareLaunchArgument("namespace", default_value="", description="namespace of the node and its topics; empty: /"),
     DeclareLaunchArgument("domain", default_value="", description="DDS domain; empty: ROS_DOMAIN_ID, or 0"),
     DeclareLaunchArgument("loopback", default_value="false", description="true: speak to this machine alone"),
     DeclareLaunchArgument("record", default_value="", description="folder to record into; empty: no recording"),
@@ -40,6 +41,7 @@ def start_node(context):
     return [
         Node(
             executable=given["executable"],
+            namespace=given["namespace"] or None,
             arguments=arguments,
             parameters=[given["params_file"]],
             output="screen",

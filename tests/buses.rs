@@ -2,6 +2,7 @@
 //! in `tests/peers`.
 
 mod bus;
+mod domain;
 
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
@@ -10,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use bus::{PATIENCE, answer, into, next, point, shm, wait_until};
 use crossbeam_channel::unbounded;
+use domain::Domain;
 use squealcast::io::heard::{Bus, Heard};
 use squealcast::io::ros_args::RosArgs;
 use squealcast::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
@@ -17,10 +19,23 @@ use squealcast::io::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, S
 use squealcast::wire::shm::{Form, OperatingPointForm};
 use squealcast::wire::{OperatingPoint, Prediction, RigInfo, Vibration};
 
-/// A domain of its own for each test: not 0, the default, and below 102, where ports of other programs begin.
-fn ros_options(offset: u16) -> Ros2Options {
-    let base = 20 + (std::process::id() % 8) as u16 * 10;
-    Ros2Options::new(Some(base + offset), true, RosArgs::default()).expect("a valid domain")
+/// A node hears its inputs with two readers: a reliable one and a best-effort one.
+const READERS: usize = 2;
+
+/// Loopback, in a domain.
+fn ros_options(domain: &Domain) -> Ros2Options {
+    Ros2Options::new(Some(domain.id), true, RosArgs::default()).expect("a valid domain")
+}
+
+#[test]
+fn no_two_tests_share_a_domain_or_a_name() {
+    let domains: Vec<Domain> = (0..20).map(|_| Domain::claim()).collect();
+    let ids: std::collections::HashSet<u16> = domains.iter().map(|domain| domain.id).collect();
+    assert_eq!(ids.len(), domains.len());
+    for domain in &domains {
+        assert!((1..102).contains(&domain.id) && Domain::take(domain.id).is_none(), "{}", domain.id);
+    }
+    assert_ne!(shm("name").service_prefix, shm("name").service_prefix);
 }
 
 /// This test binary once more, running one `#[ignore]`d test as another process.
@@ -234,14 +249,15 @@ fn echoing_node(options: &Ros2Options, parameters: Parameters) -> Arc<Ros2> {
 
 #[test]
 fn ros2_carries_both_ways() {
-    let options = ros_options(0);
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
     let ros = echoing_node(&options, Parameters::none());
     let (predictions, heard) = unbounded();
     let source = Ros2Source::start(&options, into(predictions)).expect("source");
     wait_until("discovery", || {
-        source.readers() == 1
+        source.readers() == READERS
             && source.prediction_writers() == 1
-            && ros.prediction_readers() == 1
+            && ros.prediction_readers() == READERS
             && ros.operating_point_writers() == 1
     });
     for seq in 0..500 {
@@ -275,12 +291,13 @@ fn both_buses_carry_the_vibration_beside_the_conditions() {
     }
     assert_eq!((input.counts().heard, input.counts().missed), (100, 0), "it has no numbers to miss");
 
-    let options = ros_options(7);
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
     let (points, heard_points) = unbounded();
     let ros = Ros2::start(&options, Parameters::none(), into(points), into(vibrations)).expect("node");
     let source = Ros2Source::start(&options, |_| ()).expect("source");
     wait_until("discovery", || {
-        source.readers() == 1 && source.vibration_readers() == 1 && ros.operating_point_writers() == 1
+        source.readers() == READERS && source.vibration_readers() == READERS && ros.operating_point_writers() == 1
     });
     for k in 0..100 {
         source.publish_vibration(&vibration(k)).expect("published");
@@ -294,25 +311,158 @@ fn both_buses_carry_the_vibration_beside_the_conditions() {
 
 #[test]
 fn ros2_names_are_remapped() {
-    let args = "--ros-args -r __node:=left -r __ns:=/cells -r /rig/operating_point:=/cells/point";
+    let args = "--ros-args -r __node:=left -r __ns:=/cells -r rig/operating_point:=point";
     let (args, _) = RosArgs::split(args.split(' ').map(str::to_owned)).expect("well formed");
-    let node_options = Ros2Options { args: args.clone(), ..ros_options(1) };
+    let domain = Domain::claim();
+    let node_options = Ros2Options { args: args.clone(), ..ros_options(&domain) };
     let (points, heard) = unbounded();
     let ros = Ros2::start(&node_options, Parameters::none(), into(points), |_| ()).expect("node");
     assert_eq!(ros.full_name(), "/cells/left");
     let args = "--ros-args -r /rig/operating_point:=/cells/point";
     let (args, _) = RosArgs::split(args.split(' ').map(str::to_owned)).expect("well formed");
-    let source = Ros2Source::start(&Ros2Options { args, ..ros_options(1) }, |_| ()).expect("source");
-    wait_until("discovery", || source.readers() == 1 && ros.operating_point_writers() == 1);
+    let source = Ros2Source::start(&Ros2Options { args, ..ros_options(&domain) }, |_| ()).expect("source");
+    wait_until("discovery", || source.readers() == READERS && ros.operating_point_writers() == 1);
     source.publish(&point(3)).expect("published");
     assert_eq!(next(&heard).message, point(3));
 }
 
+/// Two rigs, each with its node, in one domain.
+#[test]
+fn namespaces_separate_nodes() {
+    let domain = Domain::claim();
+    let cells = ["left", "right"].map(|cell| {
+        let args = ["--ros-args".to_owned(), "-r".to_owned(), format!("__ns:=/{cell}")];
+        let (args, _) = RosArgs::split(args).expect("well formed");
+        let options = Ros2Options { args, ..ros_options(&domain) };
+        let (predictions, heard) = unbounded();
+        let ros = echoing_node(&options, Parameters::none());
+        assert_eq!(ros.full_name(), format!("/{cell}/squealcast"));
+        (ros, Ros2Source::start(&options, into(predictions)).expect("source"), heard)
+    });
+    wait_until("discovery", || {
+        cells.iter().all(|(ros, source, _)| {
+            source.readers() == READERS && source.prediction_writers() == 1 && ros.prediction_readers() > 0
+        }) && cells.iter().all(|(ros, ..)| ros.operating_point_writers() == 1)
+    });
+    for (first, (_, source, heard)) in (0..).step_by(1000).zip(&cells) {
+        for seq in first..first + 100 {
+            source.publish(&point(seq)).expect("published");
+            assert_eq!(next(heard).message, answer(&point(seq)));
+        }
+    }
+    for (ros, source, heard) in &cells {
+        assert_eq!((ros.counts().heard, source.counts().heard, heard.len()), (100, 100, 0));
+    }
+}
+
+/// What waits while a lost sample is sent again, or the machine is busy: a thread that hears is held up here.
+#[test]
+fn reliable_inputs_that_wait_are_not_lost() {
+    const COUNT: u64 = 6000; // 2 kHz for 3 s, the default time between heartbeats of Fast DDS
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
+    let (sender, heard) = unbounded();
+    let (gate, opened) = unbounded::<()>();
+    let sink = move |point: Heard<OperatingPoint>| {
+        if point.message.seq == 0 {
+            let _ = opened.recv();
+        }
+        let _ = sender.send(point.message.seq);
+    };
+    let ros = Ros2::start(&options, Parameters::none(), sink, |_| ()).expect("node");
+    let source = Ros2Source::start(&options, |_| ()).expect("source");
+    wait_until("discovery", || source.readers() == READERS && ros.operating_point_writers() == 1);
+    for seq in 0..COUNT {
+        source.publish(&point(seq)).expect("published");
+        // Not faster than RustDDS can send.
+        if seq % 50 == 0 {
+            thread::sleep(Duration::from_millis(5));
+        }
+    }
+    drop(gate);
+    for seq in 0..COUNT {
+        assert_eq!(heard.recv_timeout(PATIENCE).expect("heard in time"), seq);
+    }
+    assert_eq!((ros.counts().heard, ros.counts().missed), (COUNT, 0));
+}
+
+/// Another node in a domain, made with the library underneath; it spins.
+fn foreign_node(domain: &Domain, name: &str) -> (ros2_client::Node, tokio::runtime::Runtime) {
+    use ros2_client::{Context, NodeName, NodeOptions};
+    let participant = rustdds::DomainParticipantBuilder::new(domain.id)
+        .with_only_networks([std::net::Ipv4Addr::LOCALHOST])
+        .build()
+        .expect("participant");
+    let context = Context::from_domain_participant(participant).expect("context");
+    let mut node = context.new_node(NodeName::new("/", name).expect("name"), NodeOptions::new()).expect("node");
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().expect("runtime");
+    runtime.spawn(node.spinner().expect("spinner").spin());
+    (node, runtime)
+}
+
+/// Sensor drivers publish best effort, which a reliable subscription refuses.
+#[test]
+fn best_effort_publishers_are_heard_and_reliable_ones_once() {
+    use ros2_client::{MessageTypeName, Name, QosProfile, qos};
+    const COUNT: u64 = 500;
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
+    let (points, heard) = unbounded();
+    let ros = Ros2::start(&options, Parameters::none(), into(points), |_| ()).expect("node");
+    let (mut node, _runtime) = foreign_node(&domain, "driver");
+    let profile = QosProfile::publisher_default().reliability(qos::Reliability::BestEffort);
+    let name = Name::new("/rig", "operating_point").expect("name");
+    let kind = MessageTypeName::new("squealcast_msgs", "OperatingPoint");
+    let topic = node.create_topic(&name, kind, &profile).expect("topic");
+    let driver = node.create_publisher::<OperatingPoint>(&topic, None).expect("publisher");
+    let source = Ros2Source::start(&options, |_| ()).expect("source");
+    wait_until("discovery", || source.readers() == READERS && ros.operating_point_writers() == 2);
+    wait_until("the driver's discovery", || driver.get_subscription_count(&node) > 0);
+    for seq in 0..COUNT {
+        driver.publish(point(COUNT + seq)).expect("published");
+        source.publish(&point(seq)).expect("published");
+        thread::sleep(Duration::from_millis(1));
+    }
+    let mut reliable = Vec::new();
+    let mut best_effort = std::collections::BTreeSet::new();
+    while reliable.len() < COUNT as usize || !best_effort.contains(&(2 * COUNT - 1)) {
+        let seq = next(&heard).message.seq;
+        if seq < COUNT {
+            reliable.push(seq);
+        } else {
+            assert!(best_effort.insert(seq), "{seq} came twice");
+        }
+    }
+    assert_eq!(reliable, (0..COUNT).collect::<Vec<_>>());
+    // It may lose some, but not on loopback at this pace.
+    assert!(best_effort.len() as u64 > COUNT / 2, "{}", best_effort.len());
+    assert_eq!((ros.counts().malformed, ros.counts().incompatible), (0, 0));
+}
+
+#[test]
+fn peers_with_incompatible_quality_of_service_are_counted_while_they_are_there() {
+    use ros2_client::{MessageTypeName, Name, QosProfile};
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
+    let ros = Ros2::start(&options, Parameters::none(), |_| (), |_| ()).expect("node");
+    let (mut node, runtime) = foreign_node(&domain, "demanding");
+    let profile = QosProfile { deadline: Some(Duration::from_millis(10)), ..QosProfile::subscription_default() };
+    let name = Name::new("/squealcast", "prediction").expect("name");
+    let kind = MessageTypeName::new("squealcast_msgs", "Prediction");
+    let topic = node.create_topic(&name, kind, &profile).expect("topic");
+    let subscription = node.create_subscription::<Prediction>(&topic, None).expect("subscription");
+    wait_until("the peer is counted", || ros.counts().incompatible == 1);
+    assert_eq!(ros.prediction_readers(), 0);
+    drop((subscription, topic, node, runtime));
+    wait_until("it is gone", || ros.counts().incompatible == 0);
+}
+
 #[test]
 fn bad_ros2_names_are_errors() {
-    for bad in ["__node:=a-b", "__node:=a__b", "__ns:=/a//b", "__ns:=/1", "/rig/operating_point:=/a//b"] {
+    for bad in ["__node:=a-b", "__node:=a__b", "__ns:=/a//b", "__ns:=/1", "rig/operating_point:=/a//b"] {
         let (args, _) = RosArgs::split(["--ros-args", "-r", bad].map(str::to_owned)).expect("well formed");
-        let options = Ros2Options { args, ..ros_options(2) };
+        let domain = Domain::claim();
+        let options = Ros2Options { args, ..ros_options(&domain) };
         assert!(Ros2::start(&options, Parameters::none(), |_| (), |_| ()).is_err(), "{bad}");
     }
     assert!(Ros2Options::new(Some(233), true, RosArgs::default()).is_err());
@@ -321,7 +471,8 @@ fn bad_ros2_names_are_errors() {
 #[test]
 fn a_late_ros2_reader_gets_the_rig() {
     use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, qos};
-    let options = ros_options(3);
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
     let ros = Ros2::start(&options, Parameters::none(), |_| (), |_| ()).expect("node");
     let rig = RigInfo { name: "nine-dof".to_owned(), mode_count: 9, ..RigInfo::default() };
     ros.publish_rig(&rig).expect("published");
@@ -361,7 +512,8 @@ fn ros2_parameters_are_judged() {
     use ros2_client::{
         Context, Name, NodeName, NodeOptions, Parameter, ParameterValue, QosProfile, ServiceMapping, ServiceTypeName,
     };
-    let options = ros_options(4);
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
     let accepted = Arc::new(Mutex::new(Vec::new()));
     let collecting = Arc::clone(&accepted);
     let parameters = Parameters {
@@ -455,14 +607,16 @@ fn a_refused_initial_value_is_an_error() {
         validate: Box::new(|_, _| Err("below 0".to_owned())),
         accepted: Box::new(|_, _| ()),
     };
-    let error = Ros2::start(&ros_options(5), parameters, |_| (), |_| ()).err().expect("refused").to_string();
+    let domain = Domain::claim();
+    let error = Ros2::start(&ros_options(&domain), parameters, |_| (), |_| ()).err().expect("refused").to_string();
     assert!(error.contains("below 0"), "{error}");
 }
 
 #[test]
 fn malformed_ros2_samples_are_counted() {
     use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, qos};
-    let options = ros_options(6);
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
     let (points, heard) = unbounded();
     let ros = Ros2::start(&options, Parameters::none(), into(points), |_| ()).expect("node");
     let participant = rustdds::DomainParticipantBuilder::new(options.domain_id)
@@ -481,7 +635,7 @@ fn malformed_ros2_samples_are_counted() {
         .expect("topic");
     let publisher = node.create_publisher::<u16>(&topic, None).expect("publisher");
     let source = Ros2Source::start(&options, |_| ()).expect("source");
-    wait_until("discovery", || source.readers() == 1 && ros.operating_point_writers() == 2);
+    wait_until("discovery", || source.readers() == READERS && ros.operating_point_writers() == 2);
     wait_until("malformed samples", || {
         publisher.publish(0xffff).expect("published");
         ros.counts().malformed > 0
@@ -492,7 +646,8 @@ fn malformed_ros2_samples_are_counted() {
 
 #[test]
 fn ros2_outlives_killed_peers() {
-    let options = ros_options(7);
+    let domain = Domain::claim();
+    let options = ros_options(&domain);
     let ros = echoing_node(&options, Parameters::none());
     for seq in 0..2 {
         let peer = spawn_peer("peer_on_ros2", "SQUEALCAST_TEST_DOMAIN", &options.domain_id.to_string());
@@ -505,7 +660,7 @@ fn ros2_outlives_killed_peers() {
         }
         let (predictions, heard) = unbounded();
         let source = Ros2Source::start(&options, into(predictions)).expect("source");
-        wait_until("discovery", || source.readers() == 1 && source.prediction_writers() == 1);
+        wait_until("discovery", || source.readers() == READERS && source.prediction_writers() == 1);
         let started = Instant::now();
         loop {
             source.publish(&point(seq)).expect("published");

@@ -47,6 +47,8 @@ pub struct Counts {
     pub malformed: u64,
     /// Times the bus itself failed to deliver or to wait.
     pub failures: u64,
+    /// Peers that are known now but cannot be connected, because their quality of service is incompatible.
+    pub incompatible: u64,
 }
 
 impl Counts {
@@ -57,6 +59,7 @@ impl Counts {
             missed: self.missed + others.missed,
             malformed: self.malformed + others.malformed,
             failures: self.failures + others.failures,
+            incompatible: others.incompatible, // who is known now
         }
     }
 }
@@ -68,6 +71,7 @@ pub(super) struct Counters {
     missed: AtomicU64,
     malformed: AtomicU64,
     failures: AtomicU64,
+    incompatible: AtomicU64,
 }
 
 impl Counters {
@@ -84,12 +88,17 @@ impl Counters {
         self.failures.fetch_add(1, Ordering::Relaxed);
     }
 
+    pub(super) fn set_incompatible(&self, peers: u64) {
+        self.incompatible.store(peers, Ordering::Relaxed);
+    }
+
     pub(super) fn counts(&self) -> Counts {
         Counts {
             heard: self.heard.load(Ordering::Relaxed),
             missed: self.missed.load(Ordering::Relaxed),
             malformed: self.malformed.load(Ordering::Relaxed),
             failures: self.failures.load(Ordering::Relaxed),
+            incompatible: self.incompatible.load(Ordering::Relaxed),
         }
     }
 }

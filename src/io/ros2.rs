@@ -3,10 +3,13 @@
 //! Pure Rust DDS underneath (RustDDS): no ROS 2 installation is needed. Publishing works from any thread and never
 //! waits. A peer that was killed is only forgotten after its lease; who listens should look at sequence numbers.
 
+mod discovery;
+mod ears;
 mod frame;
 mod link;
 mod loopback;
 pub mod process;
+mod qos_conflicts;
 pub mod side;
 
 use std::env;
@@ -18,6 +21,7 @@ use ros2_client::{MessageTypeName, NodeOptions, ParameterValue, Publisher};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use self::discovery::Discovery;
 use self::link::{Durability, Link, MAX_UNANSWERED};
 use super::heard::{Bus, Counts, Heard};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
@@ -28,6 +32,9 @@ use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitiv
 pub const NODE_NAME: &str = "squealcast";
 /// The name of the mirror's node, before remapping.
 pub const SOURCE_NODE_NAME: &str = "rig";
+
+/// How notes about ROS 2 begin.
+const NOTE: &str = "ROS 2: ";
 
 /// The largest domain whose ports exist.
 const MAX_DOMAIN_ID: u16 = 232;
@@ -44,10 +51,11 @@ pub struct Ros2Options {
 }
 
 impl Ros2Options {
-    /// The given domain, or that of `ROS_DOMAIN_ID`, or 0.
+    /// The given domain, or that of `ROS_DOMAIN_ID`, or 0; on loopback alone if that is asked for here or by
+    /// `ROS_AUTOMATIC_DISCOVERY_RANGE` or `ROS_LOCALHOST_ONLY`.
     ///
     /// # Errors
-    /// A domain that is no number or beyond 232.
+    /// A domain that is no number or beyond 232; a variable whose value is none, or cannot be done.
     pub fn new(domain_id: Option<u16>, loopback_only: bool, args: RosArgs) -> Result<Self, Ros2Error> {
         let domain_id = match (domain_id, env::var("ROS_DOMAIN_ID")) {
             (Some(domain_id), _) => domain_id,
@@ -59,7 +67,11 @@ impl Ros2Options {
         if domain_id > MAX_DOMAIN_ID {
             return Err(Ros2Error::DomainId(domain_id.to_string()));
         }
-        Ok(Self { domain_id, loopback_only, args })
+        let discovery = Discovery::from_variables(|name| env::var(name).ok())?;
+        for warning in &discovery.warnings {
+            note!("{NOTE}{warning}");
+        }
+        Ok(Self { domain_id, loopback_only: loopback_only || discovery.loopback_only, args })
     }
 }
 
@@ -68,6 +80,8 @@ impl Ros2Options {
 pub enum Ros2Error {
     #[error("ROS domain {0:?}, expected 0 to {MAX_DOMAIN_ID}")]
     DomainId(String),
+    #[error("{variable}={value}: {reason}")]
+    Discovery { variable: &'static str, value: String, reason: &'static str },
     #[error("{name:?} is no name of ROS 2: {reason}")]
     Name { name: String, reason: String },
     #[error("ROS node {name}: {reason}")]
@@ -261,7 +275,8 @@ impl Ros2 {
         publish(&self.diagnostics, topic::DIAGNOSTICS, diagnostics)
     }
 
-    /// How many readers the predictions have, those included that were killed less than their lease ago.
+    /// How many readers the predictions have, those included that were killed less than their lease ago. A [`Ros2Source`] has
+    /// two: a reliable one and a best-effort one.
     pub fn prediction_readers(&self) -> usize {
         self.prediction.get_subscription_count(self.link.node())
     }
@@ -346,12 +361,13 @@ impl Ros2Source {
         publish(&self.vibration, topic::VIBRATION, vibration)
     }
 
-    /// How many readers the operating points have, those included that were killed less than their lease ago.
+    /// How many readers the operating points have, those included that were killed less than their lease ago. A node has two:
+    /// a reliable one and a best-effort one.
     pub fn readers(&self) -> usize {
         self.operating_point.get_subscription_count(self.link.node())
     }
 
-    /// How many readers the vibration has, those included that were killed less than their lease ago.
+    /// How many readers the vibration has, those included that were killed less than their lease ago; a node has two.
     pub fn vibration_readers(&self) -> usize {
         self.vibration.get_subscription_count(self.link.node())
     }

@@ -112,6 +112,7 @@ impl Statistics {
             values.push(pair(&format!("{bus}_missed"), counts.missed));
             values.push(pair(&format!("{bus}_malformed"), counts.malformed));
             values.push(pair(&format!("{bus}_failures"), counts.failures));
+            values.push(pair(&format!("{bus}_incompatible_peers"), counts.incompatible));
         }
         self.times.clear();
         let mut warnings: Vec<String> = vec![];
@@ -122,6 +123,10 @@ impl Statistics {
         warnings.extend(outputs.last_failure.take());
         warnings.extend(ros2.into_iter().flat_map(|(_, wrong)| wrong));
         warnings.extend(outputs.other_nodes());
+        let incompatible = outputs.counts().iter().map(|(_, counts)| counts.incompatible).sum::<u64>();
+        if incompatible > 0 {
+            warnings.push(format!("peers not connected, their quality of service is incompatible: {incompatible}"));
+        }
         let passed_over = self.passed_over - self.passed_over_before;
         self.passed_over_before = self.passed_over;
         if passed_over > 0 {

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::physics;
 
-/// Topic names on ROS 2 and in recordings.
+/// Topic names in recordings, and on ROS 2 for a node in the namespace `/`.
 pub mod topic {
     /// Conditions in.
     pub const OPERATING_POINT: &str = "/rig/operating_point";
@@ -25,6 +25,15 @@ pub mod topic {
     pub const SENSITIVITY: &str = "/squealcast/sensitivity";
     /// How the node does.
     pub const DIAGNOSTICS: &str = "/diagnostics";
+
+    /// How many messages a publisher keeps; one on [`RIG`].
+    pub const DEPTH: i32 = 64;
+
+    /// The name by which a node asks ROS 2 for a topic: relative to the node's namespace. Only diagnostics are one topic for the
+    /// nodes of all namespaces, by the convention of ROS.
+    pub fn relative(topic: &str) -> &str {
+        if topic == DIAGNOSTICS { topic } else { topic.trim_start_matches('/') }
+    }
 }
 
 /// At most this many modes in a [`Prediction`].

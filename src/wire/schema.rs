@@ -128,7 +128,7 @@ impl Topic {
     /// older `rosbags` and `ros2 bag` read no names; the two places must agree.
     pub fn qos_profiles(self) -> String {
         let durability = if self.is_latched() { 1 } else { 2 };
-        let depth = if self.is_latched() { 1 } else { 64 };
+        let depth = if self.is_latched() { 1 } else { topic::DEPTH };
         let forever = "sec: 2147483647\n    nsec: 4294967295";
         format!(
             "- history: 1\n  depth: {depth}\n  reliability: 1\n  durability: {durability}\n  deadline:\n    {forever}\n  \
@@ -217,6 +217,15 @@ mod tests {
                     "{topic:?}: {full} is not defined"
                 );
             }
+        }
+    }
+
+    #[test]
+    fn the_recorded_quality_of_service_is_that_of_the_publishers() {
+        for topic in Topic::ALL {
+            let (depth, durability) = if topic == Topic::RigInfo { (1, 1) } else { (64, 2) };
+            let begin = format!("- history: 1\n  depth: {depth}\n  reliability: 1\n  durability: {durability}\n");
+            assert!(topic.qos_profiles().starts_with(&begin), "{}", topic.qos_profiles());
         }
     }
 

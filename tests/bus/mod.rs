@@ -1,6 +1,7 @@
 //! What tests on the buses share: messages, and how to wait for them.
 #![allow(dead_code)] // each test binary uses its part
 
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -51,6 +52,9 @@ pub fn wait_until(what: &str, condition: impl Fn() -> bool) {
     }
 }
 
+/// Shared memory under names that no other test has.
 pub fn shm(name: &str) -> ShmOptions {
-    ShmOptions { service_prefix: format!("test-{}-{name}/", std::process::id()), file_prefix: None }
+    static COUNT: AtomicU32 = AtomicU32::new(0);
+    let number = COUNT.fetch_add(1, Ordering::Relaxed);
+    ShmOptions { service_prefix: format!("test-{}-{number}-{name}/", std::process::id()), file_prefix: None }
 }

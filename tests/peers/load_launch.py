@@ -93,10 +93,12 @@ def load_with_stand_in(file: Path, given: dict[str, str]) -> dict[str, object]:
             return context[self.name]
 
     class Node:
-        def __init__(self, *, executable, arguments, parameters, output):
+        def __init__(self, *, executable, namespace, arguments, parameters, output):
             parts = [executable, *arguments, "--ros-args"]
             for path in parameters:
                 parts += ["--params-file", path]
+            if namespace is not None:
+                parts += ["-r", "__ns:=/" + namespace.strip("/")]
             if not all(isinstance(part, str) for part in parts):
                 raise TypeError(f"not all text: {parts}")
             self.command = parts

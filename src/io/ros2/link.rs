@@ -5,8 +5,8 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
-use ros2_client::{Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, Subscription};
-use rustdds::policy::{History, ResourceLimits};
+use ros2_client::{Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher};
+use rustdds::policy::{History, Reliability, ResourceLimits};
 use rustdds::{DomainParticipantBuilder, Duration, QosPolicies, QosPolicyBuilder, Topic, TopicKind};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -15,11 +15,16 @@ use tokio::sync::oneshot;
 pub(super) use rustdds::policy::Durability;
 
 use super::super::heard::{Counters, Counts, Gaps, Heard};
+use super::ears::{Ears, Refused};
 use super::loopback::keep_to_loopback;
+use super::qos_conflicts::QosConflicts;
 use super::{Ros2Error, Ros2Options, heard};
+use crate::wire::topic;
 
-/// How many messages publishers and subscriptions keep.
-const KEEP_LAST: i32 = 64;
+/// How many messages may wait for the thread that hears a subscription; RustDDS acknowledges what does not fit, and drops it.
+/// A reliable subscription hands over nothing until a lost sample was sent again, and everything at once then. Fast DDS sends
+/// it again with its next heartbeat, 3 s later by default: at 2 kHz 6000 messages wait for that.
+const MAX_WAITING: i32 = 8192;
 /// How many messages may wait for the answer of a reader before publishing fails. A killed reader is only forgotten
 /// after its lease, under a minute as a rule; RustDDS's 8192 would be full after 16 s at 500 Hz, for all readers.
 pub(super) const MAX_UNANSWERED: i32 = 1 << 15;
@@ -31,7 +36,8 @@ pub(super) type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
 pub(super) struct Link<M> {
     options: Ros2Options,
     name: NodeName,
-    subscription: Option<Arc<Subscription<M>>>,
+    ears: Option<Arc<Ears<M>>>,
+    conflicts: QosConflicts,
     node: Node,
     context: Context,
     counters: Arc<Counters>,
@@ -67,9 +73,10 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         Ok(Self {
             options: options.clone(),
             name,
+            conflicts: QosConflicts::new(context.domain_participant()),
             context,
             node,
-            subscription: None,
+            ears: None,
             counters: Arc::new(Counters::default()),
             running: None,
         })
@@ -79,7 +86,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
     /// unacknowledged.
     pub(super) fn publisher<P: Serialize>(
         &mut self,
-        topic: &'static str,
+        name: &'static str,
         kind: MessageTypeName,
         durability: Durability,
         max_unanswered: i32,
@@ -87,9 +94,10 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         let limits =
             ResourceLimits { max_samples: max_unanswered, max_instances: 1, max_samples_per_instance: max_unanswered };
         // What is kept for readers that come later is the latest of it.
-        let depth = if durability == Durability::TransientLocal { 1 } else { KEEP_LAST };
-        let qos = qos(durability, depth).resource_limits(limits).build();
-        let (topic, name) = self.topic(topic, &kind, &qos)?;
+        let depth = if durability == Durability::TransientLocal { 1 } else { topic::DEPTH };
+        let qos = qos(durability, RELIABLE, depth).resource_limits(limits).build();
+        let (topic, name) = self.topic(name, &kind, &qos)?;
+        self.conflicts.published(&topic, &name);
         self.node.create_publisher(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
     }
 
@@ -102,14 +110,15 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         sink: impl FnMut(Heard<M>) + Send + 'static,
         aside: Option<Hearing>,
     ) -> Result<(), Ros2Error> {
-        let subscription = Arc::new(self.subscribe::<M>(topic, &kind)?);
+        let ears = Arc::new(self.subscribe::<M>(topic, &kind)?);
         let failed = |reason: String| Ros2Error::Topic { name: topic.to_owned(), reason };
         let spinner = self.node.spinner().map_err(|e| failed(e.to_string()))?;
 
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (stop, stopped) = oneshot::channel();
-        self.subscription = Some(Arc::clone(&subscription));
+        self.ears = Some(Arc::clone(&ears));
         let counters = Arc::clone(&self.counters);
+        let conflicts = self.conflicts.clone();
         let thread = thread::Builder::new().name(format!("ros2 {}", self.name.base_name())).spawn(move || {
             runtime.block_on(async {
                 if let Some(hearing) = aside {
@@ -125,7 +134,8 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
                 tokio::select! {
                     _ = stopped => (),
                     () = spin => (),
-                    () = hear(&subscription, seq, sink, &counters) => (),
+                    () = conflicts.watch(&counters) => (),
+                    () = hear(&ears, seq, sink, &counters) => (),
                 }
             });
         })?;
@@ -141,29 +151,38 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         kind: MessageTypeName,
         sink: impl FnMut(Heard<N>) + Send + 'static,
     ) -> Result<Hearing, Ros2Error> {
-        let subscription = self.subscribe::<N>(topic, &kind)?;
+        let ears = self.subscribe::<N>(topic, &kind)?;
         Ok(Box::pin(async move {
-            hear(&subscription, |_| 0, sink, &Counters::default()).await;
+            hear(&ears, |_| 0, sink, &Counters::default()).await;
         }))
     }
 
-    fn subscribe<N: 'static>(
+    fn subscribe<N: DeserializeOwned + 'static>(
         &mut self,
         topic: &'static str,
         kind: &MessageTypeName,
-    ) -> Result<Subscription<N>, Ros2Error> {
-        let (topic, name) = self.topic(topic, kind, &qos(Durability::Volatile, KEEP_LAST).build())?;
-        self.node.create_subscription(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
+    ) -> Result<Ears<N>, Ros2Error> {
+        let requested = qos(Durability::Volatile, RELIABLE, MAX_WAITING).build();
+        let (reliable, name) = self.topic(topic, kind, &requested)?;
+        let least = qos(Durability::Volatile, Reliability::BestEffort, MAX_WAITING).build();
+        let (best_effort, _) = self.topic(topic, kind, &least)?;
+        self.conflicts.subscribed(&best_effort, &name);
+        let failed =
+            |error: ros2_client::CreateError| Ros2Error::Topic { name: name.clone(), reason: error.to_string() };
+        // The reliable one first: a publisher that the other knows is known to it, too.
+        let reliable = self.node.create_subscription(&reliable, None).map_err(failed)?;
+        let best_effort = self.node.create_subscription(&best_effort, None).map_err(failed)?;
+        Ok(Ears::new((reliable, requested), best_effort, self.context.domain_participant()))
     }
 
     /// A topic, remapped, and its name.
     fn topic(
         &self,
-        topic: &'static str,
+        name: &'static str,
         kind: &MessageTypeName,
         qos: &QosPolicies,
     ) -> Result<(Topic, String), Ros2Error> {
-        let full = self.options.args.topic(topic, self.name.namespace(), self.name.base_name());
+        let full = self.options.args.topic(topic::relative(name), self.name.namespace(), self.name.base_name());
         let bad_name =
             |error: ros2_client::names::NameError| Ros2Error::Name { name: full.clone(), reason: error.to_string() };
         let name = Name::parse(&full).map_err(bad_name)?;
@@ -180,7 +199,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
     }
 
     pub(super) fn writers(&self) -> usize {
-        self.subscription.as_ref().map_or(0, |subscription| subscription.get_publisher_count(&self.node))
+        self.ears.as_ref().map_or(0, |ears| ears.publishers(&self.node))
     }
 }
 
@@ -201,14 +220,15 @@ impl<M> Drop for Link<M> {
 }
 
 async fn hear<M: DeserializeOwned + 'static>(
-    subscription: &Subscription<M>,
+    ears: &Ears<M>,
     seq: fn(&M) -> u64,
     mut sink: impl FnMut(Heard<M>),
     counters: &Counters,
 ) {
     let mut gaps = Gaps::new();
+    let mut refused = Refused::new();
     loop {
-        match subscription.async_take().await {
+        match ears.next(&mut refused).await {
             Ok((message, info)) => {
                 counters.heard(gaps.note(info.publisher_gid(), seq(&message)));
                 sink(heard(message));
@@ -228,6 +248,9 @@ async fn hear<M: DeserializeOwned + 'static>(
     }
 }
 
-fn qos(durability: Durability, depth: i32) -> QosPolicyBuilder {
-    QosPolicyBuilder::new().durability(durability).reliable(Duration::ZERO).history(History::KeepLast { depth })
+/// Reliable, and publishing never waits.
+const RELIABLE: Reliability = Reliability::Reliable { max_blocking_time: Duration::ZERO };
+
+fn qos(durability: Durability, reliability: Reliability, depth: i32) -> QosPolicyBuilder {
+    QosPolicyBuilder::new().durability(durability).reliability(reliability).history(History::KeepLast { depth })
 }

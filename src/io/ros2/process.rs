@@ -3,7 +3,7 @@
 //! Nothing of the node waits for it: what is published goes into a bounded queue.
 
 use std::borrow::Cow;
-use std::io::{BufWriter, Read, Write};
+use std::io::{BufRead, BufReader, BufWriter, Read, Write};
 use std::net::Shutdown;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, bounded, select};
 
 use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide, encode};
-use super::{Ros2Error, Ros2Options};
+use super::{NOTE, Ros2Error, Ros2Options};
 use crate::io::heard::{Bus, Counts, Heard};
 use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
@@ -441,11 +441,14 @@ fn end_process(process: &mut Child, gently: bool) -> std::io::Result<ExitStatus>
     process.wait()
 }
 
-/// The last line that a process wrote to its standard error, Rust's hint about backtraces aside.
-fn last_words(mut stderr: ChildStderr) -> String {
-    let (mut kept, mut chunk) = (Vec::new(), [0; 4096]);
-    while let Ok(count @ 1..) = stderr.read(&mut chunk) {
-        kept.extend_from_slice(&chunk[..count]);
+/// The last line that a process wrote to its standard error, Rust's hint about backtraces aside. Its notes are repeated here.
+fn last_words(stderr: ChildStderr) -> String {
+    let (mut kept, mut line, mut stderr) = (Vec::new(), Vec::new(), BufReader::new(stderr));
+    while let Ok(1..) = (&mut stderr).take(MAX_LAST_WORDS as u64).read_until(b'\n', &mut line) {
+        if line.starts_with(NOTE.as_bytes()) {
+            note!("{}", String::from_utf8_lossy(&line).trim_end());
+        }
+        kept.append(&mut line);
         kept.drain(..kept.len().saturating_sub(MAX_LAST_WORDS));
     }
     let text = String::from_utf8_lossy(&kept);
