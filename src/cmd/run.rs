@@ -113,7 +113,10 @@ pub fn serve(
     if let Some(ros2) = buses.ros2(ros_args)? {
         let declared: Vec<(&str, f64)> = initial.values().collect();
         let name = ros2.args.node_name("squealcast");
-        let values = ros2.args.parameters(&declared, &ros2.args.namespace(&name, "/"), &name)?;
+        let (values, ignored) = ros2.args.parameters(&declared, &ros2.args.namespace(&name, "/"), &name)?;
+        for what in ignored {
+            note!("ROS 2: {what}");
+        }
         for (name, value) in &values {
             initial.set(name, *value)?;
         }

@@ -131,7 +131,8 @@ fn parameters(yaml: &Yaml, prefix: &str, at: &[String], values: &mut Vec<(String
             Yaml::Value(Scalar::FloatingPoint(number)) => values.push((name, number.into_inner().to_string())),
             Yaml::Value(Scalar::Boolean(truth)) => values.push((name, truth.to_string())),
             Yaml::Value(Scalar::String(text)) => values.push((name, text.to_string())),
-            _ => return Err(shape(&[at, &[name]].concat(), "expected a number")),
+            // No parameter of this node, but maybe of another that the file is for, too.
+            _ => values.push((name, "a list, or nothing".to_owned())),
         }
     }
     Ok(())
@@ -190,6 +191,9 @@ other:
         for name in ["squealcast", "/*", "/a/squealcast", "/a/b/other", "/a/b/squealcast/c"] {
             assert_eq!(values(&format!("{name}: {{ros__parameters: {{x: 1}}}}"), "/a/b").len(), 0, "{name}");
         }
+        let text = "/**: {ros__parameters: {x: [1], y: ~}}";
+        assert_eq!(values(text, "/"), ["x", "y"].map(|name| (name.to_owned(), "a list, or nothing".to_owned())));
+        assert_eq!(values("/**/squealcast: {ros__parameters: {x: 1}}", "/").len(), 1, "** stands for none, too");
         assert_eq!(values("/a: {b: {squealcast: {ros__parameters: {x: 1}}}}", "/a/b").len(), 1);
     }
 
@@ -199,7 +203,6 @@ other:
         assert_eq!(problem("[1, 2]"), "top level: expected a mapping of node names");
         assert_eq!(problem("squealcast: 3"), "squealcast: expected a mapping of node names");
         assert_eq!(problem("squealcast: {ros__parameters: 3}"), "squealcast: expected a mapping of parameters");
-        assert_eq!(problem("squealcast: {ros__parameters: {x: [1]}}"), "squealcast / x: expected a number");
         assert_eq!(problem("a: [1, 2"), "no YAML");
         assert!(values("", "/").is_empty());
     }

@@ -4,7 +4,7 @@
 //! of rcl: an argument for one node carries its name before the first colon, later arguments win over earlier ones, and
 //! the first remapping rule that matches is the one that counts.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -24,8 +24,8 @@ pub enum RosArgsError {
     Parameter { text: String },
     #[error("parameter {name}: {value:?} is no number")]
     NotANumber { name: String, value: String },
-    #[error("unknown parameter {name:?}, there are: {known}")]
-    UnknownParameter { name: String, known: String },
+    #[error("{value:?} is no log level, expected DEBUG, INFO, WARN, ERROR or FATAL, or LOGGER:= and one of them")]
+    LogLevel { value: String },
     #[error(transparent)]
     File(#[from] ParamsFileError),
 }
@@ -42,7 +42,7 @@ struct Rule {
 /// Where parameter values come from, in the order they were given.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 enum ParameterSource {
-    Value { node: Option<String>, name: String, value: f64 },
+    Value { node: Option<String>, name: String, value: String },
     File(PathBuf),
 }
 
@@ -51,7 +51,6 @@ enum ParameterSource {
 pub struct RosArgs {
     rules: Vec<Rule>,
     sources: Vec<ParameterSource>,
-    log_level: Option<String>,
 }
 
 impl RosArgs {
@@ -84,7 +83,7 @@ impl RosArgs {
                 "-r" | "--remap" => self.rules.push(Rule::parse(&value()?)?),
                 "-p" | "--param" => self.sources.push(parse_parameter(&value()?)?),
                 "--params-file" => self.sources.push(ParameterSource::File(value()?.into())),
-                "--log-level" => self.log_level = Some(value()?),
+                "--log-level" => check_log_level(&value()?)?,
                 "--log-config-file" | "--log-file-name" | "-e" | "--enclave" => drop(value()?),
                 _ if LOG_SWITCHES.iter().any(|switch| {
                     ["--enable-", "--disable-"].iter().any(|on_off| arg.strip_prefix(on_off) == Some(switch))
@@ -93,11 +92,6 @@ impl RosArgs {
             }
         }
         Ok(())
-    }
-
-    /// `--log-level`, as it was given.
-    pub fn log_level(&self) -> Option<&str> {
-        self.log_level.as_deref()
     }
 
     /// The same, but the node's name is `name` whatever the rules say.
@@ -133,42 +127,51 @@ impl RosArgs {
             .map_or(full, |rule| expand(&rule.to, namespace, node))
     }
 
-    /// Values for the declared parameters: their defaults, then whatever files and `-p` say for this node, in the
-    /// order they were given.
+    /// Values for the declared parameters: their defaults, then whatever files and `-p` say for this node, in the order they
+    /// were given. What was not declared is ignored, as rclcpp does, for launch files give parameters to every node; it comes
+    /// back beside the values, as sentences to be said, so that a misspelt parameter does not go unnoticed.
     ///
     /// # Errors
-    /// A file that cannot be read, a value that is no number, a name that was not declared: a misspelt parameter
-    /// would otherwise go unnoticed. `use_sim_time`, which launch files give to every node, is passed over.
+    /// A file that cannot be read, a declared parameter whose value is no number.
     pub fn parameters(
         &self,
         declared: &[(&str, f64)],
         namespace: &str,
         node: &str,
-    ) -> Result<Vec<(String, f64)>, RosArgsError> {
+    ) -> Result<(Vec<(String, f64)>, Vec<String>), RosArgsError> {
         let mut values: Vec<(String, f64)> = declared.iter().map(|&(name, value)| (name.to_owned(), value)).collect();
-        let mut set = |name: &str, value: f64| {
-            if let Some(slot) = values.iter_mut().find(|(known, _)| known == name) {
-                slot.1 = value;
-                return Ok(());
+        let mut ignored = Vec::new();
+        let mut set = |name: String, value: String| {
+            match (values.iter_mut().find(|(known, _)| *known == name), value.trim().parse()) {
+                (Some(slot), Ok(number)) => slot.1 = number,
+                (Some(_), Err(_)) => return Err(RosArgsError::NotANumber { name, value }),
+                (None, _) if name == USE_SIM_TIME => {
+                    if value != "false" {
+                        ignored.push(format!("{USE_SIM_TIME} is ignored: times are those of this machine"));
+                    }
+                }
+                (None, _) => {
+                    let known = declared.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ");
+                    ignored.push(format!("parameter {name} is ignored, there are: {known}"));
+                }
             }
-            let known = declared.iter().map(|(name, _)| *name).collect::<Vec<_>>().join(", ");
-            Err(RosArgsError::UnknownParameter { name: name.to_owned(), known })
+            Ok(())
         };
         for source in &self.sources {
             match source {
                 ParameterSource::Value { node: only, name, value } => {
                     if only.as_deref().is_none_or(|only| only == node) {
-                        set(name, *value)?;
+                        set(name.clone(), value.clone())?;
                     }
                 }
                 ParameterSource::File(path) => {
-                    for (name, value) in read_file(path, namespace, node)? {
-                        set(&name, value)?;
+                    for (name, value) in params_file::read(path, namespace, node)? {
+                        set(name, value)?;
                     }
                 }
             }
         }
-        Ok(values)
+        Ok((values, ignored))
     }
 }
 
@@ -177,16 +180,13 @@ const LOG_SWITCHES: [&str; 3] = ["rosout-logs", "stdout-logs", "external-lib-log
 /// The parameter every node has; ours takes no simulated time.
 pub(super) const USE_SIM_TIME: &str = "use_sim_time";
 
-fn read_file(path: &Path, namespace: &str, node: &str) -> Result<Vec<(String, f64)>, RosArgsError> {
-    let mut values = params_file::read(path, namespace, node)?;
-    values.retain(|(name, _)| name != USE_SIM_TIME);
-    values
-        .into_iter()
-        .map(|(name, value)| match value.parse() {
-            Ok(number) => Ok((name, number)),
-            Err(_) => Err(RosArgsError::NotANumber { name, value }),
-        })
-        .collect()
+/// `LEVEL` or `LOGGER:=LEVEL`. It has no effect: this node says the same at every level.
+fn check_log_level(text: &str) -> Result<(), RosArgsError> {
+    let level = text.split_once(":=").map_or(text, |(_, level)| level);
+    if ["DEBUG", "INFO", "WARN", "ERROR", "FATAL"].iter().any(|known| level.eq_ignore_ascii_case(known)) {
+        return Ok(());
+    }
+    Err(RosArgsError::LogLevel { value: text.to_owned() })
 }
 
 impl Rule {
@@ -212,14 +212,7 @@ fn parse_parameter(text: &str) -> Result<ParameterSource, RosArgsError> {
     if name.is_empty() {
         return Err(malformed());
     }
-    if name == USE_SIM_TIME {
-        // Kept as a parameter of nobody.
-        return Ok(ParameterSource::Value { node: Some(String::new()), name: name.to_owned(), value: 0.0 });
-    }
-    match value.trim().parse() {
-        Ok(value) => Ok(ParameterSource::Value { node, name: name.to_owned(), value }),
-        Err(_) => Err(RosArgsError::NotANumber { name: name.to_owned(), value: value.to_owned() }),
-    }
+    Ok(ParameterSource::Value { node, name: name.to_owned(), value: value.to_owned() })
 }
 
 /// The node an argument is for, if it says one, and the rest: `node:rest`. The colon of `scheme://` is none.
@@ -260,7 +253,6 @@ mod tests {
             split("run a.toml --ros-args -r __node:=x -- --record d --ros-args --log-level debug").unwrap();
         assert_eq!(rest, ["run", "a.toml", "--record", "d"]);
         assert_eq!(ros.node_name("squealcast"), "x");
-        assert_eq!(ros.log_level(), Some("debug"));
         assert_eq!(split("run a.toml").unwrap().0, RosArgs::default());
     }
 
@@ -304,9 +296,10 @@ mod tests {
         let declared = [("warn_margin", 0.05), ("dead_band", 0.0), ("silence_s", 1.0)];
         let args = ros(&format!(
             "--ros-args -p warn_margin:=0.1 --params-file {path} -p squealcast:dead_band:=4 -p rig:dead_band:=5 \
-             -p use_sim_time:=true"
+             -p use_sim_time:=false"
         ));
-        let values = args.parameters(&declared, "/", "squealcast").unwrap();
+        let (values, ignored) = args.parameters(&declared, "/", "squealcast").unwrap();
+        assert_eq!(ignored, Vec::<String>::new());
         assert_eq!(
             values,
             [("warn_margin".to_owned(), 0.2), ("dead_band".to_owned(), 4.0), ("silence_s".to_owned(), 1.0)]
@@ -314,9 +307,35 @@ mod tests {
     }
 
     #[test]
-    fn misspelt_parameters_are_told() {
-        let error = ros("--ros-args -p warn_margn:=1").parameters(&[("warn_margin", 0.0)], "/", "n").unwrap_err();
-        assert_eq!(error.to_string(), "unknown parameter \"warn_margn\", there are: warn_margin");
+    fn undeclared_parameters_are_ignored_and_said() {
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        let text = "/**:\n  ros__parameters:\n    start_type_description_service: false\n    frames: [a, b]\n    warn_margin: 0.2\n\
+                    \x20   qos_overrides: {/parameter_events: {publisher: {depth: 10}}}\n";
+        write!(file, "{text}").unwrap();
+        let path = file.path().display();
+        let args = ros(&format!("--ros-args --params-file {path} -p warn_margn:=wide -p use_sim_time:=true"));
+        let (values, ignored) = args.parameters(&[("warn_margin", 0.0)], "/", "n").unwrap();
+        assert_eq!(values, [("warn_margin".to_owned(), 0.2)]);
+        assert_eq!(
+            ignored,
+            [
+                "parameter start_type_description_service is ignored, there are: warn_margin",
+                "parameter frames is ignored, there are: warn_margin",
+                "parameter qos_overrides./parameter_events.publisher.depth is ignored, there are: warn_margin",
+                "parameter warn_margn is ignored, there are: warn_margin",
+                "use_sim_time is ignored: times are those of this machine",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_declared_parameter_must_be_a_number() {
+        let error = |line: &str| ros(line).parameters(&[("x", 0.0)], "/", "n").expect_err("refused").to_string();
+        assert_eq!(error("--ros-args -p x:=wide"), "parameter x: \"wide\" is no number");
+        let mut file = tempfile::NamedTempFile::new().unwrap();
+        write!(file, "/**: {{ros__parameters: {{x: [1, 2]}}}}").unwrap();
+        let line = format!("--ros-args --params-file {}", file.path().display());
+        assert_eq!(error(&line), "parameter x: \"a list, or nothing\" is no number");
     }
 
     #[test]
@@ -327,7 +346,12 @@ mod tests {
         assert_eq!(error("--ros-args -r a=b"), "\"a=b\" is no remapping rule from:=to");
         assert_eq!(error("--ros-args -r :=b"), "\":=b\" is no remapping rule from:=to");
         assert_eq!(error("--ros-args -p x"), "\"x\" is no parameter name:=value");
-        assert_eq!(error("--ros-args -p x:=wide"), "parameter x: \"wide\" is no number");
+        let level = "expected DEBUG, INFO, WARN, ERROR or FATAL, or LOGGER:= and one of them";
+        for wrong in ["nonsense", "squealcast:=loud", ""] {
+            let error = RosArgs::split(["--ros-args", "--log-level", wrong].map(str::to_owned)).expect_err("malformed");
+            assert_eq!(error.to_string(), format!("{wrong:?} is no log level, {level}"));
+        }
+        assert!(split("--ros-args --log-level info --log-level squealcast:=WARN").is_ok());
         assert!(split("--ros-args --disable-rosout-logs --enable-stdout-logs -e /x").is_ok());
     }
 
