@@ -2,6 +2,7 @@
 //! `cargo run --release --`. One that says `# needs ...` behind it is left out (`# needs a rig`), one that says
 //! `# exits with N` must do so. They run one after another in one folder, with what the repository holds beside them.
 
+mod domain;
 mod program;
 
 use std::fs::{self, File};
@@ -113,6 +114,7 @@ fn run(shown: &Shown, folder: &Path) {
     let path =
         format!("{}:{}", program.parent().expect("a folder").display(), std::env::var("PATH").unwrap_or_default());
     let (stdout, stderr) = (folder.join(".stdout"), folder.join(".stderr"));
+    let domain = domain::Domain::claim();
     // Where it is one program, Ctrl-C and exit code are its own and not the shell's.
     let exec = if shown.command.contains(['|', ';', '&']) { "" } else { "exec " };
     let child = Command::new("sh")
@@ -120,7 +122,8 @@ fn run(shown: &Shown, folder: &Path) {
         .current_dir(folder)
         .env("PATH", path)
         // Away from nodes that run on this machine.
-        .env("ROS_DOMAIN_ID", (1 + std::process::id() % 100).to_string())
+        .env("XDG_CACHE_HOME", program::cache_folder())
+        .env("ROS_DOMAIN_ID", domain.id.to_string())
         .stdin(Stdio::null())
         .stdout(File::create(&stdout).expect("created"))
         .stderr(File::create(&stderr).expect("created"))

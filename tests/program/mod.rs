@@ -4,7 +4,7 @@
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
-use std::sync::mpsc;
+use std::sync::{OnceLock, mpsc};
 use std::time::{Duration, Instant};
 
 use npyz::WriterBuilder;
@@ -38,8 +38,28 @@ pub struct Run {
 /// The program with some arguments, its working directory aside from the project's.
 pub fn command<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_squealcast"));
-    command.args(args).current_dir(std::env::temp_dir()).stdin(Stdio::null());
+    command.args(args).current_dir(std::env::temp_dir()).env("XDG_CACHE_HOME", cache_folder()).stdin(Stdio::null());
     command
+}
+
+/// The folder for charts of the programs that this test starts: one of its own, so that no chart of an older program, or of
+/// the user, answers for this one.
+pub fn cache_folder() -> PathBuf {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    let made = || {
+        let all = Path::new(env!("CARGO_TARGET_TMPDIR")).join("cache");
+        std::fs::create_dir_all(&all).expect("a folder of the test");
+        // What runs that have ended left behind; several tests may look at once.
+        for entry in std::fs::read_dir(&all).expect("just made").flatten() {
+            if !Path::new("/proc").join(entry.file_name()).exists() {
+                let _ = std::fs::remove_dir_all(entry.path());
+            }
+        }
+        let folder = all.join(std::process::id().to_string());
+        std::fs::create_dir_all(&folder).expect("a folder of the test");
+        folder
+    };
+    FOLDER.get_or_init(made).clone()
 }
 
 /// Runs the program to its end.
