@@ -4,11 +4,13 @@
 //! `SQUEALCAST_PEERS` names another folder than `target/peers`; with it set, missing peers are a failure.
 //! `SQUEALCAST_SHARED` names another folder with the real brake's matrices than `../shared`.
 
+mod domain;
 mod program;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
+use std::ffi::OsString;
 use std::fs::{self, File};
-use std::io::Write;
+use std::io::{BufRead, BufReader, Write};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
@@ -17,7 +19,8 @@ use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use crossbeam_channel::{Receiver, unbounded};
-use program::{PATIENCE, promised, until as wait_until};
+use domain::Domain;
+use program::{PATIENCE, cache_folder, promised, until as wait_until};
 use serde_json::Value;
 use squealcast::io::heard::Heard;
 use squealcast::io::message::Payload;
@@ -50,8 +53,13 @@ fn manifest_dir() -> &'static Path {
 
 /// A program that `setup.sh` leaves: `python` or `ros-python`. `None`, said aloud, where it is not there.
 fn peer_program(name: &str) -> Option<PathBuf> {
-    let given = std::env::var_os("SQUEALCAST_PEERS").map(PathBuf::from);
-    let folder = given.clone().unwrap_or_else(|| manifest_dir().join("target/peers"));
+    peer_program_in("", name)
+}
+
+/// The same in the folder beside it that was set up with `PEERS_ROS=jazzy`, whose name ends with `-jazzy`.
+fn peer_program_in(suffix: &str, name: &str) -> Option<PathBuf> {
+    let given = std::env::var_os("SQUEALCAST_PEERS").map(|folder| PathBuf::from(folder_with(folder, suffix)));
+    let folder = given.clone().unwrap_or_else(|| manifest_dir().join(format!("target/peers{suffix}")));
     let program = [folder.join("bin").join(name), folder.join(name)].into_iter().find(|path| path.is_file());
     match (&program, given) {
         (None, Some(folder)) => panic!("SQUEALCAST_PEERS={}: no {name}", folder.display()),
@@ -59,6 +67,11 @@ fn peer_program(name: &str) -> Option<PathBuf> {
         _ => {}
     }
     program
+}
+
+fn folder_with(mut folder: OsString, suffix: &str) -> OsString {
+    folder.push(suffix);
+    folder
 }
 
 /// Says which versions of some Python packages a peer has.
@@ -74,9 +87,13 @@ fn say_versions(python: &Path, packages: &[&str]) {
 
 /// Runs a script of `tests/peers` to its end and gives back its one line of JSON.
 fn peer(python: &Path, script: &str, arguments: &[&str]) -> Value {
-    let path = manifest_dir().join("tests/peers").join(script);
-    let mut child = Command::new(python)
-        .arg(path)
+    peer_by(Command::new(python), script, arguments)
+}
+
+/// The same by a command that gets the script's path and arguments.
+fn peer_by(mut command: Command, script: &str, arguments: &[&str]) -> Value {
+    let mut child = command
+        .arg(manifest_dir().join("tests/peers").join(script))
         .args(arguments)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
@@ -119,18 +136,18 @@ impl Drop for Killed {
 /// A running node with a domain and a prefix of its own.
 struct Node {
     process: Killed,
-    domain: u16,
+    domain: Domain,
     prefix: String,
     folder: TempDir,
 }
 
 impl Node {
-    /// Starts `squealcast run RIG`; `number` tells the nodes of this file apart.
-    fn start(rig: &str, number: u16, record: bool) -> Self {
+    /// Starts `squealcast run RIG`.
+    fn start(rig: &str, record: bool) -> Self {
         let folder = TempDir::new().expect("a folder");
-        let (domain, prefix) = names(number);
+        let (domain, prefix) = names();
         let mut arguments = vec!["run", rig, "--loopback"].into_iter().map(str::to_owned).collect::<Vec<_>>();
-        arguments.extend(["--domain".to_owned(), domain.to_string(), "--shm-prefix".to_owned(), prefix.clone()]);
+        arguments.extend(["--domain".to_owned(), domain.id.to_string(), "--shm-prefix".to_owned(), prefix.clone()]);
         if record {
             arguments.extend(["--record".to_owned(), folder.path().join("recordings").display().to_string()]);
         }
@@ -139,7 +156,7 @@ impl Node {
     }
 
     fn domain(&self) -> String {
-        self.domain.to_string()
+        self.domain.id.to_string()
     }
 
     /// What it said so far.
@@ -162,10 +179,11 @@ impl Node {
     }
 }
 
-/// A domain, not 0 and below 102, and a prefix that no other test run on this machine uses now.
-fn names(number: u16) -> (u16, String) {
-    let process = std::process::id();
-    (10 + (process % 9) as u16 * 10 + number, format!("peers-{process}-{number}/"))
+/// A domain, and a prefix of shared memory, that nobody else on this machine uses now.
+fn names() -> (Domain, String) {
+    let domain = Domain::claim();
+    let prefix = format!("peers-{}-{}/", std::process::id(), domain.id);
+    (domain, prefix)
 }
 
 fn start(program: &Path, arguments: &[String], folder: &Path) -> Killed {
@@ -174,6 +192,7 @@ fn start(program: &Path, arguments: &[String], folder: &Path) -> Killed {
         .args(arguments)
         .current_dir(folder)
         .env_remove("ROS_DOMAIN_ID")
+        .env("XDG_CACHE_HOME", cache_folder())
         .stdin(Stdio::null())
         .stdout(file("stdout"))
         .stderr(file("stderr"))
@@ -204,8 +223,11 @@ fn only_entry(folder: &Path) -> PathBuf {
     entry.clone()
 }
 
+/// Charts are not taken from the nodes that were recorded: a replay makes its own.
 fn squealcast(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_squealcast")).args(arguments).stdin(Stdio::null()).output().expect("started")
+    let mut command = Command::new(env!("CARGO_BIN_EXE_squealcast"));
+    command.args(arguments).env("XDG_CACHE_HOME", cache_folder().join("replay")).stdin(Stdio::null());
+    command.output().expect("started")
 }
 
 /// `replay --verify`: the same bytes again.
@@ -245,6 +267,8 @@ struct Content {
     rigs: Vec<RigInfo>,
     sensitivities: Vec<Sensitivity>,
     vibrations: Vec<Vibration>,
+    /// FAULTs for silence with inputs before and after.
+    silences_between: usize,
     /// The values of the last diagnostics.
     diagnostics: HashMap<String, String>,
     last_log_time_ns: u64,
@@ -255,11 +279,19 @@ impl Content {
         let recording = Recording::open(path).expect("a recording");
         assert!(recording.is_complete(), "{:?}", recording.damage());
         let mut content = Self::default();
+        let mut silences = 0;
         for entry in recording.messages() {
             content.last_log_time_ns = entry.log_time_ns;
             match entry.message {
-                Recorded::Known(Payload::OperatingPoint(input)) => content.inputs.push(input),
-                Recorded::Known(Payload::Prediction(prediction)) => content.predictions.push(prediction),
+                Recorded::Known(Payload::OperatingPoint(input)) => {
+                    content.silences_between += if content.inputs.is_empty() { 0 } else { silences };
+                    silences = 0;
+                    content.inputs.push(input);
+                }
+                Recorded::Known(Payload::Prediction(prediction)) => {
+                    silences += usize::from(prediction.reason.starts_with("stale"));
+                    content.predictions.push(prediction);
+                }
                 Recorded::Known(Payload::RigInfo(rig)) => content.rigs.push(rig),
                 Recorded::Known(Payload::Diagnostics(array)) => {
                     let values = array.status.into_iter().flat_map(|status| status.values);
@@ -304,7 +336,7 @@ fn rclpy_is_answered_at_500_hz_for_30_s_and_the_recording_serves_others() {
     let (Some(ros_python), Some(python)) = (peer_program("ros-python"), peer_program("python")) else { return };
     let _alone = alone();
     say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
-    let mut node = Node::start(RIG, 0, true);
+    let mut node = Node::start(RIG, true);
     let report = peer(
         &ros_python,
         "rclpy_peer.py",
@@ -344,12 +376,126 @@ fn rclpy_is_answered_at_500_hz_for_30_s_and_the_recording_serves_others() {
     verify(&recording);
 }
 
+/// Two network namespaces with a link between them that loses 5 % of the frames, delays them by 50 ms and lets them overtake
+/// each other. It goes when its standard input closes.
+struct BadLink {
+    process: Killed,
+    near: String,
+    far: String,
+}
+
+impl BadLink {
+    /// `None`, said aloud, where this process may make none; with `SQUEALCAST_PEERS` set that is a failure.
+    fn make(python: &Path) -> Option<Self> {
+        let apart = Command::new("unshare").args(["--net", "true"]).stderr(Stdio::null()).status();
+        if !Path::new("/dev/net/tun").exists() || !apart.is_ok_and(|status| status.success()) {
+            let why = "no network namespaces, or no /dev/net/tun: it takes root, and a machine that has them";
+            assert!(std::env::var_os("SQUEALCAST_PEERS").is_none(), "{why}");
+            say(&format!("skipped: {why}"));
+            return None;
+        }
+        let script = manifest_dir().join("tests/peers/bad_link.py");
+        let child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
+        let mut process = Killed(child.expect("started"));
+        let mut line = String::new();
+        BufReader::new(process.0.stdout.as_mut().expect("piped")).read_line(&mut line).expect("read");
+        let ends: Value = serde_json::from_str(&line).expect("its two ends");
+        Some(Self { process, near: ends["near"].to_string(), far: ends["far"].to_string() })
+    }
+
+    /// A program at one end.
+    fn at(end: &str, program: &Path) -> Command {
+        let mut command = Command::new("nsenter");
+        command.args(["--net", "--target", end]).arg(program).env("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET");
+        command
+    }
+}
+
+impl Drop for BadLink {
+    fn drop(&mut self) {
+        drop(self.process.0.stdin.take());
+        let _ = wait(&mut self.process.0, PATIENCE);
+    }
+}
+
+/// rclpy with a deep queue at 500 Hz over a bad link: reliable means that nothing is lost, however late it comes.
+fn nothing_is_lost_over_a_bad_link(ros: &str) {
+    const COUNT: u64 = 10_000;
+    let (Some(ros_python), Some(python)) = (peer_program_in(ros, "ros-python"), peer_program("python")) else { return };
+    let Some(link) = BadLink::make(&python) else { return };
+    let _alone = alone();
+    say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
+    let folder = TempDir::new().expect("a folder");
+    // Nobody else is in these namespaces, but for shared memory.
+    let (domain, prefix) = names();
+    let arguments =
+        ["--net", "--target", &link.near, env!("CARGO_BIN_EXE_squealcast"), "run", RIG, "--no-shm", "--record"];
+    let mut arguments: Vec<String> = arguments.iter().map(|&argument| argument.to_owned()).collect();
+    arguments.extend([
+        folder.path().join("recordings").display().to_string(),
+        "--domain".to_owned(),
+        domain.id.to_string(),
+    ]);
+    let process = start(Path::new("nsenter"), &arguments, folder.path());
+    let mut node = Node { process, domain, prefix, folder };
+    // Somebody at the node's end who hears the same inputs.
+    let script = manifest_dir().join("tests/peers/patient_listener.py");
+    let listener = BadLink::at(&link.near, &ros_python)
+        .arg(script)
+        .args(["--domain", &node.domain()])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn();
+    let mut listener = Killed(listener.expect("started"));
+    let mut heard = BufReader::new(listener.0.stdout.take().expect("piped")).lines();
+    assert_eq!(heard.next().expect("a line").expect("read"), "listening");
+
+    let seconds = (COUNT / 500).to_string();
+    let pace = ["--rate", "500", "--seconds", &seconds, "--depth", "20000", "--settle", "3", "--drain", "30"];
+    // What comes too late to be predicted is passed over, and a stall is a silence until it ends.
+    let only = ["--only-exchange", "--allow-passed-over", "--allow-silence", "--wait", "60"];
+    let domain = node.domain();
+    let report = peer_by(
+        BadLink::at(&link.far, &ros_python),
+        "rclpy_peer.py",
+        &[&["--domain", &domain], &pace[..], &only].concat(),
+    );
+    drop(listener.0.stdin.take());
+    let heard: Value = serde_json::from_str(&heard.next().expect("a line").expect("read")).expect("its account");
+    node.interrupt();
+
+    let content = Content::read(&node.recording());
+    let seqs: HashSet<u64> = content.inputs.iter().map(|input| input.seq).collect();
+    say(&format!(
+        "bad link: {} of {COUNT} inputs recorded, {} missed, {} passed over, {} answered, first answer after {} s, {} silences; \
+         rclpy beside the node: {heard}",
+        seqs.len(),
+        content.count("ros2_missed"),
+        content.count("inputs_passed_over"),
+        report["answered"],
+        report["first_answer_s"],
+        content.silences_between,
+    ));
+    assert_eq!((seqs.len() as u64, content.inputs.len() as u64, content.count("ros2_missed")), (COUNT, COUNT, 0));
+    verify(&node.recording());
+}
+
+#[test]
+fn nothing_of_kilted_is_lost_over_a_bad_link() {
+    nothing_is_lost_over_a_bad_link("");
+}
+
+#[test]
+fn nothing_of_jazzy_is_lost_over_a_bad_link() {
+    nothing_is_lost_over_a_bad_link("-jazzy");
+}
+
 #[test]
 fn cyclone_dds_is_answered() {
     let Some(python) = peer_program("python") else { return };
     let _alone = alone();
     say_versions(&python, &["cyclonedds"]);
-    let mut node = Node::start(RIG, 1, false);
+    let mut node = Node::start(RIG, false);
     let domain = node.domain();
     let expected = ["--expect-modes", "9", "--expect-unstable-above", CRITICAL];
     let pace = ["--domain", &domain, "--rate", "500", "--seconds", "10"];
@@ -364,7 +510,7 @@ fn iceoryx2_in_python_is_answered() {
     let Some(python) = peer_program("python") else { return };
     let _alone = alone();
     say_versions(&python, &["iceoryx2"]);
-    let mut node = Node::start(RIG, 2, false);
+    let mut node = Node::start(RIG, false);
     let report = peer(
         &python,
         "shm_peer.py",
@@ -381,17 +527,17 @@ fn what_comes_over_both_buses_is_answered_once() {
     const COUNT: u64 = 1000;
     let _alone = alone();
     say(&format!("both buses: squealcast {} against its own mirror", env!("CARGO_PKG_VERSION")));
-    let mut node = Node::start(RIG, 3, true);
+    let mut node = Node::start(RIG, true);
     let (on_ros, heard_on_ros) = unbounded();
     let (on_shm, heard_on_shm) = unbounded();
-    let options = Ros2Options::new(Some(node.domain), true, RosArgs::default()).expect("valid");
+    let options = Ros2Options::new(Some(node.domain.id), true, RosArgs::default()).expect("valid");
     let ros =
         Ros2Source::start(&options, move |heard: Heard<Prediction>| drop(on_ros.send(heard.message))).expect("joined");
     let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
     let shm = ShmSource::new(&options).expect("joined");
     let _sink =
         ShmSink::spawn(&options, move |heard: Heard<Prediction>| drop(on_shm.send(heard.message))).expect("joined");
-    wait_until("discovery", || ros.readers() == 1 && ros.prediction_writers() == 1);
+    wait_until("discovery", || ros.readers() > 0 && ros.prediction_writers() == 1);
     // The node's own discovery of us is not to be seen from here: until it is there, inputs of another kind.
     let mut seq = COUNT;
     wait_until("an answer over both buses", || {
@@ -436,14 +582,14 @@ fn a_vibration_over_both_buses_is_recorded_once_and_read_by_others() {
     const COUNT: u64 = 100;
     let Some(python) = peer_program("python") else { return };
     let _alone = alone();
-    let mut node = Node::start(RIG, 7, true);
+    let mut node = Node::start(RIG, true);
     let (on_ros, heard_on_ros) = unbounded();
-    let options = Ros2Options::new(Some(node.domain), true, RosArgs::default()).expect("valid");
+    let options = Ros2Options::new(Some(node.domain.id), true, RosArgs::default()).expect("valid");
     let ros =
         Ros2Source::start(&options, move |heard: Heard<Prediction>| drop(on_ros.send(heard.message))).expect("joined");
     let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
     let shm = ShmVibrationSource::new(&options).expect("joined");
-    wait_until("discovery", || ros.readers() == 1 && ros.vibration_readers() == 1);
+    wait_until("discovery", || ros.readers() > 0 && ros.vibration_readers() > 0);
     let vibration = |k: u64| Vibration {
         header: Header { stamp: Time::from_ns(now_ns()), frame_id: "accelerometer".to_owned() },
         frequency_hz: 1500.0 + k as f64,
@@ -516,7 +662,7 @@ fn the_launch_file_starts_the_node() {
     let (Some(ros_python), Some(python)) = (peer_program("ros-python"), peer_program("python")) else { return };
     let _alone = alone();
     let folder = TempDir::new().expect("a folder");
-    let (domain, prefix) = names(4);
+    let (domain, prefix) = names();
     // Another value than the node's own default: it must come from the file.
     let params = fs::read_to_string(manifest_dir().join("launch/params.yaml")).expect("parameters");
     assert!(params.contains("warn_margin: 0.05"), "{params}");
@@ -528,7 +674,7 @@ fn the_launch_file_starts_the_node() {
         &[
             &manifest_dir().join("launch/squealcast.launch.py").display().to_string(),
             "rig:=nine-dof",
-            &format!("domain:={domain}"),
+            &format!("domain:={}", domain.id),
             "loopback:=true",
             &format!("record:={}", folder.path().join("recordings").display()),
             &format!("params_file:={}", params_file.display()),
@@ -559,7 +705,7 @@ fn a_killed_node_loses_a_second_at_most() {
     let _alone = alone();
     let python = peer_program("python");
     for run_ms in [900, 3300] {
-        let mut node = Node::start(RIG, 5, true);
+        let mut node = Node::start(RIG, true);
         let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
         let shm = ShmSource::new(&options).expect("joined");
         wait_until("the node", || shm.publish(&point(0)).expect("published") > 0);
@@ -622,7 +768,7 @@ fn the_real_brake_runs_live() {
     fs::copy(manifest_dir().join("launch/rigs/brake4669.toml"), &rig).expect("copied");
 
     say_versions(&ros_python, &["ros-rclpy"]);
-    let mut node = Node::start(&rig.display().to_string(), 6, true);
+    let mut node = Node::start(&rig.display().to_string(), true);
     let report = peer(
         &ros_python,
         "rclpy_peer.py",

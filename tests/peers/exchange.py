@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 LEVELS = ("OK", "WARN", "SQUEAL", "FAULT")
 FAULT = 3
-DEPTH = 64  # of every queue: reliable, keep last 64
+DEPTH = 64  # of every queue: reliable, keep last 64, unless told otherwise
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
@@ -34,10 +34,16 @@ def arguments(description: str) -> argparse.ArgumentParser:
         metavar="MU",
         help="unstable modes above this friction coefficient, none below (but for 1e-6 about it)",
     )
+    parser.add_argument("--depth", type=int, default=DEPTH, help="how many messages each queue of the peer keeps")
     parser.add_argument(
         "--allow-passed-over",
         action="store_true",
         help="inputs may stay unanswered (a large rig passes over what it cannot predict in time)",
+    )
+    parser.add_argument(
+        "--allow-silence",
+        action="store_true",
+        help="the node may miss inputs that are under way (a link that loses some holds up all behind them)",
     )
     return parser
 
@@ -61,6 +67,7 @@ class Sent:
     friction_coefficient: float
     at: float  # monotonic, s
     answers: int = 0
+    answered_at: float = 0.0  # monotonic, s; the first time
 
 
 @dataclass
@@ -117,8 +124,6 @@ class Exchange:
                 self.inputs[args.first_seq + k] = Sent(stamp, mu, last)
             yield args.first_seq + k, stamp, mu
         self.span_s = time.monotonic() - start
-        if self.span_s > 1.05 * args.seconds + 0.1:
-            self.fail("rate", f"{total} inputs took {self.span_s:.1f} s instead of {args.seconds} s: machine too slow")
 
     def answer(self, got: Answer) -> None:
         now = time.monotonic()
@@ -130,7 +135,7 @@ class Exchange:
             if not self.inputs:
                 return  # about whoever published before
             since = now - max(sent.at for sent in self.inputs.values())
-            if since < 0.5:
+            if since < 0.5 and not self.args.allow_silence:
                 self.fail("silence", f"reported {since:.3f} s after an input: {got.reason!r}")
             self.silence_faults += 1
             return
@@ -144,6 +149,7 @@ class Exchange:
             return
         if got.seq < self.newest_answer:
             self.fail("out_of_order", f"seq {got.seq} answered after {self.newest_answer}")
+        sent.answered_at = now
         self.newest_answer = max(self.newest_answer, got.seq)
         self.latencies_s.append(now - sent.at)
         level = LEVELS[got.level] if got.level < len(LEVELS) else str(got.level)
@@ -160,6 +166,13 @@ class Exchange:
         critical = args.expect_unstable_above
         if critical is not None and abs(mu - critical) > 1e-6 and (got.unstable_modes > 0) != (mu > critical):
             self.fail("stability", f"seq {got.seq}: {got.unstable_modes} unstable modes at {mu:.6f}")
+
+    def first_answer_s(self) -> float | None:
+        """From the first input that was sent to the first answer."""
+        with_answer = [sent.answered_at for sent in self.inputs.values() if sent.answers]
+        if not with_answer:
+            return None
+        return round(min(with_answer) - next(iter(self.inputs.values())).at, 3)
 
     def drain(self) -> None:
         """Waits until everything sent is answered, or for `--drain` seconds."""
@@ -185,6 +198,7 @@ class Exchange:
                 "sent": len(self.inputs),
                 "answered": answered,
                 "missing": len(missing),
+                "first_answer_s": self.first_answer_s(),
                 "rate_hz": round(len(self.inputs) / self.span_s, 1) if self.span_s else None,
                 "discovery_s": round(self.discovery_s, 3),
                 "latency_ms": {

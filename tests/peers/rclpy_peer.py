@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 
-from exchange import DEPTH, Answer, Exchange, arguments, bound_run_time, run_time_limit, wait_until
+from exchange import Answer, Exchange, arguments, bound_run_time, run_time_limit, wait_until
 
 # The node's parameters, all doubles.
 PARAMETERS = (
@@ -79,7 +79,7 @@ class Peer:
 
         self.exchange, self.args, self.node = exchange, exchange.args, node
         self.diagnostics: list[DiagnosticArray] = []
-        reliable = {"reliability": ReliabilityPolicy.RELIABLE, "history": HistoryPolicy.KEEP_LAST, "depth": DEPTH}
+        reliable = {"reliability": ReliabilityPolicy.RELIABLE, "history": HistoryPolicy.KEEP_LAST, "depth": self.args.depth}
         qos = QoSProfile(**reliable, durability=DurabilityPolicy.VOLATILE)
         self.latched = QoSProfile(**reliable, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.publisher = node.create_publisher(OperatingPoint, "/rig/operating_point", qos)

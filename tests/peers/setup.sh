@@ -6,6 +6,7 @@
 #
 # Needs Python 3.11 or later, gcc, g++, make and a package index that pip can reach. Environment:
 #     PEERS_ROS=kilted|jazzy    which ROS 2 (default kilted)
+#     PEERS_TOOLS=no            rclpy alone, without DIR/bin/python
 #     PYTHON=...                which Python (default python3)
 #
 # Leaves DIR/bin/ros-python (rclpy, squealcast_msgs), DIR/bin/python (everything else) and DIR/env.sh
@@ -70,7 +71,7 @@ make_venv() { # name, requirements
     echo "$key" >"$dir/$1.stamp"
 }
 make_venv ros "$here/requirements-$ros.txt"
-make_venv tools "$here/requirements-tools.txt"
+[ "${PEERS_TOOLS:-yes}" = no ] || make_venv tools "$here/requirements-tools.txt"
 
 # --- the environment --------------------------------------------------------------------------------------------
 
@@ -94,11 +95,14 @@ cat >"$dir/bin/ros-python" <<EOF
 . "$dir/env.sh"
 exec "$dir/ros/bin/python" "\$@"
 EOF
-cat >"$dir/bin/python" <<EOF
+chmod +x "$dir/bin/ros-python"
+if [ "${PEERS_TOOLS:-yes}" != no ]; then
+    cat >"$dir/bin/python" <<EOF
 #!/bin/sh
 exec "$dir/tools/bin/python" "\$@"
 EOF
-chmod +x "$dir/bin/ros-python" "$dir/bin/python"
+    chmod +x "$dir/bin/python"
+fi
 
 # --- squealcast_msgs, built by rosidl ---------------------------------------------------------------------------
 
@@ -126,4 +130,4 @@ if ! done_for msgs "$msgs_key"; then
         die "squealcast_msgs was built but does not import"
     echo "$msgs_key" >"$dir/msgs.stamp"
 fi
-say "ready: $dir/bin/ros-python (ROS 2 $ros), $dir/bin/python"
+say "ready: $(ls "$dir"/bin/* | tr '\n' ' ')(ROS 2 $ros)"
