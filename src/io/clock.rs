@@ -1,16 +1,20 @@
 //! The only place that reads clocks. What a prediction depends on are the stamps of messages, never these.
 
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::sync::LazyLock;
+use std::time::{SystemTime, UNIX_EPOCH};
 
-use iceoryx2_bb_posix::clock::{ClockType, Time};
+use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
+
+/// Both clocks at one moment of this process, from which logged times count.
+static START: LazyLock<Reading> = LazyLock::new(|| Reading { wall_ns: now_ns(), monotonic_ns: monotonic_ns() });
 
 /// Both clocks, read together.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reading {
-    /// Nanoseconds since the epoch; may jump.
+    /// Nanoseconds since the epoch; jumps when the clock is set.
     pub wall_ns: i64,
-    /// Nanoseconds since some moment of this machine, the same for all processes; never goes back. For durations.
+    /// Nanoseconds since the machine was started, the same in every process; never goes back. For durations.
     pub monotonic_ns: u64,
 }
 
@@ -18,6 +22,15 @@ impl Reading {
     /// Now.
     pub fn now() -> Self {
         Self { wall_ns: now_ns(), monotonic_ns: monotonic_ns() }
+    }
+
+    /// The time to log something at: the wall clock at the start of this process plus the time that has passed since. Setting the
+    /// clock does not change it, so that a recording is replayed in the time it took; the wall clock then and now is
+    /// [`Reading::wall_ns`].
+    pub fn log_ns(&self) -> u64 {
+        let start = *START;
+        let start_ns = u64::try_from(start.wall_ns).unwrap_or(0);
+        start_ns.saturating_add(self.monotonic_ns).saturating_sub(start.monotonic_ns)
     }
 }
 
@@ -29,11 +42,11 @@ pub fn now_ns() -> i64 {
     }
 }
 
-/// Nanoseconds since some moment of this machine, the same for all processes; never goes back.
+/// Nanoseconds since the machine was started, the time it slept included; never goes back.
 pub fn monotonic_ns() -> u64 {
-    // It fails only where a system has no such clock.
-    let now = Time::now_with_clock(ClockType::Monotonic).map_or_else(|_| Duration::ZERO, |now| now.as_duration());
-    u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
+    let time = clock_gettime(ClockId::Boottime);
+    let [seconds, ns] = [time.tv_sec, time.tv_nsec].map(|part| u64::try_from(part).unwrap_or(0));
+    seconds.saturating_mul(1_000_000_000).saturating_add(ns)
 }
 
 #[cfg(test)]
@@ -47,6 +60,19 @@ mod tests {
             let now = monotonic_ns();
             assert!(now >= last);
             last = now;
+        }
+    }
+
+    /// Log times are the wall clock at first, and pass as monotonic time does whatever the wall clock is set to.
+    #[test]
+    fn log_time_does_not_follow_a_clock_that_is_set() {
+        let now = Reading::now();
+        // Both clocks are read within the time that passed since the start, and pass alike.
+        assert!(now.log_ns().abs_diff(now.wall_ns as u64) < 1_000_000_000, "{now:?}");
+        let second = 1_000_000_000;
+        for step_ns in [-3_600 * second, 3_600 * second] {
+            let later = Reading { wall_ns: now.wall_ns + step_ns, monotonic_ns: now.monotonic_ns + 5 };
+            assert_eq!(later.log_ns(), now.log_ns() + 5);
         }
     }
 

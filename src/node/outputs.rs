@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
-use crate::io::clock;
+use crate::io::clock::Reading;
 use crate::io::heard::Counts;
 use crate::io::message::{Message, Payload};
 use crate::io::recorder::RecorderHandle;
@@ -54,12 +54,12 @@ impl Readers {
 }
 
 impl Outputs {
-    /// Records a message heard or made at `wall_ns`.
-    pub fn record(&self, wall_ns: i64, payload: Payload) {
+    /// Records a message heard or made at a moment: logged at the time that passes evenly, published by the wall clock.
+    pub fn record(&self, at: Reading, payload: Payload) {
         if let Some(recorder) = &self.recorder {
-            let time_ns = u64::try_from(wall_ns).unwrap_or(0);
+            let publish_time_ns = u64::try_from(at.wall_ns).unwrap_or(0);
             // A message the recorder has no room for is in its own count.
-            recorder.record(Message { log_time_ns: time_ns, publish_time_ns: time_ns, payload });
+            recorder.record(Message { log_time_ns: at.log_ns(), publish_time_ns, payload });
         }
     }
 
@@ -80,7 +80,7 @@ impl Outputs {
             }
         }
         if self.recorder.is_some() {
-            self.record(clock::now_ns(), Payload::Prediction(prediction.clone()));
+            self.record(Reading::now(), Payload::Prediction(prediction.clone()));
         }
     }
 
@@ -88,14 +88,14 @@ impl Outputs {
         if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_session_event(&event)) {
             self.failed(&error);
         }
-        self.record(clock::now_ns(), Payload::SessionEvent(event));
+        self.record(Reading::now(), Payload::SessionEvent(event));
     }
 
     pub fn rig_info(&mut self, info: &RigInfo) {
         if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_rig(info)) {
             self.failed(&error);
         }
-        self.record(clock::now_ns(), Payload::RigInfo(info.clone()));
+        self.record(Reading::now(), Payload::RigInfo(info.clone()));
     }
 
     /// Whether somebody hears sensitivities, or records them.
@@ -112,14 +112,14 @@ impl Outputs {
         if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_sensitivity(&sensitivity)) {
             self.failed(&error);
         }
-        self.record(clock::now_ns(), Payload::Sensitivity(sensitivity));
+        self.record(Reading::now(), Payload::Sensitivity(sensitivity));
     }
 
     pub fn diagnostics(&mut self, diagnostics: DiagnosticArray) {
         if let Some(Err(error)) = self.ros2.as_ref().map(|ros2| ros2.publish_diagnostics(&diagnostics)) {
             self.failed(&error);
         }
-        self.record(clock::now_ns(), Payload::Diagnostics(diagnostics));
+        self.record(Reading::now(), Payload::Diagnostics(diagnostics));
     }
 
     /// That others publish predictions over shared memory too: readers cannot tell them apart.
