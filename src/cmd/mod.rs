@@ -98,6 +98,9 @@ pub fn main() -> ExitCode {
         }
     };
     let cli = Cli::parse_from(args); // leaves with code 2 on wrong usage
+    if let Err(error) = signals::survive_file_size_limit() {
+        note!("a file that grows beyond its limit will end this: {error}");
+    }
     let result = match cli.command {
         Command::Demo(options) => options.run(ros_args),
         Command::Run(options) => options.run(ros_args),
@@ -213,5 +216,5 @@ fn print(text: &str) -> anyhow::Result<()> {
 
 /// Writes a file, whole or not at all.
 fn write_file(path: &std::path::Path, bytes: &[u8]) -> anyhow::Result<()> {
-    write_whole(path, |out| out.write_all(bytes))
+    Ok(write_whole(path, |out| out.write_all(bytes))?)
 }

@@ -1,6 +1,5 @@
 use std::f64::consts::TAU;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -14,7 +13,7 @@ use crate::certificate::{Against, Certificate, Verified, verify_against};
 use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
 use crate::full_model::FullModelFile;
 use crate::input_file;
-use crate::io::whole_file::{remove_begun, write_whole};
+use crate::io::whole_file::{remove_begun, write_together};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullSolver, GIB, Kept, Progress, Residual, Wanted};
 use crate::rig::{Rig, RigFile, SideResidual, between_patches};
@@ -82,11 +81,8 @@ fn mode_counts(text: &str) -> Result<ModeCounts, String> {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let unfinished = Unfinished::default();
-        let to_remove = unfinished.clone();
-        on_stop(move || {
+        on_stop(|| {
             remove_begun();
-            to_remove.remove();
             note!("\nstopped: nothing was written");
             std::process::exit(130);
         })?;
@@ -109,7 +105,7 @@ impl Options {
             let (request, basis) = basis_of(&full, tolerance, range, &mut solver, &mut steps)?;
             let method = format!("{} vectors of the full model", basis.projected.omega_squared.len());
             let make = |known: Option<&Certificate>| basis_rig(&file, &full, &request, &basis, known);
-            return self.finish(steps, &unfinished, &full, Some(solver), method, &make);
+            return self.finish(steps, &full, Some(solver), method, &make);
         }
         if full.geometry.is_empty() {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
@@ -142,7 +138,7 @@ impl Options {
             let patches = full.contact_patches.as_ref();
             modal_rig(&file, &remarks, &full.common_tables, patches, known, &sides, residual.as_ref())
         };
-        self.finish(steps, &unfinished, &full, None, kept.join("; "), &make)
+        self.finish(steps, &full, None, kept.join("; "), &make)
     }
 
     /// The name of the rig file, which can be written and is not what is read.
@@ -164,7 +160,6 @@ impl Options {
     fn finish(
         &self,
         mut steps: Steps,
-        unfinished: &Unfinished,
         full: &FullModelFile,
         solver: Option<FullSolver<'_>>,
         method: String,
@@ -209,7 +204,9 @@ impl Options {
             }
         }
         let replaced = replaced(&self.output, &files);
-        unfinished.write(self.output.parent().unwrap_or(Path::new("")), &files)?;
+        // The rig file, which is the first, names the others.
+        let folder = self.output.parent().unwrap_or(Path::new(""));
+        write_together(files.iter().rev().map(|file| (folder.join(&file.name), &file.bytes[..])))?;
         // The rig file no longer names them; what cannot be removed harms nobody.
         replaced.into_iter().for_each(|path| drop(std::fs::remove_file(path)));
         steps.say(&format!("{} written", self.output.display()));
@@ -334,41 +331,6 @@ fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
     found
 }
 
-/// Files that are not there in full yet, or not of use without the last one.
-#[derive(Clone, Debug, Default)]
-struct Unfinished(Arc<Mutex<Vec<PathBuf>>>);
-
-impl Unfinished {
-    fn list(&self) -> std::sync::MutexGuard<'_, Vec<PathBuf>> {
-        // A list of paths is never half changed.
-        self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
-    }
-
-    /// Writes every file whole or not at all, the first one last; if that does not come about, none is left.
-    fn write(&self, folder: &Path, files: &[RigFile]) -> anyhow::Result<()> {
-        for file in files.iter().skip(1).chain(files.first()) {
-            let path = folder.join(&file.name);
-            // A name with the hash of its content that is there already belongs to another rig too.
-            if !path.exists() {
-                self.list().push(path.clone());
-            }
-            let written = write_whole(&path, |out| std::io::Write::write_all(out, &file.bytes));
-            if written.is_err() {
-                self.remove();
-                return written;
-            }
-        }
-        self.list().clear();
-        Ok(())
-    }
-
-    /// Removes what is there of them.
-    fn remove(&self) {
-        // One that cannot be removed, or was never begun, must not keep the others.
-        self.list().drain(..).for_each(|path| drop(std::fs::remove_file(path)));
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -380,18 +342,5 @@ mod tests {
         for (text, told) in [("80+", "expected counts such as 80+80"), ("0+3", "at least 1"), ("a", "`a`")] {
             assert!(mode_counts(text).unwrap_err().contains(told), "{text}");
         }
-    }
-
-    #[test]
-    fn files_that_were_not_finished_are_removed() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = |name: &str| RigFile { name: name.to_owned(), bytes: b"x".to_vec() };
-        let unfinished = Unfinished::default();
-        // The rig file cannot be written: its folder is not there. The archive is removed again.
-        unfinished.write(folder.path(), &[file("none/rig.toml"), file("a.npz")]).unwrap_err();
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
-        unfinished.write(folder.path(), &[file("rig.toml"), file("a.npz")]).unwrap();
-        unfinished.remove();
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2);
     }
 }

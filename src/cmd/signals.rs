@@ -1,9 +1,14 @@
-//! SIGINT and SIGTERM end a command cleanly; a second one ends it at once.
+//! SIGINT, SIGTERM and SIGHUP end a command cleanly; asked again, it ends at once.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+/// A second signal this soon belongs to the first: a Ctrl-C reaches a launcher's whole process group, and the launcher sends its own.
+const SAME_REQUEST: Duration = Duration::from_secs(2);
 
 /// Sleeps until a moment, or until `stopped`, which is looked at ten times a second.
 pub fn wait_until(moment: Instant, stopped: &AtomicBool) {
@@ -16,7 +21,8 @@ pub fn wait_until(moment: Instant, stopped: &AtomicBool) {
     }
 }
 
-/// Calls `stop` once at the first signal.
+/// Calls `stop` once at the first signal. The next is ignored if it comes within [`SAME_REQUEST`]; any other ends the process. SIGHUP
+/// is not heard where it was ignored when the process began (`nohup`).
 ///
 /// # Errors
 /// Signals cannot be listened to.
@@ -25,17 +31,69 @@ pub fn on_stop(stop: impl FnOnce() + Send + 'static) -> anyhow::Result<()> {
         .enable_io()
         .build()
         .context("cannot start the signal listener")?;
-    let (mut interrupt, mut terminate) = runtime.block_on(async {
-        use tokio::signal::unix::{SignalKind, signal};
-        anyhow::Ok((signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?))
-    })?;
+    let mut kinds = vec![SignalKind::interrupt(), SignalKind::terminate()];
+    if !ignored_from_the_beginning(SignalKind::hangup()) {
+        kinds.push(SignalKind::hangup());
+    }
+    let mut signals: Vec<Signal> =
+        runtime.block_on(async { kinds.into_iter().map(signal).collect::<Result<_, _>>() })?;
     std::thread::spawn(move || {
         runtime.block_on(async {
-            tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {} }
+            any(&mut signals).await;
             stop();
-            tokio::select! { _ = interrupt.recv() => {}, _ = terminate.recv() => {} }
+            let first = Instant::now();
+            any(&mut signals).await;
+            if first.elapsed() < SAME_REQUEST {
+                note!("finishing; another signal ends this at once, and what was begun is not finished");
+                any(&mut signals).await;
+            }
             std::process::exit(130);
         });
     });
     Ok(())
+}
+
+/// Waits for any of some signals.
+async fn any(signals: &mut [Signal]) {
+    std::future::poll_fn(|context| {
+        // Each is asked, so that each wakes this.
+        let came: Vec<bool> = signals.iter_mut().map(|signal| signal.poll_recv(context).is_ready()).collect();
+        if came.contains(&true) { std::task::Poll::Ready(()) } else { std::task::Poll::Pending }
+    })
+    .await;
+}
+
+/// Whether the process was started with a signal ignored.
+fn ignored_from_the_beginning(kind: SignalKind) -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    ignores(&status, kind.as_raw_value())
+}
+
+/// What `/proc/PID/status` says of a signal: bit `n - 1` of a hexadecimal mask is signal `n`.
+fn ignores(status: &str, signal: i32) -> bool {
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let mask = mask.and_then(|digits| u64::from_str_radix(digits.trim(), 16).ok());
+    mask.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
+}
+
+/// Makes a write beyond the limit of file sizes (`ulimit -f`) an error like that of a full disk, instead of the end of the process.
+///
+/// # Errors
+/// The signal cannot be handled.
+pub fn survive_file_size_limit() -> std::io::Result<()> {
+    signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::new(AtomicBool::new(false)))?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ignored_signals_are_read_from_the_status_of_the_process() {
+        let status = "Name:\tsquealcast\nSigBlk:\tffffffffffffffff\nSigIgn:\t0000000000001001\nSigCgt:\t0\n";
+        let ignored: Vec<i32> = (1..=64).filter(|&signal| ignores(status, signal)).collect();
+        assert_eq!(ignored, [1, 13], "SIGHUP and SIGPIPE");
+        assert!(!ignores("", 1));
+    }
 }

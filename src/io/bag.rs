@@ -1,12 +1,8 @@
 //! `metadata.yaml` (version 8), which makes a directory of MCAP files a rosbag2 recording.
 
-use std::{
-    collections::BTreeMap,
-    fmt::Write as _,
-    fs::File,
-    io::{self, Write as _},
-    path::Path,
-};
+use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, path::Path};
+
+use super::whole_file::{WholeFileError, write_whole};
 
 /// The name of the file.
 pub const METADATA_FILE: &str = "metadata.yaml";
@@ -100,19 +96,9 @@ pub fn metadata_yaml(files: &[FileSummary]) -> String {
 ///
 /// # Errors
 ///
-/// What writing and renaming yield.
-pub fn write_metadata(directory: &Path, files: &[FileSummary]) -> io::Result<()> {
-    let beside = directory.join("metadata.yaml.new");
-    let mut file = File::create(&beside)?;
-    file.write_all(metadata_yaml(files).as_bytes())?;
-    file.sync_all()?;
-    std::fs::rename(&beside, directory.join(METADATA_FILE))?;
-    sync_directory(directory)
-}
-
-/// Makes renames within a directory last.
-pub(super) fn sync_directory(directory: &Path) -> io::Result<()> {
-    File::open(directory)?.sync_all()
+/// [`WholeFileError`].
+pub fn write_metadata(directory: &Path, files: &[FileSummary]) -> Result<(), WholeFileError> {
+    write_whole(&directory.join(METADATA_FILE), |out| out.write_all(metadata_yaml(files).as_bytes()))
 }
 
 /// A YAML list under a key, `[]` when empty.

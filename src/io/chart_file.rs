@@ -3,10 +3,12 @@
 //! The file is a line, the SHA-256 of what follows, the key, and the words of the chart, little-endian.
 
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use super::whole_file::{WholeFileError, folder_of, write_whole};
 use crate::hex::hex;
 use crate::input_file;
 use crate::physics::Chart;
@@ -30,6 +32,8 @@ pub enum ChartFileError {
     Io { path: PathBuf, source: std::io::Error },
     #[error("{}: damaged, or not a chart of this rig", path.display())]
     Foreign { path: PathBuf },
+    #[error(transparent)]
+    Write(#[from] WholeFileError),
 }
 
 impl ChartFile {
@@ -82,25 +86,25 @@ impl ChartFile {
         Chart::from_words(&words)
     }
 
-    /// Keeps `chart`: written beside, then renamed.
+    /// Keeps `chart`, in a folder made where it is missing.
     ///
     /// # Errors
-    /// [`ChartFileError::Io`].
+    /// [`ChartFileError::Io`] of the folder, [`ChartFileError::Write`] of the file.
     pub fn save(&self, chart: &Chart) -> Result<(), ChartFileError> {
-        let io = |source| ChartFileError::Io { path: self.path.clone(), source };
         let mut body = self.key.to_vec();
         body.extend(chart.words().into_iter().flat_map(u64::to_le_bytes));
-        let bytes = [MAGIC, Sha256::digest(&body).as_slice(), &body].concat();
-        if let Some(folder) = self.path.parent() {
-            fs::create_dir_all(folder).map_err(io)?;
+        let folder = folder_of(&self.path);
+        fs::create_dir_all(folder).map_err(|source| ChartFileError::Io { path: folder.to_owned(), source })?;
+        // A named pipe or the like has no business under this name.
+        if fs::metadata(&self.path).is_ok_and(|there| !there.is_file()) {
+            let _ = fs::remove_file(&self.path);
         }
-        // Two nodes may chart one rig: each writes a file of its own.
-        let beside = self.path.with_extension(format!("chart.{}", std::process::id()));
-        let written = fs::write(&beside, bytes).and_then(|()| fs::rename(&beside, &self.path));
-        written.map_err(|source| {
-            let _ = fs::remove_file(&beside);
-            io(source)
-        })
+        write_whole(&self.path, |out| {
+            out.write_all(MAGIC)?;
+            out.write_all(&Sha256::digest(&body))?;
+            out.write_all(&body)
+        })?;
+        Ok(())
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::{
     collections::BTreeMap,
-    fs, io,
+    io,
     path::{Path, PathBuf},
 };
 
@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::{
     message::Payload,
-    recording_file::{RecordingFile, WriteError, with_suffix},
+    recording_file::{RecordingFile, WriteError},
     tribometer_log::{self, LogError, LogOptions, Sample, TribometerLog},
 };
 use crate::hex::hex;
@@ -64,19 +64,12 @@ pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Im
     if output.exists() && !options.overwrite {
         return Err(WriteError::Exists { path: output.to_owned() }.into());
     }
-    // Beside, and renamed only when it is complete.
-    let beside = with_suffix(output, ".importing");
-    let mut file = RecordingFile::create_beside(&beside, ".part")?;
+    let mut file = RecordingFile::create_whole(output)?;
     if let Err(error) = write(&mut file, input, &bytes, &log) {
-        let _ = fs::remove_file(file.abandon());
+        file.abandon();
         return Err(error);
     }
-    let part = file.temporary().to_owned();
-    let summary = file.finish().inspect_err(|_| drop(fs::remove_file(&part)))?;
-    fs::rename(&beside, output).map_err(|source| {
-        let _ = fs::remove_file(&beside);
-        WriteError::io(output, source)
-    })?;
+    let summary = file.finish()?;
     Ok(Imported { path: output.to_owned(), messages: summary.messages(), span_ns: summary.span_ns, log })
 }
 

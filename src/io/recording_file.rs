@@ -3,9 +3,10 @@
 use std::{
     collections::{BTreeMap, HashMap},
     ffi::OsString,
-    fmt,
-    fs::{File, OpenOptions},
+    fmt, fs,
+    fs::File,
     io::{self, BufWriter, Write},
+    os::unix::fs::MetadataExt,
     path::{Path, PathBuf},
     sync::Arc,
 };
@@ -17,8 +18,9 @@ use mcap::{
 };
 
 use super::{
-    bag::{self, FileSummary, TopicInfo},
+    bag::{FileSummary, TopicInfo},
     record_walker::Attachment,
+    whole_file::{WholeFile, WholeFileError, folder_of, sync_open_folder},
 };
 use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
 
@@ -37,6 +39,8 @@ pub enum WriteError {
     Mcap { path: PathBuf, source: McapError },
     #[error("{}: exists already", .path.display())]
     Exists { path: PathBuf },
+    #[error(transparent)]
+    Whole(#[from] WholeFileError),
 }
 
 impl WriteError {
@@ -53,6 +57,15 @@ pub trait Disk: fmt::Debug + Send + Sync {
     ///
     /// As [`Write::write`].
     fn write(&self, file: &File, bytes: &[u8]) -> io::Result<usize>;
+
+    /// Puts what was written on the disk.
+    ///
+    /// # Errors
+    ///
+    /// As [`File::sync_data`].
+    fn sync(&self, file: &File) -> io::Result<()> {
+        file.sync_data()
+    }
 
     /// How much may still be written below a directory.
     ///
@@ -101,6 +114,24 @@ impl Write for CountedFile {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct ChannelId(u16);
 
+/// Whether the temporary name of a file being written still leads to it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Whereabouts {
+    InPlace,
+    /// Its directory was moved: there now.
+    Moved(PathBuf),
+    /// It was removed: what was and will be written is lost.
+    Removed,
+}
+
+/// How a file gets its name.
+enum Naming {
+    /// It has its temporary name, which others look for; the directory it was made in.
+    Active(File),
+    /// It has no name that others know.
+    Whole(WholeFile),
+}
+
 /// A file being written.
 ///
 /// Chunks are gathered in memory and written whole: a killed process leaves whole chunks, not the open one of length
@@ -108,9 +139,11 @@ pub struct ChannelId(u16);
 pub struct RecordingFile {
     writer: Writer<NoSeek<BufWriter<CountedFile>>>,
     file: File,
+    disk: Arc<dyn Disk>,
     bytes: Arc<std::sync::atomic::AtomicU64>,
     temporary: PathBuf,
     path: PathBuf,
+    naming: Naming,
     topics: HashMap<ChannelId, TopicInfo>,
     summary: FileSummary,
 }
@@ -122,7 +155,8 @@ impl fmt::Debug for RecordingFile {
 }
 
 impl RecordingFile {
-    /// Begins a file that will be named `path` when it is finished, and `path` + `suffix` until then.
+    /// Begins a file that will be named `path` when it is finished, and `path` + `suffix` until then, so that what is there can be
+    /// read and recovered before it is finished.
     ///
     /// # Errors
     ///
@@ -135,14 +169,34 @@ impl RecordingFile {
             }
         }
         // Locked before it has the name others look for.
-        let newborn = with_suffix(&temporary, ".new");
-        let at = |source| WriteError::io(&newborn, source);
-        let file = OpenOptions::new().write(true).create(true).truncate(true).open(&newborn).map_err(at)?;
-        file.try_lock().map_err(|error| at(error.into()))?;
-        std::fs::rename(&newborn, &temporary).map_err(|source| WriteError::io(&temporary, source))?;
+        let file = WholeFile::create(&temporary)?.name_unfinished()?;
+        let folder = folder_of(path);
+        let directory = File::open(folder).map_err(|source| WriteError::io(folder, source))?;
+        let begun = Self::begin(file, temporary.clone(), path, Naming::Active(directory), disk);
+        begun.inspect_err(|_| drop(fs::remove_file(&temporary)))
+    }
 
+    /// Begins a file on the file system that appears under its name, in the place of what has it, when it is finished.
+    ///
+    /// # Errors
+    ///
+    /// What writing yields.
+    pub(super) fn create_whole(path: &Path) -> Result<Self, WriteError> {
+        let whole = WholeFile::create(path)?;
+        let file = whole.as_file().try_clone().map_err(|source| WriteError::io(path, source))?;
+        Self::begin(file, path.to_owned(), path, Naming::Whole(whole), Arc::new(FileSystem))
+    }
+
+    fn begin(
+        file: File,
+        temporary: PathBuf,
+        path: &Path,
+        naming: Naming,
+        disk: Arc<dyn Disk>,
+    ) -> Result<Self, WriteError> {
         let bytes = Arc::default();
-        let counted = CountedFile { file: file.try_clone().map_err(at)?, disk, bytes: Arc::clone(&bytes) };
+        let same = file.try_clone().map_err(|source| WriteError::io(&temporary, source))?;
+        let counted = CountedFile { file: same, disk: Arc::clone(&disk), bytes: Arc::clone(&bytes) };
         let options = WriteOptions::new()
             .profile("ros2")
             .library(concat!("squealcast ", env!("CARGO_PKG_VERSION")))
@@ -150,33 +204,42 @@ impl RecordingFile {
             .compression_threads(0)
             .disable_seeking(true);
         let created = options.create(NoSeek::new(BufWriter::new(counted)));
-        let writer = created.map_err(|source| {
-            let _ = std::fs::remove_file(&temporary);
-            located(&temporary, source)
-        })?;
+        let writer = created.map_err(|source| located(&temporary, source))?;
         let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let summary = FileSummary { name, ..FileSummary::default() };
-        Ok(Self { writer, file, bytes, temporary, path: path.to_owned(), topics: HashMap::new(), summary })
+        let (path, topics) = (path.to_owned(), HashMap::new());
+        Ok(Self { writer, file, disk, bytes, temporary, path, naming, topics, summary })
     }
 
-    /// Begins a file that will take another's place once it is finished, on the file system. What an interrupted
-    /// attempt left under these names is removed.
+    /// Whether what is written can still be found.
     ///
     /// # Errors
     ///
-    /// [`WriteError::Exists`] when another process is at it, and what writing yields.
-    pub(super) fn create_beside(path: &Path, suffix: &str) -> Result<Self, WriteError> {
-        for stale in [path, &with_suffix(path, suffix)] {
-            match File::open(stale) {
-                Ok(file) => {
-                    file.try_lock().map_err(|_| WriteError::Exists { path: stale.to_owned() })?;
-                    std::fs::remove_file(stale).map_err(|source| WriteError::io(stale, source))?;
-                }
-                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-                Err(source) => return Err(WriteError::io(stale, source)),
+    /// What asking the file system yields.
+    pub fn whereabouts(&self) -> io::Result<Whereabouts> {
+        let own = self.file.metadata()?;
+        let same = match fs::symlink_metadata(&self.temporary) {
+            Ok(there) => Some((there.dev(), there.ino()) == (own.dev(), own.ino())),
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => None,
+            Err(error) => return Err(error),
+        };
+        Ok(match (own.nlink(), same) {
+            (0, None | Some(false)) => Whereabouts::Removed,
+            (_, None) => Whereabouts::Moved(self.directory()),
+            // Numbers of files are not steady on every file system.
+            (_, Some(_)) => Whereabouts::InPlace,
+        })
+    }
+
+    /// The directory it is in, wherever that was moved.
+    fn directory(&self) -> PathBuf {
+        let moved = match &self.naming {
+            Naming::Active(directory) => {
+                fs::read_link(format!("/proc/self/fd/{}", std::os::fd::AsRawFd::as_raw_fd(directory))).ok()
             }
-        }
-        Self::create(path, suffix, Arc::new(FileSystem))
+            Naming::Whole(_) => None,
+        };
+        moved.unwrap_or_else(|| folder_of(&self.path).to_owned())
     }
 
     /// The name it has while it is written.
@@ -296,15 +359,27 @@ impl RecordingFile {
     ///
     /// What `fdatasync` yields.
     pub fn sync(&self) -> Result<(), WriteError> {
-        self.file.sync_data().map_err(|source| WriteError::io(&self.temporary, source))
+        self.disk.sync(&self.file).map_err(|source| WriteError::io(&self.temporary, source))
     }
 
-    /// Writes the summary, puts everything on the disk and gives the file its name.
+    /// Writes the summary, puts everything on the disk and gives the file its name, wherever its directory was moved.
     ///
     /// # Errors
     ///
     /// What writing yields; then the file keeps its temporary name, and is not locked any more.
-    pub fn finish(mut self) -> Result<FileSummary, WriteError> {
+    pub fn finish(self) -> Result<FileSummary, WriteError> {
+        self.finish_after(|| Ok(()))
+    }
+
+    /// As [`finish`](Self::finish), with something done when everything but the name is there.
+    ///
+    /// # Errors
+    ///
+    /// As [`finish`](Self::finish), and those of `before_naming`.
+    pub fn finish_after(
+        mut self,
+        before_naming: impl FnOnce() -> Result<(), WriteError>,
+    ) -> Result<FileSummary, WriteError> {
         let finished = self.writer.finish().map(drop);
         // Not `Drop`: it would try again and keep silent.
         let mut buffered = self.writer.into_inner().into_inner();
@@ -312,14 +387,21 @@ impl RecordingFile {
             drop(buffered.into_parts());
             return Err(located(&self.temporary, source));
         }
-        self.file.sync_all().map_err(|source| WriteError::io(&self.temporary, source))?;
-        std::fs::rename(&self.temporary, &self.path).map_err(|source| WriteError::io(&self.path, source))?;
-        let directory = directory_of(&self.path);
-        bag::sync_directory(directory).map_err(|source| WriteError::io(directory, source))?;
+        let at = |source| WriteError::io(&self.temporary, source);
+        self.file.sync_all().map_err(at)?;
+        before_naming()?;
+        match self.naming {
+            Naming::Whole(whole) => whole.finish()?,
+            Naming::Active(directory) => {
+                let [from, to] = [&self.temporary, &self.path].map(|path| path.file_name().unwrap_or_default());
+                let renamed = rustix::fs::renameat(&directory, from, &directory, to).map_err(io::Error::from);
+                renamed.and_then(|()| sync_open_folder(&directory)).map_err(at)?;
+            }
+        }
         Ok(self.summary)
     }
 
-    /// Lets go of the file as it is on the disk, under its temporary name, writing nothing more.
+    /// Lets go of the file as it is on the disk, writing nothing more. It keeps its temporary name if it has one.
     pub fn abandon(self) -> PathBuf {
         drop(self.writer.into_inner().into_inner().into_parts());
         self.temporary
@@ -338,12 +420,4 @@ pub(super) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name: OsString = path.as_os_str().to_owned();
     name.push(suffix);
     PathBuf::from(name)
-}
-
-/// The directory a file is in.
-pub(super) fn directory_of(path: &Path) -> &Path {
-    match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    }
 }

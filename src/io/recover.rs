@@ -1,7 +1,6 @@
 //! Repairs interrupted recordings.
 //!
-//! What can be read is written into a finished file beside the interrupted one, which is replaced only when the new one
-//! is on the disk. An original with anything in it that could not be read is kept as `*.mcap.damaged`.
+//! What can be read is written into a finished file, which takes the place of the interrupted one only when it is on the disk. An original with anything in it that could not be read is kept as `*.mcap.damaged`.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -16,12 +15,12 @@ use super::{
     bag::{self, FileSummary, TopicInfo},
     record_walker::{Damage, Depth, Item, RecordWalker},
     recording::{RecordingError, mcap_files, no_files, open_walker},
-    recording_file::{RecordingFile, WriteError, directory_of, with_suffix},
+    recording_file::{RecordingFile, WriteError, with_suffix},
+    whole_file::{folder_of, sync_folder},
 };
 
 /// The suffix of a file that is being recorded.
 pub const ACTIVE: &str = ".active";
-const RECOVERING: &str = ".recovering";
 const DAMAGED: &str = ".damaged";
 
 /// Why a recording cannot be repaired.
@@ -147,7 +146,7 @@ fn recover_files(files: &[PathBuf]) -> RecoveryReport {
     }
     let mut changed: Vec<&Path> = Vec::new();
     for Recovery { original, outcome } in &report.recoveries {
-        let directory = directory_of(original);
+        let directory = folder_of(original);
         let listed = match outcome {
             Outcome::InUse => true,
             Outcome::Complete { path, .. } => path == original && directory.join(bag::METADATA_FILE).exists(),
@@ -188,7 +187,7 @@ fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
         return Err(RecoverError::TargetExists { interrupted: path.to_owned(), finished: target });
     }
     if lock.metadata().map_err(|source| read_error(path, source))?.len() == 0 && is_active(path) {
-        std::fs::remove_file(path).map_err(|source| read_error(path, source))?;
+        remove(path)?;
         return Ok(recovery(Outcome::Empty));
     }
 
@@ -209,30 +208,24 @@ fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
         return Ok(recovery(Outcome::Complete { path: target, messages }));
     }
 
-    let beside = with_suffix(&target, RECOVERING);
-    // Named `*.recovering` when finished, so that nothing is replaced before.
-    let mut copy = RecordingFile::create_beside(&beside, ".part")?;
+    let mut copy = RecordingFile::create_whole(&target)?;
     let mut walker = open_walker(path, Depth::Messages)?;
     let attachments = match copy_items(&mut walker, &mut copy) {
         Ok(attachments) => attachments,
         Err(error) => {
-            let _ = std::fs::remove_file(copy.abandon());
+            copy.abandon();
             return Err(error.into());
         }
     };
-    let part = copy.temporary().to_owned();
-    let summary = copy.finish().inspect_err(|_| drop(std::fs::remove_file(&part)))?;
     let damage = walker.damage().to_vec();
-    let kept_original = if damage.iter().any(|damage| damage.loses_data) {
-        let kept = free_name(&with_suffix(&target, DAMAGED));
-        rename(path, &kept)?;
-        Some(kept)
-    } else {
-        None
-    };
-    rename(&beside, &target)?;
-    if kept_original.is_none() && target != path {
-        std::fs::remove_file(path).map_err(|source| read_error(path, source))?;
+    let loses_data = damage.iter().any(|damage| damage.loses_data);
+    let kept_original = loses_data.then(|| free_name(&with_suffix(&target, DAMAGED)));
+    let summary = copy.finish_after(|| match &kept_original {
+        Some(kept) => keep_as(path, kept),
+        None => Ok(()),
+    })?;
+    if target != path {
+        remove(path)?;
     }
     let restored = Restored {
         path: target,
@@ -283,7 +276,7 @@ fn rewrite_metadata(directory: &Path) -> Result<(), RecoverError> {
             summaries.push(summarize(&path)?);
         }
     }
-    bag::write_metadata(directory, &summaries).map_err(|source| WriteError::io(directory, source))?;
+    bag::write_metadata(directory, &summaries).map_err(WriteError::from)?;
     Ok(())
 }
 
@@ -342,9 +335,23 @@ fn free_name(path: &Path) -> PathBuf {
 }
 
 fn rename(from: &Path, to: &Path) -> Result<(), WriteError> {
-    std::fs::rename(from, to)
-        .and_then(|()| bag::sync_directory(directory_of(to)))
-        .map_err(|source| WriteError::io(to, source))
+    std::fs::rename(from, to).and_then(|()| sync_folder(folder_of(to))).map_err(|source| WriteError::io(to, source))
+}
+
+/// Gives a file a second name, so that replacing the first leaves it; where the file system has no second names, another one.
+fn keep_as(path: &Path, kept: &Path) -> Result<(), WriteError> {
+    match std::fs::hard_link(path, kept) {
+        Ok(()) => Ok(()),
+        Err(_) => rename(path, kept),
+    }
+}
+
+/// Removes a file whose content is elsewhere; that it has gone already is as good.
+fn remove(path: &Path) -> Result<(), RecordingError> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(read_error(path, error)),
+        _ => Ok(()),
+    }
 }
 
 fn read_error(path: &Path, source: io::Error) -> RecordingError {

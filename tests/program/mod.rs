@@ -192,7 +192,15 @@ impl Running {
         Self(Some(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the program starts")))
     }
 
-    /// Sends a signal (`INT`, `TERM`) and waits for the end, which is promised within 2 s.
+    /// Sends a signal (`HUP`) and does not wait for what comes of it.
+    pub fn send(&self, signal: &str) {
+        let id = self.0.as_ref().expect("still running").id().to_string();
+        let sent = Command::new("kill").args([&format!("-{signal}"), &id]).status();
+        assert!(sent.expect("kill is there").success(), "the program had ended before SIG{signal}");
+    }
+
+    /// Sends a signal (`INT`, `TERM`) and waits for the end, which is promised within 2 s. Three more are granted to a machine that
+    /// does much else.
     pub fn signal(mut self, signal: &str) -> Run {
         let child = self.0.take().expect("still running");
         let id = child.id().to_string();
@@ -210,6 +218,7 @@ impl Running {
         drop(done);
         watch.join().expect("the watch ends");
         promised(&format!("SIG{signal}"), started.elapsed(), Duration::from_secs(2));
+        assert!(started.elapsed() < Duration::from_secs(5), "SIG{signal}: ended after {:.1?}", started.elapsed());
         ended(output)
     }
 }
