@@ -257,7 +257,7 @@ impl Offline {
         match finished.status.dropped() {
             0 => Ok(Predicted { directory: finished.directory, inputs, levels, map_failure }),
             dropped => {
-                let reason = finished.status.last_error.unwrap_or_else(|| "the queue was full".to_owned());
+                let reason = finished.status.why_dropped().unwrap_or_default();
                 Err(OfflineError::Dropped { dropped, reason })
             }
         }

@@ -5,8 +5,10 @@
 //! Sensitivities are left out: nothing depends on them. Dense spectra of inputs to come are solved side by side, ahead of the
 //! session (`ahead`).
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
+
+use bytes::Bytes;
 
 use crate::ahead::Ahead;
 use crate::io::chart_file::ChartFile;
@@ -71,8 +73,6 @@ pub enum Charts {
 /// Why nothing could be compared.
 #[derive(Debug, thiserror::Error)]
 pub enum VerifyError {
-    #[error("the recording begins in the middle of a session (split {split}): give the directory of all its files")]
-    Split { split: String },
     #[error("the recording holds no prediction that can be read{}", .damage.iter().map(|d| format!("; {d}")).collect::<String>())]
     NoPredictions { damage: Vec<FileDamage> },
     #[error("cannot compute the stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s: {reason}")]
@@ -85,14 +85,13 @@ pub enum VerifyError {
     Encode(String),
 }
 
-/// Predicts the session in `recording` again with `rig` and compares.
+/// Predicts the session in `recording` again with `rig` and compares. A file from the middle of a session begins with the settings,
+/// map, ends and chart in force, so that it comes out the same by itself; but whether its first input repeats the one before, and
+/// whether the hysteresis of SQUEAL held then, is not in it.
 ///
 /// # Errors
 /// [`VerifyError`].
 pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<Verification, VerifyError> {
-    if let Some(split) = recording.session_metadata("split_index").filter(|&split| split != "0") {
-        return Err(VerifyError::Split { split: split.to_owned() });
-    }
     let mut answered: HashSet<(Time, u64)> = HashSet::new();
     let mut messages = recording.messages();
     for entry in messages.by_ref() {
@@ -106,6 +105,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
     }
 
     let mut found = Verification { damage, ..Verification::default() };
+    let mut events = NewEvents::default();
     let mut session = Session::new(rig.clone(), Settings::for_rig(rig));
     let mut solver = Solver::new(rig.model.dimension());
     let mut computed: VecDeque<Prediction> = VecDeque::new();
@@ -132,7 +132,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
                     step(&mut session, &mut computed, Event::Input(input));
                 }
             }
-            Recorded::Known(Payload::SessionEvent(event)) => {
+            Recorded::Known(Payload::SessionEvent(event)) if events.take(&event, &entry.cdr) => {
                 let map = session.map().cloned();
                 let event = session_event(event, rig, charts, map.as_deref(), &mut solver, &mut found)?;
                 step(&mut session, &mut computed, event);
@@ -152,6 +152,17 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
         found.describe(|| format!("seq {}: predicted now, not recorded", prediction.input_seq));
     }
     Ok(found)
+}
+
+/// The latest session event of each kind, and of each setting: each file of a recording begins with a copy of them.
+#[derive(Default)]
+struct NewEvents(HashMap<(u8, String), Bytes>);
+
+impl NewEvents {
+    /// Whether an event is not a copy of one before, to the byte. Its stamp, in nanoseconds, is among these.
+    fn take(&mut self, event: &SessionEvent, cdr: &Bytes) -> bool {
+        self.0.insert((event.kind, event.name.clone()), cdr.clone()).is_none_or(|before| before != cdr)
+    }
 }
 
 /// The event that was recorded, a stability map computed anew.

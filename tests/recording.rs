@@ -1,80 +1,27 @@
 //! Recordings end to end: what was recorded is read back, whatever happened to the process, the disk or the file.
 
-mod program;
+mod records;
 
 use std::{
-    fs::{self, File},
-    io::{self, BufRead, BufReader, Write},
+    fs, io,
     path::{Path, PathBuf},
-    process::{Command, Stdio},
-    sync::{
-        Arc, Condvar, Mutex,
-        atomic::{AtomicI64, Ordering},
-    },
-    time::{Duration, Instant, SystemTime, UNIX_EPOCH},
+    process::Command,
+    time::Duration,
 };
 
 use proptest::prelude::*;
+use records::*;
 use squealcast::{
     io::{
         import::{ImportOptions, import},
         message::{Message, Payload},
-        recorder::{Recorder, RecorderConfig, RecorderError, State},
+        recorder::{Recorder, RecorderConfig, State},
         recording::{Entry, ReadOptions, Recorded, Recording},
-        recording_file::{Disk, FileSystem},
         recover::{Outcome, recover},
     },
-    rig::RigFile,
-    wire::{
-        DiagnosticArray, DiagnosticStatus, Header, KeyValue, Mode, OperatingPoint, Prediction, RigInfo, SessionEvent,
-        Time, schema::Topic,
-    },
+    wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, SessionEvent, Time, schema::Topic},
 };
 use tempfile::TempDir;
-
-/// The start of the recordings made here, ns since the epoch.
-const T0: u64 = 1_700_000_000_000_000_000;
-const LIMIT: Duration = Duration::from_secs(120);
-
-fn point(seq: u64, log_time_ns: u64) -> Message {
-    let stamp = Time::from_ns(log_time_ns as i64);
-    let point = OperatingPoint {
-        header: Header { stamp, frame_id: "rig".to_owned() },
-        seq,
-        normal_load_n: 500.0 + (seq as f64 * 0.37).sin(),
-        disc_speed_rad_s: 13.0,
-        friction_coefficient: 0.3 + 1e-4 * (seq % 1000) as f64,
-    };
-    Message { log_time_ns, publish_time_ns: log_time_ns, payload: Payload::OperatingPoint(point) }
-}
-
-fn prediction(seq: u64, log_time_ns: u64) -> Message {
-    let mode = |id: u32| Mode {
-        id,
-        frequency_hz: 1000.0 * f64::from(id) + (seq as f64).sqrt(),
-        growth_rate_per_s: -(f64::from(id) + seq as f64).sin(),
-        damping_ratio: 0.01,
-        pad_participation: 0.5,
-        residual: 1e-14,
-        frequency_error_hz: f64::INFINITY,
-        growth_rate_error_per_s: -0.0,
-    };
-    let prediction = Prediction {
-        header: Header { stamp: Time::from_ns(log_time_ns as i64), frame_id: String::new() },
-        input_seq: seq,
-        level: 2,
-        reused: seq % 2 == 1,
-        unstable_modes: 1,
-        max_growth_rate_per_s: 1.5,
-        worst_frequency_hz: 2000.0,
-        critical_friction: 0.31,
-        friction_margin: -0.02,
-        friction_margin_error: 1e-10,
-        reason: "ä reason".to_owned(),
-        modes: (0..9).map(mode).collect(),
-    };
-    Message { log_time_ns, publish_time_ns: log_time_ns, payload: Payload::Prediction(prediction) }
-}
 
 fn others() -> Vec<Message> {
     let header = Header { stamp: Time { sec: 5, nanosec: 6 }, frame_id: String::new() };
@@ -85,26 +32,6 @@ fn others() -> Vec<Message> {
         .into_iter()
         .map(|payload| Message { log_time_ns: T0, publish_time_ns: 7, payload })
         .collect()
-}
-
-fn rig_info() -> Message {
-    let info = RigInfo {
-        name: "nine-dof".to_owned(),
-        content_hash: "c0ffee".to_owned(),
-        version: "0.1.0".to_owned(),
-        mode_count: 9,
-        band_max_hz: 20_000.0,
-        reduction: "0 missed".to_owned(),
-    };
-    Message { log_time_ns: T0, publish_time_ns: T0, payload: Payload::RigInfo(info) }
-}
-
-fn config(directory: &Path) -> RecorderConfig {
-    let rig_files = vec![
-        RigFile { name: "rig.toml".to_owned(), bytes: b"name = \"nine-dof\"\n".to_vec() },
-        RigFile { name: "M.mtx".to_owned(), bytes: (0..=255).collect() },
-    ];
-    RecorderConfig { rig_name: "nine-dof".to_owned(), rig_files, ..RecorderConfig::new(directory) }
 }
 
 /// Records `count` operating points, each with its prediction, behind one message of every other kind.
@@ -130,30 +57,6 @@ fn payloads(entries: &[Entry]) -> Vec<&Payload> {
         other => panic!("{other:?}"),
     };
     entries.iter().filter(|entry| payload(entry)).filter_map(|entry| known(entry)).collect()
-}
-
-fn known(entry: &Entry) -> Option<&Payload> {
-    match &entry.message {
-        Recorded::Known(payload) => Some(payload),
-        _ => None,
-    }
-}
-
-fn sequence_numbers<'a>(entries: impl IntoIterator<Item = &'a Entry>) -> Vec<u64> {
-    let seq = |entry: &'a Entry| match known(entry) {
-        Some(Payload::OperatingPoint(point)) => Some(point.seq),
-        _ => None,
-    };
-    entries.into_iter().filter_map(seq).collect()
-}
-
-fn read(path: &Path) -> Vec<Entry> {
-    let recording = Recording::open(path).unwrap();
-    assert!(recording.is_complete(), "{:?}", recording.damage());
-    let mut messages = recording.messages();
-    let entries: Vec<Entry> = messages.by_ref().collect();
-    assert_eq!(messages.damage(), []);
-    entries
 }
 
 fn only_file(directory: &Path) -> PathBuf {
@@ -194,9 +97,9 @@ fn a_recording_is_split_by_size_and_by_duration() {
         let by_size = config.split_bytes == 1;
         let (directory, _) = record(config, if by_size { 20 } else { 1800 });
         let recording = Recording::open(&directory).unwrap();
-        // By duration: 3.6 s in files of 1 s. By size: every message its own file, so numeric order counts (`_10` is
-        // behind `_9`).
-        assert_eq!(recording.files().len(), if by_size { 43 } else { 4 });
+        // By duration: 3.6 s in files of 1 s. By size: three messages and 20 inputs with their predictions in a file each, so
+        // numeric order counts (`_10` is behind `_9`).
+        assert_eq!(recording.files().len(), if by_size { 23 } else { 4 });
         for file in recording.files() {
             let part = Recording::open(file).unwrap();
             assert_eq!(part.attachments().len(), 2);
@@ -206,77 +109,6 @@ fn a_recording_is_split_by_size_and_by_duration() {
         assert!(entries.windows(2).all(|pair| pair[0].log_time_ns < pair[1].log_time_ns));
         assert_eq!(sequence_numbers(&entries), (0..if by_size { 20 } else { 1800 }).collect::<Vec<_>>());
         assert_eq!(recording.attachments().len(), 2);
-    }
-}
-
-/// Not a test of its own: what `a_killed_process_loses_less_than_a_second` starts and kills.
-#[test]
-fn recording_child() {
-    let Ok(directory) = std::env::var("SQUEALCAST_TEST_RECORD") else { return };
-    let recorder = Recorder::start(config(Path::new(&directory))).unwrap();
-    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos() as u64;
-    recorder.record(Message { log_time_ns: now, ..rig_info() });
-    let start = Instant::now();
-    for seq in 0.. {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos() as u64;
-        recorder.record(point(seq, now));
-        recorder.record(prediction(seq, now));
-        if seq == 0 {
-            println!("\nrecording");
-            io::stdout().flush().unwrap();
-        }
-        std::thread::sleep((start + Duration::from_millis(2) * seq as u32).saturating_duration_since(Instant::now()));
-        assert!(start.elapsed() < 2 * LIMIT, "nobody killed this process");
-    }
-}
-
-#[test]
-fn a_killed_process_loses_less_than_a_second() {
-    for milliseconds in [200, 1600, 2900] {
-        let temp = TempDir::new().unwrap();
-        let mut child = Command::new(std::env::current_exe().unwrap())
-            .args(["--exact", "recording_child", "--nocapture"])
-            .env("SQUEALCAST_TEST_RECORD", temp.path())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut output = BufReader::new(child.stdout.take().unwrap());
-        let mut line = String::new();
-        while line.trim() != "recording" {
-            line.clear();
-            assert_ne!(output.read_line(&mut line).unwrap(), 0, "the recording process ended");
-        }
-        std::thread::sleep(Duration::from_millis(milliseconds));
-        let live = recover(temp.path()).unwrap().recoveries;
-        assert!(live.iter().all(|recovery| recovery.outcome == Outcome::InUse), "{live:?}");
-        let killed = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos() as u64;
-        child.kill().unwrap();
-        child.wait().unwrap();
-
-        // The next start repairs it by itself.
-        let recorder = Recorder::start(config(temp.path())).unwrap();
-        let deadline = Instant::now() + LIMIT;
-        let recovered = loop {
-            let status = recorder.status();
-            assert_eq!(status.unrecovered, [] as [String; 0]);
-            match status.recovered.as_slice() {
-                [recovery] => break recovery.clone(),
-                _ => assert!(Instant::now() < deadline, "{status:?}"),
-            }
-            std::thread::sleep(Duration::from_millis(10));
-        };
-        recorder.finish(LIMIT).unwrap();
-        let Outcome::Restored(restored) = recovered.outcome else { panic!("{recovered:?}") };
-        let entries = read(restored.path.parent().unwrap());
-        assert_eq!(entries.len() as u64, restored.messages);
-        let seqs = sequence_numbers(&entries);
-        assert_eq!(seqs, (0..seqs.len() as u64).collect::<Vec<_>>());
-        let last = entries.last().map_or(killed - milliseconds * 1_000_000, |entry| entry.log_time_ns);
-        let lost_ms = killed.saturating_sub(last) / 1_000_000;
-        eprintln!("killed after {milliseconds} ms: {} messages restored, the last {lost_ms} ms lost", entries.len());
-        program::promised("what a kill loses", Duration::from_millis(lost_ms), Duration::from_secs(1));
-        assert!(restored.path.parent().unwrap().join("metadata.yaml").exists());
-        assert_eq!(Recording::open(&restored.path).unwrap().attachments().len(), 2);
     }
 }
 
@@ -353,148 +185,6 @@ fn a_chunk_that_is_damaged_inside_loses_no_other() {
     assert!(lost_a_chunk_only > 10, "{lost_a_chunk_only} of 60");
 }
 
-/// A disk on which only so much can be written.
-#[derive(Debug)]
-struct SmallDisk(AtomicI64);
-
-impl Disk for SmallDisk {
-    fn write(&self, file: &File, bytes: &[u8]) -> io::Result<usize> {
-        let space = self.0.load(Ordering::SeqCst);
-        if space <= 0 {
-            return Err(io::Error::from_raw_os_error(28)); // ENOSPC
-        }
-        // As a real one: the last write fits in part.
-        let written = FileSystem.write(file, &bytes[..bytes.len().min(space as usize)])?;
-        self.0.fetch_sub(written as i64, Ordering::SeqCst);
-        Ok(written)
-    }
-
-    fn free_bytes(&self, _: &Path) -> io::Result<u64> {
-        Ok(self.0.load(Ordering::SeqCst).max(0) as u64)
-    }
-}
-
-#[test]
-fn a_full_disk_stops_nobody_and_is_told() {
-    let temp = TempDir::new().unwrap();
-    let disk = Arc::new(SmallDisk(AtomicI64::new(60_000)));
-    let config = RecorderConfig {
-        disk: Arc::clone(&disk) as Arc<dyn Disk>,
-        flush_interval: Duration::from_millis(10),
-        retry_interval: Duration::from_millis(20),
-        ..config(temp.path())
-    };
-    let recorder = Recorder::start(config.clone()).unwrap();
-    recorder.record(rig_info());
-    let wait = |wanted: fn(&State) -> bool, seq: &mut u64| {
-        let deadline = Instant::now() + LIMIT;
-        while !wanted(&recorder.status().state) {
-            assert!(recorder.record(prediction(*seq, T0 + *seq * 1000)));
-            *seq += 1;
-            std::thread::sleep(Duration::from_micros(200));
-            assert!(Instant::now() < deadline, "{:?}", recorder.status());
-        }
-    };
-    let mut seq = 0;
-    wait(|state| matches!(state, State::Failed(_)), &mut seq);
-    let status = recorder.status();
-    let State::Failed(reason) = &status.state else { panic!() };
-    assert!(reason.contains("No space left on device"), "{reason}");
-    for _ in 0..50 {
-        recorder.record(prediction(seq, T0 + seq * 1000));
-        seq += 1;
-    }
-
-    // Space again: the next file.
-    disk.0.store(1 << 30, Ordering::SeqCst);
-    wait(|state| *state == State::Recording, &mut seq);
-    let resumed = seq;
-    while seq < resumed + 100 {
-        recorder.record(prediction(seq, T0 + seq * 1000));
-        seq += 1;
-    }
-    let finished = recorder.finish(LIMIT).unwrap();
-    let status = &finished.status;
-    assert!(status.last_error.is_some() && status.dropped_failed > 50, "{status:?}");
-    // The rig info is written once more at the start of the second file.
-    assert_eq!(status.messages_written + status.dropped(), seq + 2, "{status:?}");
-    assert_eq!(finished.files.len(), 1);
-
-    // What was on the disk of the first file is not lost either.
-    let recovered = recover(&finished.directory).unwrap().recoveries;
-    assert_eq!(recovered.len(), 2);
-    let entries = read(&finished.directory);
-    assert!(entries.len() as u64 >= status.messages_written);
-    assert!(matches!(known(&entries[0]), Some(Payload::RigInfo(_))));
-
-    // Full to the end: an error.
-    disk.0.store(30_000, Ordering::SeqCst);
-    let recorder = Recorder::start(config).unwrap();
-    for seq in 0..5000 {
-        recorder.record(prediction(seq, T0 + seq * 1000));
-    }
-    let error = recorder.finish(LIMIT).unwrap_err();
-    assert!(matches!(error, RecorderError::Failed { .. }), "{error}");
-
-    // Full from the start: an error at once, and nothing left behind.
-    let empty = TempDir::new().unwrap();
-    disk.0.store(100, Ordering::SeqCst);
-    let config = RecorderConfig { disk, ..RecorderConfig::new(empty.path()) };
-    assert!(matches!(Recorder::start(config), Err(RecorderError::Write(_))));
-    assert_eq!(fs::read_dir(empty.path()).unwrap().count(), 0);
-}
-
-/// A disk on which a write ends only once it is let go on.
-#[derive(Debug, Default)]
-struct HangingDisk {
-    hangs: Mutex<bool>,
-    goes_on: Condvar,
-}
-
-impl HangingDisk {
-    fn hang(&self, hangs: bool) {
-        *self.hangs.lock().unwrap() = hangs;
-        self.goes_on.notify_all();
-    }
-}
-
-impl Disk for HangingDisk {
-    fn write(&self, file: &File, bytes: &[u8]) -> io::Result<usize> {
-        drop(self.goes_on.wait_while(self.hangs.lock().unwrap(), |hangs| *hangs).unwrap());
-        FileSystem.write(file, bytes)
-    }
-
-    fn free_bytes(&self, path: &Path) -> io::Result<u64> {
-        FileSystem.free_bytes(path)
-    }
-}
-
-/// Recording never waits: the disk hangs until more was recorded than the queue holds, and all of that by one thread.
-#[test]
-fn a_disk_that_hangs_holds_nobody_up() {
-    let temp = TempDir::new().unwrap();
-    let disk = Arc::new(HangingDisk::default());
-    let config = RecorderConfig {
-        disk: Arc::clone(&disk) as Arc<dyn Disk>,
-        flush_interval: Duration::from_millis(10),
-        ..config(temp.path())
-    };
-    let recorder = Recorder::start(config).unwrap();
-    recorder.record(rig_info());
-    disk.hang(true);
-    let mut taken = 1;
-    let mut seq = 0;
-    // Were it to wait, nobody would let the disk go on.
-    while recorder.record(point(seq, T0 + seq * 1000)) {
-        (taken, seq) = (taken + 1, seq + 1);
-        assert!(seq < 10_000_000, "the queue has no bound");
-    }
-    disk.hang(false);
-    let finished = recorder.finish(LIMIT).unwrap();
-    assert_eq!((finished.status.messages_written, finished.status.dropped_queue_full), (taken, 1));
-    assert!(sequence_numbers(&read(&finished.directory)).into_iter().eq(0..seq), "not those that were taken");
-}
-
 #[test]
 fn a_log_becomes_a_recording() {
     let temp = TempDir::new().unwrap();
@@ -511,7 +201,6 @@ fn a_log_becomes_a_recording() {
 
     fs::write(&log, "Zeit [s];Normalkraft [kN];Drehzahl [1/min];Reibwert\n0,00;0,5;120;0,35\n0,01;0,5;120;0,36\n")
         .unwrap();
-    fs::write(temp.path().join("session.mcap.importing.part"), "of an import that was killed").unwrap();
     let imported = import(&log, &output, &ImportOptions::default()).unwrap();
     assert_eq!(imported.messages, 2);
     let entries = read(&output);

@@ -92,12 +92,18 @@ fn asked_to_stop() -> std::io::Result<bool> {
 fn log(watch: &Watch, stopped: &AtomicBool) {
     let mut last: Option<(u8, Instant)> = None;
     let mut stopping = false;
+    let mut problem = None;
     // A last look after the end: a short session says something too.
     while !std::mem::replace(&mut stopping, stopped.load(Ordering::Relaxed)) {
         if !stopping {
             std::thread::sleep(EVERY);
         }
-        let Some(prediction) = watch.snapshot().prediction else { continue };
+        let snapshot = watch.snapshot();
+        if snapshot.recording_problem != problem {
+            problem = snapshot.recording_problem;
+            note!("{}", problem.as_deref().unwrap_or("recording again"));
+        }
+        let Some(prediction) = snapshot.prediction else { continue };
         let due = last.is_none_or(|(level, at)| level != prediction.level || at.elapsed() >= LOG_EVERY);
         if due {
             last = Some((prediction.level, Instant::now()));

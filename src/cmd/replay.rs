@@ -105,6 +105,12 @@ impl Options {
             Some(rig) => Rig::load(rig)?,
             None => recorded_rig(&recording)?,
         };
+        if let Some(split) = recording.session_metadata("split_index").filter(|&split| split != "0") {
+            note!(
+                "begins in the middle of a session (file {split}): reuse and the hysteresis of SQUEAL begin anew; give the \
+                 directory of all its files for the whole"
+            );
+        }
         let charts = if self.no_chart_cache { Charts::Anew } else { Charts::Kept };
         let started = Instant::now();
         let found = verify(&recording, &Arc::new(rig), charts)?;

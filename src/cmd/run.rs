@@ -13,7 +13,7 @@ use super::{Outcome, live, signals};
 use crate::display::server::Server;
 use crate::io::chart_file::ChartFile;
 use crate::io::heard::Heard;
-use crate::io::recorder::{Recorder, RecorderConfig};
+use crate::io::recorder::{Recorder, RecorderConfig, State};
 use crate::io::ros_args::RosArgs;
 use crate::io::ros2::process::{Ros2Process, Sinks};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
@@ -86,13 +86,12 @@ pub fn serve(
     if let Some(known) = &rig.reduction {
         note!("{}", known.told());
     }
-    // Before the recording begins, so that it is finished whenever the signal comes.
+    // Before the recording begins, so that it is finished whenever a signal comes.
     let stop = sender.clone();
     signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let mut initial = Settings::for_rig(rig);
     let addresses = options.display.addresses()?;
-    let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
-    let mut outputs = Outputs { recorder: recorder.as_ref().map(Recorder::handle), ..Default::default() };
+    let mut outputs = Outputs::default();
     let shortcut = Shortcut::new(sender.clone());
     if let Some(shm) = buses.shm() {
         outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
@@ -137,6 +136,9 @@ pub fn serve(
         outputs.ros2 = Some(started.context("ROS 2; --no-ros stays off it")?);
     }
 
+    // Last of what can fail: no start that fails leaves a recording.
+    let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
+    outputs.recorder = recorder.as_ref().map(Recorder::handle);
     let watch = Watch::default();
     let display = display::of_node(&addresses, rig, &watch, options.threshold);
     let shown = live::show(frame(rig, display.as_ref(), sender.clone()), watch.clone(), options.plain);
@@ -163,6 +165,9 @@ fn frame(rig: &Rig, display: Option<&Server>, node: Sender<Incoming>) -> live::F
         foot: Box::new(|snapshot| {
             let Counters { solved, charted, reused, faults, .. } = snapshot.counters;
             let passed_over = snapshot.passed_over;
+            if let Some(problem) = &snapshot.recording_problem {
+                return problem.clone();
+            }
             let falls = snapshot.ros2_falls;
             let ros2 = if falls == 0 { String::new() } else { format!("  ROS 2 started again {falls}") };
             format!(
@@ -195,25 +200,38 @@ fn start_recorder(rig: &Rig, directory: &std::path::Path) -> anyhow::Result<Reco
         rig_files: rig.files.clone(),
         ..RecorderConfig::new(directory)
     };
-    let recorder = Recorder::start(config)?;
-    note!("recording into {}", recorder.status().directory.display());
+    let recorder = Recorder::start_when_possible(config)?;
+    let status = recorder.status();
+    match &status.state {
+        State::Failed(why) => note!("not recording yet, tried again until it can be: {why}"),
+        State::Recording | State::Finished => note!("recording into {}", status.directory.display()),
+    }
     Ok(recorder)
 }
 
 fn finish(recorder: Recorder) -> anyhow::Result<Outcome> {
-    let finished = recorder.finish(FINISH_WITHIN)?;
-    let status = &finished.status;
+    let handle = recorder.handle();
+    let finished = recorder.finish(FINISH_WITHIN);
+    let status = handle.status();
     for recovered in &status.recovered {
         note!("recovered: {}", super::recover::describe(recovered));
     }
     for problem in &status.unrecovered {
         note!("not recovered: {problem}");
     }
-    note!("recorded {} messages into {}", status.messages_written, finished.directory.display());
-    if status.dropped() > 0 {
-        let why = status.last_error.as_deref().unwrap_or("the disk was too slow");
-        note!("{} messages were not recorded: {why}", status.dropped());
-        return Ok(Outcome::Differences);
+    for interrupted in &status.interrupted {
+        note!(
+            "{} was cut short by a failure: the next start in this directory repairs it, or squealcast recover",
+            interrupted.display()
+        );
     }
-    Ok(Outcome::Done)
+    let finished = finished?;
+    note!("recorded {} messages into {}", status.messages_written, finished.directory.display());
+    match status.why_dropped() {
+        Some(why) => {
+            note!("{} messages were not recorded: {why}", status.dropped());
+            Ok(Outcome::Differences)
+        }
+        None => Ok(Outcome::Done),
+    }
 }

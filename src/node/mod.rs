@@ -6,6 +6,8 @@
 
 mod mapper;
 mod outputs;
+#[cfg(test)]
+mod recorded_tests;
 mod sensitivity;
 mod shortcut;
 mod statistics;
@@ -275,7 +277,7 @@ impl Node {
         self.passing_over = self.inputs_waiting > 0 && (self.passing_over || too_many || age > LATEST);
         if self.passing_over {
             self.statistics.passed_over += 1;
-            self.outputs.record(heard.at.wall_ns, Payload::OperatingPoint(heard.message));
+            self.outputs.record(heard.at, Payload::OperatingPoint(heard.message));
             return;
         }
         let point = heard.message.point();
@@ -295,7 +297,7 @@ impl Node {
         let vibration = heard.message;
         if self.vibration_heard_before.is_new(heard.bus, vibration.header.stamp, vibration.frequency_hz.to_bits()) {
             self.watch.vibration(heard.at.wall_ns, &vibration);
-            self.outputs.record(heard.at.wall_ns, Payload::Vibration(vibration));
+            self.outputs.record(heard.at, Payload::Vibration(vibration));
         }
     }
 
@@ -410,7 +412,7 @@ impl Node {
                     self.outputs.prediction_to_shm(prediction);
                     if let Some(heard) = input {
                         self.watch.input(&heard.message);
-                        self.outputs.record(heard.at.wall_ns, Payload::OperatingPoint(heard.message));
+                        self.outputs.record(heard.at, Payload::OperatingPoint(heard.message));
                     }
                     self.outputs.prediction(prediction);
                     self.watch.prediction(prediction);
@@ -434,6 +436,7 @@ impl Node {
         let pending = self.mapper.pending();
         let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, &mut self.outputs);
         self.watch.counters(counters, self.statistics.passed_over, self.outputs.ros2_before.falls);
+        self.watch.recording_problem(self.outputs.recorder.as_ref().and_then(|recorder| recorder.status().problem()));
         self.outputs.diagnostics(array);
     }
 }

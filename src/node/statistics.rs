@@ -153,9 +153,11 @@ impl Statistics {
 fn recorder_status(rig: &Rig, outputs: &Outputs) -> Option<DiagnosticStatus> {
     let recorder = outputs.recorder.as_ref()?.status();
     let (level, message) = match &recorder.state {
-        State::Failed(why) => (diagnostic_level::ERROR, why.clone()),
-        _ if recorder.dropped() > 0 => (diagnostic_level::WARN, format!("{} messages dropped", recorder.dropped())),
-        _ => (diagnostic_level::OK, "recording".to_owned()),
+        State::Failed(why) => (diagnostic_level::ERROR, format!("not recording: {why}")),
+        State::Recording | State::Finished => match recorder.why_dropped() {
+            Some(why) => (diagnostic_level::WARN, format!("messages not recorded: {why}")),
+            None => (diagnostic_level::OK, "recording".to_owned()),
+        },
     };
     Some(DiagnosticStatus {
         level,

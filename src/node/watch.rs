@@ -23,6 +23,8 @@ pub struct Snapshot {
     pub passed_over: u64,
     /// How often the ROS 2 side fell and was started again.
     pub ros2_falls: u64,
+    /// Why not everything is recorded.
+    pub recording_problem: Option<String>,
 }
 
 /// Unstable modes kept of a [`Sample`].
@@ -193,6 +195,10 @@ impl Watch {
 
     pub(super) fn warn_margin(&self, warn_margin: f64) {
         self.with(|watched| watched.snapshot.warn_margin = Some(warn_margin));
+    }
+
+    pub(super) fn recording_problem(&self, problem: Option<String>) {
+        self.with(|watched| watched.snapshot.recording_problem = problem);
     }
 
     pub(super) fn counters(&self, counters: Counters, passed_over: u64, ros2_falls: u64) {

@@ -1,0 +1,192 @@
+//! A node with a recorder: what time brings, what is passed over, and what of it is in the recording.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::*;
+use crate::io::recorder::{QUEUE_MESSAGES, Recorder, RecorderConfig};
+use crate::io::recording::{Recorded, Recording};
+
+/// Longer than anything takes on any machine.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// A node on a thread of its own that records.
+struct Recorded9Dof {
+    sender: Sender<Incoming>,
+    watch: Watch,
+    node: std::thread::JoinHandle<Outputs>,
+    recorder: Recorder,
+    folder: tempfile::TempDir,
+}
+
+impl Recorded9Dof {
+    /// Starts with `waiting` in its queue.
+    fn start(change: impl FnOnce(&mut Settings), waiting: Vec<Incoming>) -> Self {
+        let folder = tempfile::tempdir().expect("a folder");
+        let recorder = Recorder::start(RecorderConfig::new(folder.path())).expect("a recorder");
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let mut settings = Settings::for_rig(&rig);
+        change(&mut settings);
+        let (sender, receiver) = channel();
+        waiting.into_iter().for_each(|incoming| sender.send(incoming).expect("room"));
+        let (watch, outputs) = (Watch::default(), Outputs { recorder: Some(recorder.handle()), ..Default::default() });
+        let node = Node::new(rig, settings, outputs, sender.clone(), watch.clone());
+        let node = std::thread::spawn(move || node.run(&receiver));
+        Self { sender, watch, node, recorder, folder }
+    }
+
+    fn send(&self, incoming: Incoming) {
+        self.sender.send(incoming).expect("it runs");
+    }
+
+    fn level(&self) -> Option<u8> {
+        self.watch.snapshot().prediction.map(|prediction| prediction.level)
+    }
+
+    /// Waits until something holds.
+    #[track_caller]
+    fn until(&self, what: &str, holds: impl Fn(&Self) -> bool) {
+        let began = Instant::now();
+        while !holds(self) {
+            assert!(began.elapsed() < PATIENCE, "waited for {what}: {:?}", self.watch.snapshot());
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Ends it; what it recorded, in order.
+    fn recorded(self) -> Vec<Payload> {
+        self.send(Incoming::Stop);
+        self.node.join().expect("it ended");
+        self.recorder.finish(PATIENCE).expect("finished");
+        read(self.folder.path())
+    }
+}
+
+fn read(folder: &Path) -> Vec<Payload> {
+    let session = std::fs::read_dir(folder).expect("the folder").next().expect("a session").expect("readable").path();
+    let recording = Recording::open(&session).expect("a recording");
+    let known = |recorded| if let Recorded::Known(payload) = recorded { Some(payload) } else { None };
+    recording.messages().filter_map(|entry| known(entry.message)).collect()
+}
+
+fn conditions(seq: u64) -> wire::OperatingPoint {
+    wire::OperatingPoint {
+        header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
+        seq,
+        normal_load_n: 500.0,
+        disc_speed_rad_s: 13.0,
+        friction_coefficient: 0.2 + 1e-6 * seq as f64,
+    }
+}
+
+fn heard_now(seq: u64) -> Incoming {
+    Incoming::Input(Heard::now(Bus::Shm, conditions(seq)))
+}
+
+fn inputs(recorded: &[Payload]) -> Vec<u64> {
+    recorded
+        .iter()
+        .filter_map(|p| if let Payload::OperatingPoint(input) = p { Some(input.seq) } else { None })
+        .collect()
+}
+
+fn predicted(recorded: &[Payload]) -> Vec<(u64, bool)> {
+    let fault = |level| level == wire::level::FAULT;
+    let of = |p: &Payload| if let Payload::Prediction(p) = p { Some((p.input_seq, fault(p.level))) } else { None };
+    recorded.iter().filter_map(of).collect()
+}
+
+#[test]
+fn silence_is_a_fault_once_and_the_next_input_ends_it() {
+    const TIMEOUT: Duration = Duration::from_millis(50);
+    let fault = |node: &Recorded9Dof| node.level() == Some(wire::level::FAULT);
+    let change = |settings: &mut Settings| settings.silence_timeout_s = TIMEOUT.as_secs_f64();
+    let node = Recorded9Dof::start(change, vec![heard_now(0)]);
+    node.until("a fault", fault);
+    // That nothing more comes of it cannot be waited for otherwise.
+    std::thread::sleep(6 * TIMEOUT);
+    node.send(heard_now(1));
+    node.until("a prediction", |node| !fault(node));
+    node.until("another fault", fault);
+    let recorded = node.recorded();
+    let silences =
+        recorded.iter().filter(|p| matches!(p, Payload::SessionEvent(event) if event.kind == event_kind::SILENCE));
+    assert_eq!(silences.count(), 2);
+    assert_eq!(predicted(&recorded), [(0, false), (0, true), (1, false), (1, true)]);
+}
+
+#[test]
+fn inputs_that_waited_too_long_are_passed_over_and_recorded() {
+    let began = Instant::now();
+    while clock::monotonic_ns() < 2 * LATEST.as_nanos() as u64 {
+        assert!(began.elapsed() < PATIENCE);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let aged = |seq, age: Duration| {
+        let mut heard = Heard::now(Bus::Shm, conditions(seq));
+        heard.at.monotonic_ns -= age.as_nanos() as u64;
+        Incoming::Input(heard)
+    };
+    let old = |seq| aged(seq, LATEST + LATEST / 10);
+    let node = Recorded9Dof::start(|_| (), vec![old(0), old(1), old(2)]);
+    node.until("the newest", |node| node.watch.snapshot().prediction.is_some_and(|p| p.input_seq == 2));
+    // A new one and one that waited but is the newest are predicted.
+    node.send(heard_now(3));
+    node.until("a new one", |node| node.watch.snapshot().prediction.is_some_and(|p| p.input_seq == 3));
+    node.send(old(4));
+    node.until("the newest again", |node| node.watch.snapshot().prediction.is_some_and(|p| p.input_seq == 4));
+    let recorded = node.recorded();
+    assert_eq!(inputs(&recorded), [0, 1, 2, 3, 4]);
+    assert_eq!(predicted(&recorded), [(2, false), (3, false), (4, false)]);
+}
+
+#[test]
+fn sensitivities_are_computed_once_a_second_at_most() {
+    let began = Instant::now();
+    let node = Recorded9Dof::start(|_| (), vec![]);
+    // Inputs for more than a second, so that there are two: every one of them could have had its own.
+    let mut seq = 0;
+    while began.elapsed() < SENSITIVITY_EVERY * 3 / 2 {
+        node.send(heard_now(seq));
+        seq += 1;
+        node.until("the answer", |node| node.watch.snapshot().prediction.is_some_and(|p| p.input_seq == seq - 1));
+    }
+    let recorded = node.recorded();
+    let sensitivities = recorded.iter().filter(|p| matches!(p, Payload::Sensitivity(_))).count() as u32;
+    let most = began.elapsed().as_millis() / SENSITIVITY_EVERY.as_millis() + 1;
+    assert!((1..=most).contains(&sensitivities.into()), "{sensitivities} in {:?}, {seq} inputs", began.elapsed());
+}
+
+/// Logged at the time that passes, published at the time that the wall clock showed, which was set back and forth.
+#[test]
+fn a_clock_that_is_set_does_not_bend_a_recording() {
+    const SECOND: i64 = 1_000_000_000;
+    let folder = tempfile::tempdir().expect("a folder");
+    let recorder = Recorder::start(RecorderConfig::new(folder.path())).expect("a recorder");
+    let outputs = Outputs { recorder: Some(recorder.handle()), ..Default::default() };
+    let start = clock::Reading::now();
+    let steps = [0, -7200 * SECOND, -7200 * SECOND, 7200 * SECOND, 0];
+    for (k, step) in (0..).zip(steps) {
+        let wall_ns = start.wall_ns + step + k * SECOND;
+        let at = clock::Reading { wall_ns, monotonic_ns: start.monotonic_ns + k as u64 * SECOND as u64 };
+        outputs.record(at, Payload::OperatingPoint(conditions(k as u64)));
+    }
+    let finished = recorder.finish(PATIENCE).expect("finished");
+    assert_eq!(finished.files.len(), 1, "a step of two hours is no reason for another file");
+    let recording = Recording::open(&finished.directory).expect("a recording");
+    let entries: Vec<_> = recording.messages().collect();
+    for (k, entry) in entries.iter().enumerate() {
+        assert_eq!(entry.log_time_ns - entries[0].log_time_ns, k as u64 * SECOND as u64);
+        assert_eq!(entry.publish_time_ns as i64, start.wall_ns + steps[k] + k as i64 * SECOND);
+    }
+    assert_eq!(entries.len(), steps.len());
+}
+
+/// After a stop shared memory and ROS 2 hand over what they kept at once, and each input is recorded with its answer.
+#[test]
+fn the_recorder_has_room_for_what_the_buses_keep_twice_over() {
+    use crate::wire::shm::{Form, OperatingPointForm};
+    let kept = 2 * OperatingPointForm::WAITING_SAMPLES;
+    assert!(QUEUE_MESSAGES >= 2 * 2 * kept, "{QUEUE_MESSAGES} for {kept} inputs");
+}
