@@ -7,6 +7,7 @@ use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Stdio};
 use std::sync::{Arc, mpsc};
+use std::time::{Duration, Instant};
 
 use program::{PATIENCE, command, folder, launch, run, text, write};
 use squealcast::io::heard::Heard;
@@ -127,6 +128,15 @@ fn a_log_is_predicted_in_its_own_time() {
     run(["replay", "--verify", &text(&from_log)])
         .exits(0)
         .says("4 inputs, 4 of them predicted; 5 predictions identical");
+    // Two files of one folder that nothing declares to be one recording are two.
+    let logs = folder.path().join("logs");
+    std::fs::create_dir(&logs).expect("a folder");
+    for name in ["monday.mcap", "tuesday.mcap"] {
+        run(["import", &log, "-o", &text(&logs.join(name))]).exits(0);
+    }
+    let both = run(["predict-log", &text(&logs), "--rig", "nine-dof-case-2", "-o", &text(&folder.path().join("d"))]);
+    let both = both.exits(0).complains("monday.mcap: 4 operating points").complains("tuesday.mcap: 4 operating points");
+    assert_eq!(both.stdout.lines().count(), 2, "{}", both.stdout);
     let charted = predicted(&out, &folder.path().join("c"), &["--chart"]);
     let verified = run(["replay", "--verify", "--no-chart-cache", &text(&charted)]).exits(0);
     verified.says("4 inputs, 4 of them predicted; 5 predictions identical");
@@ -365,8 +375,8 @@ fn the_committed_recordings_verify() {
         assert_eq!(recording.session_metadata("rig_content_hash"), Some(rig.content_hash.as_str()), "{path:?}");
         let found = verify(&recording, &rig, Charts::Anew).expect("verified");
         assert!(found.predicted >= 200 && found.missing + found.extra == 0, "{path:?}: {found:?}");
-        // Near the merging point a root has half the digits: √(2.2e-16) relative, some times over; 4000 1/s times as much.
-        assert!(found.frequency_difference < 1e-7 && found.growth_rate_difference_per_s < 1e-3, "{path:?}: {found:?}");
+        // Near the merging point a root has half the digits: √ε = 1.5e-8 of its frequency, at most 6 rad/s, some times over.
+        assert!(found.frequency_difference < 1e-7 && found.growth_rate_difference_per_s < 1e-6, "{path:?}: {found:?}");
         eprintln!("{}: {} of {} identical", path.display(), found.identical, found.predicted);
     }
     assert_eq!(count, 2);
@@ -455,6 +465,12 @@ fn a_replay_over_ros_waits_for_a_node() {
     let domain = (180 + std::process::id() % 10).to_string();
     let bus = ["--no-shm", "--loopback", "--domain", &domain];
     let mut playing = Playing::start(&[&["replay", &path, "--plain", "--wait", "120"], &bus[..]].concat());
+    // Its own two nodes know each other long before, and are not what it waits for.
+    let begun = Instant::now();
+    while begun.elapsed() < Duration::from_secs(3) {
+        assert!(playing.0.try_wait().expect("asked").is_none(), "it did not wait");
+        std::thread::sleep(Duration::from_millis(50));
+    }
     let out = text(&folder.path().join("recorded"));
     let node = ["run", "nine-dof", "--no-display", "--plain", "--no-chart", "--record", &out];
     let node = program::Running::start(command(node.iter().chain(&bus)));

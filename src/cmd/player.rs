@@ -63,12 +63,12 @@ impl Player {
             Topic::Sensitivity => shm.sensitivities.readers(),
             Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0, // no shared-memory form
         });
+        // Rig and node hear each other here: one reader of what they hear is their own.
         let ros2 = self.ros2.as_ref().map_or(0, |(rig, node)| match topic {
-            Topic::OperatingPoint => rig.readers(),
-            Topic::Vibration => rig.vibration_readers(),
-            Topic::Prediction | Topic::Sensitivity | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => {
-                node.readers(topic)
-            }
+            Topic::OperatingPoint => rig.readers().saturating_sub(1),
+            Topic::Vibration => rig.vibration_readers().saturating_sub(1),
+            Topic::Prediction => node.readers(topic).saturating_sub(1),
+            Topic::Sensitivity | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => node.readers(topic),
         });
         shm + ros2
     }
