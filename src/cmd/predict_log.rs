@@ -18,7 +18,7 @@ use crate::rig::Rig;
 use crate::wire::schema::Topic;
 
 /// Predict recorded conditions as fast as possible: bags with operating points, and tribometers' logs. Each becomes a
-/// recording with predictions, in its own time
+/// recording with predictions by the rig's own settings, in its own time
 #[derive(Debug, Args)]
 pub struct Options {
     #[command(flatten)]
