@@ -7,7 +7,7 @@
 //!
 //! | file | ceiling | memory of its reader, at most |
 //! |---|---|---|
-//! | rig file, full model, profile (TOML) | [`TOML`] | about 200 times the file; 80 levels of nesting |
+//! | rig file, full model, profile (TOML) | [`TOML`] | about 100 times the file; 80 levels of nesting |
 //! | ROS parameter file (YAML) | [`PARAMETERS`] | 64 levels of nesting, no aliases |
 //! | modes and residuals of a rig (`.npz`) | [`RIG_PART`] | its arrays: 64 MiB or 100 times the file, whichever is more, and 1 GiB |
 //! | modes of a rig (`.unv`, `.uff`) | [`RIG_PART`] | about 10 times the file; lines of 64 KiB |
