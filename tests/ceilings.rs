@@ -94,6 +94,9 @@ fn archives_that_unpack_to_far_more_than_they_are_are_refused() {
     let zeros = archive(&[("omega_rad_s", "9437184,", 72 << 20)]);
     assert!(zeros.len() < 200_000);
     check(zeros, "with which the archive unpacks to 75497472 bytes; expected at most 67108864 bytes");
+    // Modes for a model of 20000 x 20000, which would be 3.2 GB each of its matrices.
+    let modes = [("omega_rad_s", "20000,", 160_000), ("nodes_m", "1, 3", 24), ("phi", "1, 3, 20000", 480_000)];
+    check(archive(&modes), "`modes` is 20000 in number, expected at most 3000");
     // A shape is checked against the other arrays before its values are unpacked.
     let phi = [("omega_rad_s", "1,", 8), ("nodes_m", "1, 3", 24), ("phi", "4096, 3, 4096", 64)];
     check(
@@ -108,6 +111,26 @@ fn archives_that_unpack_to_far_more_than_they_are_are_refused() {
         ("mass_share", "2048, 2048", 8 * 2048 * 2048),
     ];
     check(archive(&many), "`mass_share` has shape (2048, 2048), with which the archive unpacks to 67158");
+}
+
+/// A matrix of 40 bytes that is referred to often enough to take days.
+#[test]
+fn systems_of_too_many_matrices_are_refused() {
+    let folder = folder();
+    write(folder.path(), "M.mtx", "%%MatrixMarket matrix array real general\n1 1\n1\n");
+    let term = "[[system.stiffness]]\nmatrix = \"M.mtx\"\n";
+    let system = format!("name = \"x\"\n[system]\nmass = \"M.mtx\"\n{}", term.repeat(20_000));
+    let system = write(folder.path(), "rig.toml", &system);
+    refused(["check", &system], "`system.stiffness` is 20000 in number, expected at most 100");
+    refused(["full", &system, "--mu", "0.4"], "`system.stiffness` is 20000 in number, expected at most 100");
+    let patch = MODAL.split_once("[[contact_patch]]").expect("a patch").1;
+    let patches = format!("{}{}", MODAL, format!("[[contact_patch]]{patch}").repeat(5_000));
+    let one = archive(&[("omega_rad_s", "1,", 8), ("nodes_m", "1, 3", 24), ("phi", "1, 3, 1", 24)]);
+    std::fs::write(folder.path().join("pad.npz"), one).expect("the archive");
+    refused(
+        ["check", &write(folder.path(), "rig.toml", &patches)],
+        "`contact_patch` is 5001 in number, expected at most 100",
+    );
 }
 
 #[test]

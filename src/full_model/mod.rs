@@ -347,6 +347,7 @@ fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Resul
         let (field, limit) = ("system.stiffness".to_owned(), "at least one [[system.stiffness]]".to_owned());
         return Err(RigError::MissingKey { file, field, limit });
     }
+    system::check_terms(&file, raw)?;
     let mass = part::symmetric(files, "system.mass", &raw.mass, true)?;
     let n = mass.nrows();
     let mut contents = vec![

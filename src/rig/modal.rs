@@ -7,7 +7,7 @@ use super::modal_data::{ModalData, Residual};
 use super::patch::{self, Pair};
 use super::raw::{RawPatch, RawResidual, RawRig, RawSubstructure};
 use super::residual::{self, SideResidual};
-use super::settings::{Settings, spread};
+use super::settings::{MOST_COORDINATES, Settings, at_most, spread};
 use super::source::Source;
 use super::{Built, RigError, basis, npz};
 use crate::physics::{ContactPairs, ResidualFlexibility};
@@ -36,6 +36,8 @@ pub(super) fn build(
     let pad = part(source, "pad", pad)?;
     let disc = disc.map(|disc| part(source, "disc", disc)).transpose()?;
     let file = source.rig_file.clone();
+    let modes = pad.selected.len() + disc.as_ref().map_or(0, |disc| disc.selected.len());
+    at_most(&file, "modes", modes, MOST_COORDINATES)?;
     let patch::Contacts { pairs, stiffness_n_per_m, damping_n_s_per_m } =
         patch::contacts(&file, patches, &pad.data.nodes_m, disc.as_ref().map(|disc| &*disc.data.nodes_m))?;
     let values = [stiffness_n_per_m, damping_n_s_per_m];

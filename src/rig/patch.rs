@@ -14,7 +14,7 @@
 use super::RigError;
 use super::interpolation::{Interpolation, Plane};
 use super::raw::RawPatch;
-use super::settings::{spread, within};
+use super::settings::{MOST_TERMS, at_most, spread, within};
 
 /// Nodes closer than this times the size of the patch coincide.
 const COINCIDENT: f64 = 1e-6;
@@ -73,6 +73,7 @@ pub fn contacts(
     disc_m: Option<&[[f64; 3]]>,
 ) -> Result<Contacts, RigError> {
     let mut contacts = Contacts { pairs: vec![], stiffness_n_per_m: vec![], damping_n_s_per_m: vec![] };
+    at_most(file, "contact_patch", patches.len(), MOST_TERMS)?;
     for (index, raw) in patches.iter().enumerate() {
         let found = pairs(file, index, raw, pad_m, disc_m)?;
         for (key, values, all) in [

@@ -5,6 +5,11 @@ use super::{ChartRange, Limits, RigError, Warning};
 use crate::physics::{ContactLaw, OperatingPoint};
 use crate::reduction::ModeSelection;
 
+/// Most coordinates of a model: a prediction that is not on the chart is a dense solve of matrices of so many rows.
+pub const MOST_COORDINATES: usize = 3000;
+/// Most matrices of a system, and most contact patches: each refers to files, which a short line can do many times.
+pub const MOST_TERMS: usize = 100;
+
 /// The common tables, checked.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -48,6 +53,15 @@ pub fn within(file: &str, field: &str, value: f64, holds: bool, limit: &str) -> 
         return Ok(value);
     }
     Err(RigError::Range { file: file.into(), field: field.into(), value: value.to_string(), limit: limit.into() })
+}
+
+/// That there are at most `limit`.
+pub fn at_most(file: &str, field: &str, count: usize, limit: usize) -> Result<(), RigError> {
+    if count <= limit {
+        return Ok(());
+    }
+    let (value, limit) = (format!("{count} in number"), format!("at most {limit}"));
+    Err(RigError::Range { file: file.into(), field: field.into(), value, limit })
 }
 
 /// Checks the common tables.

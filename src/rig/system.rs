@@ -3,16 +3,13 @@
 use faer::Mat;
 
 use super::raw::{RawSystem, RawTerm};
-use super::settings::Settings;
+use super::settings::{MOST_COORDINATES, MOST_TERMS, Settings, at_most};
 use super::source::Source;
 use super::{Built, RigError, matrix_market, scale};
 use crate::physics::{Law, Model, OperatingPoint, Term};
 use crate::reduction::{
     ReductionError, SparseMatrix, is_symmetric, lowest_modes, project_sparse, weighted_sum, whiten,
 };
-
-/// Systems of more degrees of freedom than this are only taken with `modes = k`: every prediction is a dense solve.
-const MOST_WITHOUT_MODES: usize = 3000;
 
 /// A term as it was read.
 struct ReadTerm {
@@ -39,6 +36,8 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
         let (field, limit) = ("system.stiffness".to_owned(), "at least one [[system.stiffness]]".to_owned());
         return Err(RigError::MissingKey { file, field, limit });
     }
+    check_terms(&file, raw)?;
+    at_most(&file, "system.modes", raw.modes.unwrap_or(0), MOST_COORDINATES)?;
     let listed = matrix_market::read(&raw.mass, source.read("system.mass", &raw.mass)?)?;
     let n = listed.rows;
     if listed.columns != n || n == 0 {
@@ -80,9 +79,9 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
             (count, Box::new(move |term| project_sparse(&term.matrix, phi.as_ref(), term.symmetric)))
         }
         None => {
-            if n > MOST_WITHOUT_MODES {
+            if n > MOST_COORDINATES {
                 let value = format!("not given for {n} degrees of freedom");
-                let limit = format!("modes = k above {MOST_WITHOUT_MODES} degrees of freedom");
+                let limit = format!("modes = k above {MOST_COORDINATES} degrees of freedom");
                 return Err(RigError::Range { file, field: "system.modes".to_owned(), value, limit });
             }
             let whitening = whiten("system.mass", mass.to_dense().as_ref()).map_err(in_mass_file)?;
@@ -105,6 +104,15 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
     contents.extend(stiffness.iter().map(|term| format!("stiffness  {}", term.told)));
     contents.extend(damping.iter().map(|term| format!("damping    {}", term.told)));
     Ok(Built { model, contact: None, contents, shapes: vec![], band_max_hz: settings.band_max_hz })
+}
+
+/// That a system has no more terms than can be worked with.
+///
+/// # Errors
+/// [`RigError::Range`].
+pub(crate) fn check_terms(file: &str, raw: &RawSystem) -> Result<(), RigError> {
+    at_most(file, "system.stiffness", raw.stiffness.len(), MOST_TERMS)?;
+    at_most(file, "system.damping", raw.damping.len(), MOST_TERMS)
 }
 
 /// Reads `[[system.stiffness]]` or `[[system.damping]]`.
