@@ -13,7 +13,7 @@ use crate::physics::{
     ContactState, Ends, MapOptions, Mode, Model, OperatingPoint, SolveError, Solver, Spectrum, StabilityMap, Summary,
     Traces, Vectors,
 };
-use crate::rig::{Limits, Rig};
+use crate::rig::Rig;
 use crate::settings::{SettingError, Settings};
 use crate::wire::{self, Header, MAX_MODES, Prediction, Time, level};
 
@@ -212,7 +212,7 @@ impl Session {
 
     /// Whether the prediction for `point`, if it came next, would have no margin for want of a stability map.
     pub fn lacks_map(&self, point: &OperatingPoint) -> bool {
-        check_limits(point, &self.rig.limits).is_ok()
+        self.rig.limits.check(point).is_ok()
             && self.rig.model.contact_state(point) == ContactState::Sliding
             && !self.reuses(point)
             && self.map_at(point).is_none()
@@ -227,7 +227,7 @@ impl Session {
     /// Whether the prediction for `point`, if it came next, would be solved.
     pub fn would_solve(&self, point: &OperatingPoint) -> bool {
         let at_hand = self.beforehand.iter().any(|spectrum| same(&spectrum.point, point));
-        !at_hand && !self.answers_at_once(point) && check_limits(point, &self.rig.limits).is_ok()
+        !at_hand && !self.answers_at_once(point) && self.rig.limits.check(point).is_ok()
     }
 
     /// Which of `points` would be solved if they came one after another.
@@ -289,7 +289,7 @@ impl Session {
             self.fault(header, seq, format_args!("stamp runs backward by {back:.6} s"));
             return None;
         }
-        if let Err(reason) = check_limits(&point, &self.rig.limits) {
+        if let Err(reason) = self.rig.limits.check(&point) {
             self.fault(header, seq, format_args!("{reason}"));
             return None;
         }
@@ -509,23 +509,6 @@ fn within_dead_band(from: &OperatingPoint, to: &OperatingPoint, settings: &Setti
 fn same(a: &OperatingPoint, b: &OperatingPoint) -> bool {
     let bits = |p: &OperatingPoint| [p.normal_load_n, p.disc_speed_rad_s, p.friction_coefficient].map(f64::to_bits);
     bits(a) == bits(b)
-}
-
-fn check_limits(point: &OperatingPoint, limits: &Limits) -> Result<(), String> {
-    let checks = [
-        ("normal_load_n", point.normal_load_n, limits.normal_load_n),
-        ("disc_speed_rad_s", point.disc_speed_rad_s, limits.disc_speed_rad_s),
-        ("friction_coefficient", point.friction_coefficient, limits.friction_coefficient),
-    ];
-    for (name, value, [low, high]) in checks {
-        if !value.is_finite() {
-            return Err(format!("{name} is {value}, expected a finite number"));
-        }
-        if !(low..=high).contains(&value) {
-            return Err(format!("{name} is {value}, expected {low} to {high}"));
-        }
-    }
-    Ok(())
 }
 
 /// The modes as published: ascending frequency, and above [`MAX_MODES`] those with the largest growth rates. `order` is

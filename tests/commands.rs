@@ -95,8 +95,8 @@ fn conditions_default_to_the_reference_of_the_rig() {
     assert_eq!(prediction["modes"][0]["pad_participation"], Value::Null);
     // √((2π)²)/2π: two roundings.
     assert!((number(&prediction["modes"][0], "frequency_hz") - 1.0).abs() < 4.0 * f64::EPSILON);
-    let given = json(["predict", &rig, "--json", "--mu", "-0.5", "--load", "3", "--speed", "-1e3"]);
-    assert_eq!(conditions(&given), [3.0, -1e3, -0.5]);
+    let given = json(["predict", &rig, "--json", "--mu", "0.5", "--load", "3", "--speed", "-1e3"]);
+    assert_eq!(conditions(&given), [3.0, -1e3, 0.5]);
     // Without [reference]: the conditions of the paper's test.
     assert_eq!(conditions(&json(["predict", "nine-dof", "--json"])), [500.0, 13.0, 0.35]);
 }
@@ -330,11 +330,14 @@ type Sweep = Vec<(f64, BTreeMap<u32, c64>)>;
 
 fn read_sweep(csv: &str) -> Sweep {
     let mut lines = csv.lines();
-    assert_eq!(lines.next(), Some("friction_coefficient,mode_id,frequency_hz,growth_rate_per_s,damping_ratio"));
+    let header =
+        "normal_load_n,disc_speed_rad_s,friction_coefficient,mode_id,frequency_hz,growth_rate_per_s,damping_ratio";
+    assert_eq!(lines.next(), Some(header));
     let mut sweep: Sweep = vec![];
     for line in lines {
         let cells: Vec<f64> = line.split(',').map(|cell| cell.parse().expect(line)).collect();
-        let &[mu, id, hz, growth, damping] = cells.as_slice() else { panic!("five cells: {line}") };
+        let &[load, speed, mu, id, hz, growth, damping] = cells.as_slice() else { panic!("seven cells: {line}") };
+        assert_eq!((load, speed), (500.0, 13.0), "the reference of the rig");
         if sweep.last().is_none_or(|(last, _)| *last != mu) {
             sweep.push((mu, BTreeMap::new()));
         }
@@ -500,6 +503,7 @@ fn a_sweep_prints_csv_or_writes_what_it_is_asked_for() {
     let svg = text(&folder.path().join("only.svg"));
     let drawn = run(["sweep", "nine-dof", "--mu", "-1:1:0.1", "--svg", &svg]).exits(0);
     assert_eq!(drawn.stdout, "", "a figure was asked for, no table");
+    drawn.complains("only.svg: 1 window of instability");
     well_formed(&std::fs::read_to_string(&svg).expect("the SVG file"));
     assert_eq!(files_below(folder.path()).len(), 1, "nothing left beside it");
     run(["sweep", "nine-dof", "--csv", "/nowhere/at/all.csv"]).exits(1).complains("/nowhere/at/");

@@ -126,6 +126,8 @@ fn the_paper_s_tables_on_a_small_tribometer() {
         assert!(drawn.contains("<svg") && drawn.contains(axis), "{figure}");
     }
     let page = std::fs::read_to_string(out.join("index.html")).unwrap();
+    let linked: Vec<&str> = page.split("href=\"#").skip(1).filter_map(|rest| rest.split('"').next()).collect();
+    assert!(linked.len() > 8 && linked.iter().all(|name| page.contains(&format!("id=\"{name}\""))), "{linked:?}");
     for told in
         ["Table 1", "Table 3", "Table 4", "Figure 13", "Figure 14", "Figure 15", "492 Hz", "1705 Hz", "331.44", "12510"]
     {

@@ -214,6 +214,13 @@ fn bad_files_of_kind_2() {
         RigError::Range { .. },
         "x.toml: `contact_patch[0].normal` is [0, 0, 0], expected a direction"
     );
+    // The direction of a rim brake: the disc's axis is [0, 0, 1].
+    told!(
+        modal("\nnormal = [0.0, 0.0, 1.0]", "\nnormal = [1.0, 0.0, 0.1]", &side(PAD)),
+        RigError::Range { .. },
+        "x.toml: `contact_patch[0].normal` is [1.0, 0.0, 0.1], 84 degrees off the axis, expected at most 60 degrees: \
+         the pad presses along the axis of the disc"
+    );
     told!(
         modal("normal =", "pad_nodes = [0, 2]\nnormal =", &side(PAD)),
         RigError::Range { .. },

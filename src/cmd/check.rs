@@ -1,6 +1,6 @@
 use clap::Args;
 
-use super::{Outcome, print};
+use super::{Outcome, RigName, print};
 use crate::full_model::FullModelFile;
 use crate::rig::{Rig, RigError};
 
@@ -8,6 +8,7 @@ use crate::rig::{Rig, RigError};
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, full model, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
 }
 

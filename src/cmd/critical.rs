@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{LoadAndSpeed, Outcome, format, not_negative, print, write_file};
+use super::{LoadAndSpeed, Outcome, RigName, format, not_negative, print, write_file};
 use crate::display::curves::Curves;
 use crate::physics::{MapOptions, Solver, StabilityMap, Window};
 use crate::plot;
@@ -14,6 +14,7 @@ use crate::session::map_options;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
     /// Search friction coefficients from 0 to this [default: the rig's mu_max]
     #[arg(long, value_name = "MU", value_parser = not_negative)]
@@ -62,7 +63,7 @@ impl<'a> From<&'a Window> for WindowReport<'a> {
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
-        let point = self.load_and_speed.point(&rig);
+        let point = self.load_and_speed.point(&rig)?;
         let mu_max = self.mu_max.unwrap_or(rig.mu_max);
         let options = MapOptions { mu_max, ..map_options(&rig) };
         let mut solver = Solver::new(rig.model.dimension());

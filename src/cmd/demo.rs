@@ -14,11 +14,12 @@ use crate::node::{self, Incoming};
 use crate::rig::{EMBEDDED, Rig};
 use crate::simulator::{Profile, Simulator};
 
-/// Run the node with a simulated rig: what to try first. It hears nobody else, and announces itself on this machine only
+/// Run the node with a simulated rig: what to try first. It takes no other inputs and is visible on this machine only
 #[derive(Debug, Args)]
+#[command(after_help = super::ROS_ARGS_HELP)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
-    #[arg(default_value = EMBEDDED[0].name)]
+    #[arg(default_value = EMBEDDED[0].name, value_parser = super::RigName, hide_possible_values = true)]
     rig: String,
     /// Measurements per second
     #[arg(long, value_name = "HZ", value_parser = rate_hz, default_value = "100")]

@@ -81,6 +81,11 @@ pub fn windows(rig: &Rig, map: &StabilityMap, mu_max: f64) -> String {
     text
 }
 
+/// `1 root`, `2 roots`.
+pub fn count(number: usize, noun: &str) -> String {
+    format!("{number} {noun}{}", if number == 1 { "" } else { "s" })
+}
+
 /// A number with `digits` significant digits, plain where that is readable.
 pub fn significant(value: f64, digits: usize) -> String {
     if value == 0.0 {

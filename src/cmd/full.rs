@@ -4,9 +4,10 @@ use anyhow::Context;
 use clap::Args;
 use serde::Serialize;
 
+use super::format::{self, significant};
 use super::memory::{room, solver};
-use super::steps::Steps;
-use super::{Outcome, finite, positive, print};
+use super::steps::ProgressOptions;
+use super::{Conditions, Outcome, positive, print};
 use crate::certificate::DEFAULT_BAND_HZ;
 use crate::full_model::FullModelFile;
 use crate::physics::OperatingPoint;
@@ -19,15 +20,8 @@ use crate::reduction::{FullSpectrum, FullVectors};
 pub struct Options {
     /// Full model (TOML)
     full: PathBuf,
-    /// Friction coefficient [default: the model's reference]
-    #[arg(long, value_name = "MU", value_parser = finite, allow_negative_numbers = true)]
-    mu: Option<f64>,
-    /// Normal load in N [default: the model's reference]
-    #[arg(long, value_name = "N", value_parser = finite, allow_negative_numbers = true)]
-    load: Option<f64>,
-    /// Disc speed in rad/s; negative turns the other way [default: the model's reference]
-    #[arg(long, value_name = "RAD_S", value_parser = finite, allow_negative_numbers = true)]
-    speed: Option<f64>,
+    #[command(flatten)]
+    conditions: Conditions,
     /// Highest frequency in Hz [default: the model's band, else 5000]
     #[arg(long, value_name = "HZ", value_parser = positive)]
     band_hz: Option<f64>,
@@ -37,7 +31,12 @@ pub struct Options {
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    progress: ProgressOptions,
 }
+
+/// Relative to the size of a root, what rounding leaves of its growth rate.
+const ROUNDING: f64 = 1e-12;
 
 /// What `full --json` prints.
 #[derive(Serialize)]
@@ -73,16 +72,12 @@ struct RootReport {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let mut steps = Steps::new(1);
+        let mut steps = self.progress.steps(1);
         let full = FullModelFile::load(&self.full)?;
         full.refuse_modal_damping()?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
-        let reference = full.settings.reference;
-        let p = OperatingPoint {
-            normal_load_n: self.load.unwrap_or(reference.normal_load_n),
-            disc_speed_rad_s: self.speed.unwrap_or(reference.disc_speed_rad_s),
-            friction_coefficient: self.mu.unwrap_or(reference.friction_coefficient),
-        };
+        let settings = &full.settings;
+        let p = self.conditions.point(&full.name, &settings.reference, &settings.limits)?;
         let band_hz = self.band_hz.or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
         let room = room(self.memory_gib, &self.full)?;
         let mut said = |step| steps.full("full model", step);
@@ -145,11 +140,13 @@ fn table(full: &FullModelFile, p: &OperatingPoint, band_hz: f64, found: &FullSpe
     for root in &found.roots {
         let lambda = root.lambda;
         let mark = if lambda.re > full.settings.instability_threshold * lambda.norm() { "  unstable" } else { "" };
+        // A growth rate below the rounding of its root is shown as 0.
+        let growth = if lambda.re.abs() < ROUNDING * lambda.norm() { 0.0 } else { lambda.re };
         text += &format!(
-            "{:>12.4}  {:>14.6}  {:>13.3e}  {:>8.1e}{mark}\n",
+            "{:>12.4}  {:>14}  {:>13}  {:>8.1e}{mark}\n",
             lambda.im / std::f64::consts::TAU,
-            lambda.re,
-            -lambda.re / lambda.norm(),
+            significant(growth, 6),
+            significant(0.0 - growth / lambda.norm(), 4),
             root.residual
         );
     }
@@ -157,11 +154,12 @@ fn table(full: &FullModelFile, p: &OperatingPoint, band_hz: f64, found: &FullSpe
     text += &if growth.is_finite() {
         let discs = found.discs.len();
         format!(
-            "\n{} roots; covered: 0 to {band_hz} Hz, growth rates from -{growth:.0} to {growth:.0} 1/s, by {discs} discs\n",
-            found.roots.len()
+            "\n{}; covered: 0 to {band_hz} Hz, growth rates from -{growth:.0} to {growth:.0} 1/s, by {}\n",
+            format::count(found.roots.len(), "root"),
+            format::count(discs, "disc")
         )
     } else {
-        format!("\n{} roots: all up to {band_hz} Hz\n", found.roots.len())
+        format!("\n{}: all up to {band_hz} Hz\n", format::count(found.roots.len(), "root"))
     };
     text
 }

@@ -4,7 +4,7 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 
-use super::{Outcome, positive, print, write_file};
+use super::{Outcome, RigName, positive, print, write_file};
 use crate::input_file;
 use crate::io::tribometer_log::decode_text;
 use crate::physics::identification::{IdentificationError, Identified, identify};
@@ -19,6 +19,7 @@ const WELL_DETERMINED: f64 = 2.0;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
     /// CSV file with a column `frequency_hz`: the natural frequencies of the rig at rest
     #[arg(long, value_name = "FREQ.csv")]
@@ -152,7 +153,7 @@ fn poorly(found: &Identified) -> String {
              moves more are needed",
             to / from
         ),
-        _ => "\npoorly determined: the frequencies do not bound the stiffness; such that the contact moves more are needed"
+        _ => "\npoorly determined: the frequencies do not bound the stiffness; frequencies that the contact moves more are needed"
             .to_owned(),
     }
 }

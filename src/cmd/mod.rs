@@ -23,6 +23,7 @@ mod reduce;
 mod replay;
 mod report;
 mod reproduce;
+mod rigs;
 mod ros2_side;
 mod run;
 mod signals;
@@ -36,17 +37,35 @@ mod view;
 use std::io::Write;
 use std::process::ExitCode;
 
+use anyhow::Context;
+use clap::builder::{PossibleValue, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 
 use crate::io::ros_args::RosArgs;
 use crate::io::whole_file::write_whole;
 use crate::physics::OperatingPoint;
-use crate::rig::Rig;
+use crate::rig::{EMBEDDED, Limits, Rig};
 use crate::terminal::printable;
+
+/// Shown below the help of commands that join ROS 2.
+const ROS_ARGS_HELP: &str = "\
+ROS 2 arguments follow --ros-args:
+  -r, --remap FROM:=TO         Remap a topic, the node (__node) or its namespace (__ns)
+  -p, --param NAME:=VALUE      Set a parameter
+      --params-file FILE       Read parameters from a YAML file
+      --log-level LEVEL        Set the level of the log";
+
+const EXAMPLES: &str = "\
+Examples:
+  squealcast demo                                       a simulated session, with a page and a table
+  squealcast rigs                                       the embedded rigs
+  squealcast critical tribometer                        where it becomes unstable
+  squealcast predict nine-dof-case-2 --mu 0.4           its modes at one operating point
+  squealcast run my-rig.toml --record sessions          the node beside the rig";
 
 /// Predicts friction-induced vibration of a pad-on-disc tribometer, live, from its operating conditions.
 #[derive(Debug, Parser)]
-#[command(name = "squealcast", version, max_term_width = 100)]
+#[command(name = "squealcast", version, propagate_version = true, max_term_width = 100, after_help = EXAMPLES)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -66,6 +85,7 @@ enum Command {
     Import(import::Options),
     PredictLog(predict_log::Options),
     Recover(recover::Options),
+    Rigs(rigs::Options),
     Check(check::Options),
     Identify(identify::Options),
     Bench(bench::Options),
@@ -114,6 +134,7 @@ pub fn main() -> ExitCode {
         Command::Predict(options) => options.run(),
         Command::Sweep(options) => options.run(),
         Command::Critical(options) => options.run(),
+        Command::Rigs(options) => options.run(),
         Command::Check(options) => options.run(),
         Command::Identify(options) => options.run(),
         Command::Bench(options) => options.run(),
@@ -147,10 +168,10 @@ fn failure(error: &anyhow::Error) -> String {
     text
 }
 
-/// Where on the rig's map: each value by option, else the rig's reference.
+/// The operating point: each condition by option, else the reference of the rig or full model.
 #[derive(Clone, Copy, Debug, Args)]
 struct Conditions {
-    /// Friction coefficient [default: the rig's reference]
+    /// Friction coefficient [default: the reference of RIG]
     #[arg(long, value_name = "MU", value_parser = finite, allow_negative_numbers = true)]
     mu: Option<f64>,
     #[command(flatten)]
@@ -159,28 +180,59 @@ struct Conditions {
 
 #[derive(Clone, Copy, Debug, Args)]
 struct LoadAndSpeed {
-    /// Normal load in N [default: the rig's reference]
+    /// Normal load in N [default: the reference of RIG]
     #[arg(long, value_name = "N", value_parser = finite, allow_negative_numbers = true)]
     load: Option<f64>,
-    /// Disc speed in rad/s; negative turns the other way [default: the rig's reference]
+    /// Disc speed in rad/s; negative turns the other way [default: the reference of RIG]
     #[arg(long, value_name = "RAD_S", value_parser = finite, allow_negative_numbers = true)]
     speed: Option<f64>,
 }
 
 impl Conditions {
-    fn point(&self, rig: &Rig) -> OperatingPoint {
-        let point = self.load_and_speed.point(rig);
-        point.with_friction(self.mu.unwrap_or(rig.reference.friction_coefficient))
+    /// The operating point, within the `limits` of the rig or model called `name`.
+    ///
+    /// # Errors
+    /// A condition outside the limits.
+    fn point(&self, name: &str, reference: &OperatingPoint, limits: &Limits) -> anyhow::Result<OperatingPoint> {
+        let LoadAndSpeed { load, speed } = self.load_and_speed;
+        let point = OperatingPoint {
+            normal_load_n: load.unwrap_or(reference.normal_load_n),
+            disc_speed_rad_s: speed.unwrap_or(reference.disc_speed_rad_s),
+            friction_coefficient: self.mu.unwrap_or(reference.friction_coefficient),
+        };
+        limits.check(&point).with_context(|| name.to_owned())?;
+        Ok(point)
     }
 }
 
 impl LoadAndSpeed {
-    fn point(&self, rig: &Rig) -> OperatingPoint {
-        OperatingPoint {
-            normal_load_n: self.load.unwrap_or(rig.reference.normal_load_n),
-            disc_speed_rad_s: self.speed.unwrap_or(rig.reference.disc_speed_rad_s),
-            friction_coefficient: rig.reference.friction_coefficient,
-        }
+    /// The load and speed at which friction coefficients are searched, within the limits of `rig`.
+    ///
+    /// # Errors
+    /// A condition outside the limits.
+    fn point(self, rig: &Rig) -> anyhow::Result<OperatingPoint> {
+        Conditions { mu: None, load_and_speed: self }.point(&rig.name, &rig.reference, &rig.limits)
+    }
+}
+
+/// A rig: any text, with the names of the embedded rigs for completion scripts.
+#[derive(Clone, Copy, Debug)]
+struct RigName;
+
+impl TypedValueParser for RigName {
+    type Value = String;
+
+    fn parse_ref(
+        &self,
+        command: &clap::Command,
+        argument: Option<&clap::Arg>,
+        value: &std::ffi::OsStr,
+    ) -> Result<String, clap::Error> {
+        clap::builder::StringValueParser::new().parse_ref(command, argument, value)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(EMBEDDED.iter().map(|rig| PossibleValue::new(rig.name).help(rig.about))))
     }
 }
 
@@ -207,14 +259,21 @@ fn positive(text: &str) -> Result<f64, String> {
 
 /// Writes to standard output, control characters as escapes; a reader that has gone away is no error.
 fn print(text: &str) -> anyhow::Result<()> {
+    print_bytes(printable(text).as_bytes())
+}
+
+fn print_bytes(bytes: &[u8]) -> anyhow::Result<()> {
     let mut stdout = std::io::stdout().lock();
-    match stdout.write_all(printable(text).as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(bytes).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
         _ => Ok(()),
     }
 }
 
-/// Writes a file, whole or not at all.
+/// Writes a file, whole or not at all; `-` is standard output.
 fn write_file(path: &std::path::Path, bytes: &[u8]) -> anyhow::Result<()> {
+    if path == std::path::Path::new("-") {
+        return print_bytes(bytes);
+    }
     Ok(write_whole(path, |out| out.write_all(bytes))?)
 }

@@ -1,7 +1,7 @@
 use clap::Args;
 use serde::Serialize;
 
-use super::{Conditions, Outcome, format, print};
+use super::{Conditions, Outcome, RigName, format, print};
 use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors};
 use crate::rig::Rig;
 use crate::session::map_options;
@@ -10,6 +10,7 @@ use crate::session::map_options;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
     #[command(flatten)]
     conditions: Conditions,
@@ -57,7 +58,7 @@ impl From<&Mode> for ModeReport {
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
-        let point = self.conditions.point(&rig);
+        let point = self.conditions.point(&rig.name, &rig.reference, &rig.limits)?;
         let summary = predict(&rig, &point)?;
         if self.json {
             let report = Report {

@@ -7,7 +7,7 @@ use clap::Args;
 use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
-use super::steps::Steps;
+use super::steps::{ProgressOptions, Steps};
 use super::{Outcome, positive, print};
 use crate::certificate::{Against, Certificate, Verified, verify_against};
 use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
@@ -45,10 +45,10 @@ pub struct Options {
     /// Keep the modes of pad and disc below this frequency [without a value: 2.5 times the band]
     #[arg(long, value_name = "HZ", value_parser = positive, num_args = 0..=1, group = "of_modes")]
     cutoff_hz: Option<Option<f64>>,
-    /// Leave out what the modes left out do at the contact
+    /// Omit residual flexibility: the static response of truncated modes at the contact
     #[arg(long, requires = "of_modes")]
     no_residual: bool,
-    /// Keep what the modes left out do between this model's contact pairs alone: a twelfth of the size, for these patches only
+    /// Keep residual flexibility between this model's contact pairs only: a twelfth of the size, no other patches
     #[arg(long, conflicts_with = "no_residual", requires = "of_modes")]
     compact: bool,
     /// Held-out operating points at which the rig is compared with the full model; 0 leaves the comparison out
@@ -60,6 +60,8 @@ pub struct Options {
     /// Rig file to write
     #[arg(short, long, value_name = "RIG.toml")]
     output: PathBuf,
+    #[command(flatten)]
+    progress: ProgressOptions,
 }
 
 /// How many modes of each part.
@@ -87,7 +89,7 @@ impl Options {
             std::process::exit(130);
         })?;
         let file = self.output_file()?;
-        let mut steps = Steps::new(2);
+        let mut steps = self.progress.steps(2);
         steps.say(&format!("reading {}", self.full.display()));
         let full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));

@@ -23,6 +23,7 @@ use crate::wire::schema::Topic;
 
 /// Play a recording on live buses, or predict recordings again and compare
 #[derive(Debug, Args)]
+#[command(after_help = super::ROS_ARGS_HELP)]
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,

@@ -7,7 +7,7 @@ use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of};
 use super::reduce::tell;
 use super::signals::on_stop;
-use super::steps::Steps;
+use super::steps::ProgressOptions;
 use super::{Outcome, positive, write_file};
 use crate::export::write_full_model;
 use crate::fem::tribometer::{Dimensions, Tribometer};
@@ -31,6 +31,8 @@ pub struct Options {
     /// Folder to write into
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
+    #[command(flatten)]
+    progress: ProgressOptions,
 }
 
 impl Options {
@@ -54,7 +56,7 @@ impl Options {
 
     /// Section 4 of the paper.
     fn tribometer(&self) -> anyhow::Result<Vec<Item>> {
-        let mut steps = Steps::new(2);
+        let mut steps = self.progress.steps(2);
         let folder = self.output.join("tribometer");
         write_full_model(&Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?, &folder, |_| ())?;
         steps.say(&format!("{} written", folder.display()));
@@ -91,7 +93,9 @@ impl Options {
     fn file(&self, name: &str, content: &str) -> anyhow::Result<()> {
         let path = self.output.join(name);
         write_file(&path, content.as_bytes())?;
-        note!("{}", path.display());
+        if !self.progress.quiet {
+            note!("{}", path.display());
+        }
         Ok(())
     }
 }

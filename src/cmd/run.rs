@@ -24,9 +24,10 @@ use crate::settings::Settings;
 
 /// Run the node on live buses
 #[derive(Debug, Args)]
+#[command(after_help = super::ROS_ARGS_HELP)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
-    #[arg(default_value = EMBEDDED[0].name)]
+    #[arg(default_value = EMBEDDED[0].name, value_parser = super::RigName, hide_possible_values = true)]
     rig: String,
     #[command(flatten)]
     buses: BusOptions,

@@ -19,6 +19,7 @@ use crate::wire::{Header, OperatingPoint, Time, Vibration};
 
 /// Publish simulated conditions, or record a simulated session
 #[derive(Debug, Args)]
+#[command(after_help = super::ROS_ARGS_HELP)]
 pub struct Options {
     /// Profile of load, speed and friction coefficient, TOML [default: the paper's test, then a ramp from 0 to 1]
     #[arg(long, value_name = "FILE")]

@@ -1,61 +1,105 @@
-//! What long work is doing: a bar for everything under way on a terminal, plain lines elsewhere, with time and memory.
+//! Progress of long work, on standard error: bars with the time left on a terminal, plain lines elsewhere, nothing
+//! with `--quiet`.
 
 use std::io::{IsTerminal, Write};
+
+use clap::Args;
+use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::io::clock::monotonic_ns;
 use crate::io::memory::resident_bytes;
 use crate::reduction::{FullProgress, GIB};
 
-/// Characters of a bar.
-const WIDTH: usize = 24;
-/// Plain lines are written at every such part of a step.
+/// A plain line is written each time such a fraction of a step is done.
 const PLAIN_PARTS: usize = 4;
 
-/// How far a step has come.
-#[derive(Clone, Debug, PartialEq)]
-struct Bar {
+/// How much a command says about its progress.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct ProgressOptions {
+    /// Show no progress, only results and errors
+    #[arg(short, long)]
+    pub quiet: bool,
+}
+
+impl ProgressOptions {
+    /// Progress of `tasks` tasks that run side by side; the time counts from now.
+    pub fn steps(self, tasks: usize) -> Steps {
+        let shown = match (self.quiet, std::io::stderr().is_terminal()) {
+            (true, _) => Shown::Nothing,
+            (false, true) => Shown::Bars(MultiProgress::with_draw_target(ProgressDrawTarget::stderr())),
+            (false, false) => Shown::Lines(Box::new(std::io::stderr())),
+        };
+        Steps::new(shown, tasks)
+    }
+}
+
+/// Where progress is shown.
+enum Shown {
+    Bars(MultiProgress),
+    Lines(Box<dyn Write + Send>),
+    Nothing,
+}
+
+/// The step a task is at.
+struct Step {
     what: String,
     done: usize,
     of: usize,
+    bar: ProgressBar,
 }
 
-/// The steps of some tasks that go on side by side, told on standard error.
+/// The progress of some tasks that run side by side.
 pub struct Steps {
-    terminal: bool,
+    shown: Shown,
     started_ns: u64,
-    bars: Vec<Option<Bar>>,
+    tasks: Vec<Option<Step>>,
 }
 
 impl Steps {
-    /// For so many tasks; the time counts from now.
-    pub fn new(tasks: usize) -> Self {
-        Self { terminal: std::io::stderr().is_terminal(), started_ns: monotonic_ns(), bars: vec![None; tasks] }
+    fn new(shown: Shown, tasks: usize) -> Self {
+        Self { shown, started_ns: monotonic_ns(), tasks: (0..tasks).map(|_| None).collect() }
     }
 
-    /// A line that stays.
+    /// A line that stays. That it cannot be written is no error: nothing depends on it.
     pub fn say(&mut self, text: &str) {
-        let line = format!("{} {text}\n", self.stamp());
-        self.write(&if self.terminal { format!("\r\x1b[K{line}{}", self.drawn()) } else { line });
-    }
-
-    /// `task` has come to `done` of `of` in the step `what`.
-    pub fn at(&mut self, task: usize, what: &str, done: usize, of: usize) {
-        let bar = Bar { what: what.to_owned(), done, of };
-        let part = |bar: &Bar| bar.done * PLAIN_PARTS / bar.of.max(1);
-        let before = self.bars[task].replace(bar.clone());
-        if self.terminal {
-            self.write(&format!("\r\x1b[K{}", self.drawn()));
-        } else if before.is_none_or(|before| before.what != bar.what || part(&before) != part(&bar)) {
-            self.write(&format!("{} {what}: {done} of {of}\n", self.stamp()));
+        let seconds = monotonic_ns().saturating_sub(self.started_ns) as f64 / 1e9;
+        let memory = resident_bytes().map_or("      ?".to_owned(), |bytes| format!("{:7.2}", bytes as f64 / GIB));
+        let line = format!("[{seconds:7.1} s {memory} GiB] {text}");
+        match &mut self.shown {
+            Shown::Bars(bars) => drop(bars.println(line)),
+            Shown::Lines(out) => drop(writeln!(out, "{line}").and_then(|()| out.flush())),
+            Shown::Nothing => {}
         }
     }
 
-    /// `task` has no step that could be counted.
-    pub fn done(&mut self, task: usize) {
-        self.bars[task] = None;
+    /// `task` has done `done` of `of` parts of the step `what`.
+    pub fn at(&mut self, task: usize, what: &str, done: usize, of: usize) {
+        let part = |done: usize, of: usize| done * PLAIN_PARTS / of.max(1);
+        if self.tasks[task].as_ref().is_some_and(|before| before.what != what || before.of != of) {
+            self.done(task);
+        }
+        let before = self.tasks[task].take();
+        let next_part = before.as_ref().is_none_or(|before| part(before.done, of) != part(done, of));
+        let bar = match (before, &self.shown) {
+            (Some(before), _) => before.bar,
+            (None, Shown::Bars(bars)) => bars.add(styled(what, of)),
+            (None, Shown::Lines(_) | Shown::Nothing) => ProgressBar::hidden(),
+        };
+        bar.set_position(done as u64);
+        self.tasks[task] = Some(Step { what: what.to_owned(), done, of, bar });
+        if next_part && matches!(self.shown, Shown::Lines(_)) {
+            self.say(&format!("{what}: {done} of {of}"));
+        }
     }
 
-    /// What a solve of a full model is doing, `what` it is for, as the first task.
+    /// `task` has ended its step.
+    pub fn done(&mut self, task: usize) {
+        if let Some(step) = self.tasks[task].take() {
+            step.bar.finish_and_clear();
+        }
+    }
+
+    /// The progress of the solution of a full model for the purpose `what`, as the first task.
     pub fn full(&mut self, what: &str, step: FullProgress) {
         let hz = |omega: f64| omega / std::f64::consts::TAU;
         match step {
@@ -75,54 +119,70 @@ impl Steps {
             }
         }
     }
+}
 
-    /// Seconds since the beginning.
-    fn seconds(&self) -> f64 {
-        monotonic_ns().saturating_sub(self.started_ns) as f64 / 1e9
-    }
-
-    fn stamp(&self) -> String {
-        let memory = resident_bytes().map_or("      ?".to_owned(), |bytes| format!("{:7.2}", bytes as f64 / GIB));
-        format!("[{:7.1} s {memory} GiB]", self.seconds())
-    }
-
-    fn drawn(&self) -> String {
-        let bars: Vec<String> = self.bars.iter().flatten().map(Bar::drawn).collect();
-        if bars.is_empty() { String::new() } else { format!("{} {}", self.stamp(), bars.join("   ")) }
-    }
-
-    /// Nothing depends on whether it can be seen.
-    fn write(&self, text: &str) {
-        let mut out = std::io::stderr().lock();
-        let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
-    }
+/// The bar of a step: what is done, how much of it, for how long, and the time left.
+fn styled(what: &str, of: usize) -> ProgressBar {
+    let style = ProgressStyle::with_template("{msg} [{bar:24}] {pos}/{len}, {elapsed}, {eta} left");
+    let style = style.map_or_else(|_| ProgressStyle::default_bar(), |style| style.progress_chars("#>."));
+    ProgressBar::new(of as u64).with_style(style).with_message(what.to_owned())
 }
 
 impl Drop for Steps {
     fn drop(&mut self) {
-        if self.terminal {
-            self.write("\r\x1b[K");
+        if let Shown::Bars(bars) = &self.shown {
+            drop(bars.clear());
         }
-    }
-}
-
-impl Bar {
-    fn drawn(&self) -> String {
-        let full = (WIDTH * self.done / self.of.max(1)).min(WIDTH);
-        format!("{} {}{} {}/{}", self.what, "#".repeat(full), ".".repeat(WIDTH - full), self.done, self.of)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::sync::mpsc::{Sender, channel};
+
     use super::*;
 
-    #[test]
-    fn a_bar_never_leaves_its_width() {
-        for (done, full) in [(0, 0), (3, 9), (8, 24), (12, 24)] {
-            let drawn = Bar { what: "pad: modes".to_owned(), done, of: 8 }.drawn();
-            assert_eq!((drawn.matches('#').count(), drawn.matches('.').count()), (full, WIDTH - full), "{drawn}");
+    /// A sink that another place reads.
+    struct Sink(Sender<String>);
+
+    impl Write for Sink {
+        fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+            drop(self.0.send(String::from_utf8_lossy(bytes).into_owned()));
+            Ok(bytes.len())
         }
-        assert!(Bar { what: "x".to_owned(), done: 0, of: 0 }.drawn().ends_with("0/0"));
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn plain_lines_are_written_at_quarters_of_a_step() {
+        let (sender, written) = channel();
+        let mut steps = Steps::new(Shown::Lines(Box::new(Sink(sender))), 2);
+        for done in 0..=8 {
+            steps.at(0, "pad: modes", done, 8);
+        }
+        steps.at(1, "disc: modes", 0, 0);
+        drop(steps);
+        let text: String = written.iter().collect();
+        let counts: Vec<&str> =
+            text.lines().filter_map(|line| line.split_once("GiB] ")).map(|(_, what)| what).collect();
+        let expected = ["0 of 8", "2 of 8", "4 of 8", "6 of 8", "8 of 8"].map(|part| format!("pad: modes: {part}"));
+        assert_eq!(counts[..5], expected);
+        assert_eq!(counts[5..], ["disc: modes: 0 of 0"]);
+    }
+
+    #[test]
+    fn a_step_keeps_its_bar_until_the_next_step_begins() {
+        let mut steps = Steps::new(Shown::Bars(MultiProgress::with_draw_target(ProgressDrawTarget::hidden())), 1);
+        steps.at(0, "pad: modes", 1, 8);
+        let first = steps.tasks[0].as_ref().map(|step| step.bar.clone()).expect("a step");
+        steps.at(0, "pad: modes", 3, 8);
+        assert_eq!((first.position(), first.length()), (3, Some(8)), "one bar, which the time left is estimated from");
+        steps.at(0, "pad: residual", 0, 5);
+        let second = &steps.tasks[0].as_ref().expect("a step").bar;
+        assert_eq!((second.position(), second.length()), (0, Some(5)));
+        assert!(first.is_finished() && !second.is_finished());
     }
 }

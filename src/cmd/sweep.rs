@@ -3,7 +3,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{LoadAndSpeed, Outcome, finite, print, write_file};
+use super::{LoadAndSpeed, Outcome, RigName, finite, format, print, write_file};
 use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors, Window};
 use crate::plot::{self, Point};
 use crate::rig::Rig;
@@ -13,13 +13,14 @@ use crate::session::map_options;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
     /// Friction coefficients, as FROM:TO:STEP
     #[arg(long, value_name = "FROM:TO:STEP", default_value = "0:1:0.01", allow_hyphen_values = true)]
     mu: Range,
     #[command(flatten)]
     load_and_speed: LoadAndSpeed,
-    /// Write the modes as CSV to this file [default: standard output, unless --svg is given]
+    /// Write the modes as CSV to this file, - for standard output [default: -, unless --svg is given]
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
     /// Draw frequencies and growth rates to this file
@@ -67,9 +68,9 @@ impl Range {
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
-        let point = self.load_and_speed.point(&rig);
+        let point = self.load_and_speed.point(&rig)?;
         let Sweep { modes, beside_ends, windows } = sweep(&rig, &point, self.mu, self.svg.is_some())?;
-        let csv = to_csv(&modes)?;
+        let csv = to_csv(&point, &modes)?;
         match (&self.csv, &self.svg) {
             (Some(path), _) => write_file(path, csv.as_bytes())?,
             (None, None) => print(&csv)?,
@@ -89,6 +90,7 @@ impl Options {
             points.sort_by(|a, b| a.mu.total_cmp(&b.mu));
             let title = format!("{}, {} N, {} rad/s", rig.name, point.normal_load_n, point.disc_speed_rad_s);
             write_file(path, plot::sweep(&title, &points, &windows)?.as_bytes())?;
+            note!("{}: {}", path.display(), format::count(windows.len(), "window") + " of instability");
         }
         Ok(Outcome::Done)
     }
@@ -149,14 +151,23 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
     Ok(Sweep { modes, beside_ends, windows: map.windows })
 }
 
-fn to_csv(modes: &[Swept]) -> anyhow::Result<String> {
+fn to_csv(at: &OperatingPoint, modes: &[Swept]) -> anyhow::Result<String> {
     let mut writer = csv::Writer::from_writer(vec![]);
-    writer.write_record(["friction_coefficient", "mode_id", "frequency_hz", "growth_rate_per_s", "damping_ratio"])?;
+    writer.write_record([
+        "normal_load_n",
+        "disc_speed_rad_s",
+        "friction_coefficient",
+        "mode_id",
+        "frequency_hz",
+        "growth_rate_per_s",
+        "damping_ratio",
+    ])?;
+    let (load, speed) = (at.normal_load_n.to_string(), at.disc_speed_rad_s.to_string());
     for (mu, mode) in modes {
         let root = &mode.root;
         let values = [root.frequency_hz(), root.growth_rate_per_s(), root.damping_ratio()].map(|v| v.to_string());
         let [hz, growth, damping] = &values;
-        writer.write_record([&mu.to_string(), &mode.id.to_string(), hz, growth, damping])?;
+        writer.write_record([&load, &speed, &mu.to_string(), &mode.id.to_string(), hz, growth, damping])?;
     }
     Ok(String::from_utf8(writer.into_inner()?)?)
 }

@@ -4,8 +4,8 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::memory::{room, solver};
-use super::steps::Steps;
-use super::{Outcome, positive, print};
+use super::steps::ProgressOptions;
+use super::{Outcome, RigName, positive, print};
 use crate::certificate::{Against, Verified, WindowEnds, verify_against};
 use crate::full_model::FullModelFile;
 use crate::rig::Rig;
@@ -23,6 +23,7 @@ const FRICTION_TOLERANCE: f64 = 0.003;
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
     /// Full model (TOML) to compare with
     #[arg(long, value_name = "FULL")]
@@ -48,11 +49,13 @@ pub struct Options {
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    progress: ProgressOptions,
 }
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let mut steps = Steps::new(1);
+        let mut steps = self.progress.steps(1);
         let rig = Rig::load(&self.rig)?;
         let full = FullModelFile::load(&self.against)?;
         if let Some(known) = rig.reduction.as_ref().filter(|known| known.full_model_hash != full.content_hash) {

@@ -29,12 +29,15 @@ pub fn index(items: &[Item]) -> String {
          <p class=\"lead\">Every number is computed; the paper's own stand beside. Each table and figure is also a file of \
          its own, beside this page.</p>\n"
         .to_owned();
+    let entry = |item: &Item| format!("<li><a href=\"#{}\">{}</a></li>\n", item.name, item.title);
+    body +=
+        &format!("<nav aria-label=\"Contents\">\n<ul>\n{}</ul>\n</nav>\n", items.iter().map(entry).collect::<String>());
     for item in items {
         let drawn = match &item.svg {
             Some(svg) => figure(svg, &item.text),
             None => item.text.clone(),
         };
-        body += &section(&item.title, &drawn);
+        body += &format!("<div id=\"{}\">\n{}</div>\n", item.name, section(&item.title, &drawn));
     }
     page("squealcast: the paper's tables and figures", &body)
 }

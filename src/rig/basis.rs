@@ -2,6 +2,7 @@
 
 use faer::Mat;
 
+use super::inline::free_frequencies;
 use super::modal::Part;
 use super::patch::Pair;
 use super::raw::RawBasis;
@@ -82,7 +83,7 @@ pub(super) fn build(
             None => Ok(model),
         })
         .map_err(|source| RigError::Model { file: file.to_owned(), source })?;
-    let contents = vec![
+    let mut contents = vec![
         "kind       pad and disc on a shared basis (kind 2)".to_owned(),
         format!("vectors    {k}, of the full model"),
         format!(
@@ -96,6 +97,7 @@ pub(super) fn build(
             exponent => format!("stiffness  of the contact times (load / {} N)^{exponent}", law.reference_n),
         },
     ];
+    contents.extend(free_frequencies("vectors", omega_rad_s));
     let shapes = ["pad", "disc"]
         .map(|name| SideShapes { name, first_coordinate: 0, phi: Mat::zeros(0, k), nodes_m: vec![] })
         .into();

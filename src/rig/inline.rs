@@ -81,6 +81,9 @@ pub(super) fn assemble(
             exponent => format!("stiffness  of the contact times (load / {} N)^{exponent}", contact_law.reference_n),
         },
     ];
+    for (name, side) in ["pad", "disc"].into_iter().zip(&sides) {
+        contents.extend(free_frequencies(name, &side.modes.omega_rad_s));
+    }
     let damped = zeta.iter().filter(|zeta| **zeta != 0.0).count();
     contents.push(format!(
         "damping    {damped} of {n} modes; friction slope {} s/m, lateral friction {}",
@@ -95,6 +98,13 @@ pub(super) fn assemble(
     }
     let contact = Some(Contact { pairs, residual });
     Ok(Built { model, contact, contents, shapes, band_max_hz: settings.band_max_hz })
+}
+
+/// The lowest and the highest natural frequency of a part without contact: what a wrong unit shows in.
+pub(super) fn free_frequencies(name: &str, omega_rad_s: &[f64]) -> Option<String> {
+    let hz = omega_rad_s.iter().map(|omega| omega / std::f64::consts::TAU);
+    let (low, high) = hz.fold((f64::INFINITY, 0.0f64), |(low, high), hz| (low.min(hz), high.max(hz)));
+    (low <= high).then(|| format!("{name:<10} natural frequencies {low:.1} to {high:.1} Hz without contact"))
 }
 
 /// Modes of one inline side.

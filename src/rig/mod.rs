@@ -118,6 +118,38 @@ pub struct Limits {
     pub friction_coefficient: [f64; 2],
 }
 
+/// A condition outside the rig's limits.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum OutOfLimits {
+    #[error("{name} is {value}, expected a finite number")]
+    NotFinite { name: &'static str, value: f64 },
+    #[error("{name} is {value}, expected {low} to {high}")]
+    Range { name: &'static str, value: f64, low: f64, high: f64 },
+}
+
+impl Limits {
+    /// Whether every condition of `point` is finite and within its limits.
+    ///
+    /// # Errors
+    /// [`OutOfLimits`], naming the first condition that is not.
+    pub fn check(&self, point: &OperatingPoint) -> Result<(), OutOfLimits> {
+        let checks = [
+            ("normal_load_n", point.normal_load_n, self.normal_load_n),
+            ("disc_speed_rad_s", point.disc_speed_rad_s, self.disc_speed_rad_s),
+            ("friction_coefficient", point.friction_coefficient, self.friction_coefficient),
+        ];
+        for (name, value, [low, high]) in checks {
+            if !value.is_finite() {
+                return Err(OutOfLimits::NotFinite { name, value });
+            }
+            if !(low..=high).contains(&value) {
+                return Err(OutOfLimits::Range { name, value, low, high });
+            }
+        }
+        Ok(())
+    }
+}
+
 /// The conditions that the basis of a rig was made for, as far as its file names them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MadeFor {

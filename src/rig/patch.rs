@@ -19,6 +19,9 @@ use super::settings::{MOST_TERMS, at_most, spread, within};
 /// Nodes closer than this times the size of the patch coincide.
 const COINCIDENT: f64 = 1e-6;
 
+/// Least `|n·e|` of a normal `n` that is 60 degrees off the axis `e`; beyond, the pad would press on the disc's rim.
+const LEAST_COSINE: f64 = 0.5;
+
 /// One contact pair.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pair {
@@ -107,6 +110,14 @@ fn pairs(
     }
     let axis = unit(file, &field("axis_direction"), raw.axis_direction)?;
     let normal = unit(file, &field("normal"), raw.normal)?;
+    if dot(normal, axis).abs() < LEAST_COSINE {
+        return Err(RigError::Range {
+            file: file.to_owned(),
+            field: field("normal"),
+            value: format!("{:?}, {:.0} degrees off the axis", raw.normal, dot(normal, axis).abs().acos().to_degrees()),
+            limit: "at most 60 degrees: the pad presses along the axis of the disc".to_owned(),
+        });
+    }
     let pad_nodes = selection(file, &field("pad_nodes"), raw.pad_nodes.as_deref(), pad_m.len())?;
     let search_m = raw
         .search_distance_m

@@ -116,7 +116,7 @@ pub struct RawResidual {
 
 /// A value for all, or one for each.
 #[derive(Clone, Debug, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "expected a number or a list of numbers")]
 pub enum OneOrMany {
     One(f64),
     Many(Vec<f64>),
@@ -124,7 +124,7 @@ pub enum OneOrMany {
 
 /// The `k` lowest modes, or a list of modes counted from 0.
 #[derive(Clone, Debug, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "expected a number of modes or a list of modes counted from 0")]
 pub enum RawModes {
     Lowest(usize),
     Indices(Vec<usize>),
@@ -222,14 +222,14 @@ pub fn parse<T: serde::de::DeserializeOwned>(file: &str, bytes: &[u8]) -> Result
         RigError::Syntax { file: file.to_owned(), line, value, limit: "TOML text".to_owned() }
     })?;
     toml::from_str(text).map_err(|error| {
-        let start = error.span().map_or(0, |span| span.start);
-        let line = 1 + bytes.iter().take(start).filter(|byte| **byte == b'\n').count();
-        explain(file, line, error.message())
+        let span = error.span().unwrap_or_default();
+        let line = 1 + bytes.iter().take(span.start).filter(|byte| **byte == b'\n').count();
+        explain(file, line, error.message(), text.get(span).unwrap_or_default())
     })
 }
 
 /// Sorts the parser's complaint by what it is about.
-fn explain(file: &str, line: usize, message: &str) -> RigError {
+fn explain(file: &str, line: usize, message: &str, found: &str) -> RigError {
     let file = file.to_owned();
     let quoted = |prefix: &str| message.strip_prefix(prefix).and_then(|rest| rest.split_once('`'));
     if let Some((field, rest)) = quoted("unknown field `") {
@@ -239,6 +239,10 @@ fn explain(file: &str, line: usize, message: &str) -> RigError {
     if let Some((field, _)) = quoted("missing field `") {
         let limit = format!("it in the table of line {line}");
         return RigError::MissingKey { file, field: field.to_owned(), limit };
+    }
+    // The complaint of a value that may have one of several types.
+    if let Some(limit) = message.strip_prefix("expected ") {
+        return RigError::Syntax { file, line, value: format!("the value {found}"), limit: limit.to_owned() };
     }
     match message.split_once(", expected ") {
         Some((value, limit)) => RigError::Syntax { file, line, value: value.to_owned(), limit: limit.to_owned() },

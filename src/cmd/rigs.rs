@@ -1,0 +1,17 @@
+use clap::Args;
+
+use super::{Outcome, print};
+use crate::rig::EMBEDDED;
+
+/// List the embedded rigs
+#[derive(Debug, Args)]
+pub struct Options {}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let width = EMBEDDED.iter().map(|rig| rig.name.len()).max().unwrap_or(0);
+        let lines: String = EMBEDDED.iter().map(|rig| format!("{:width$}  {}\n", rig.name, rig.about)).collect();
+        print(&lines)?;
+        Ok(Outcome::Done)
+    }
+}
