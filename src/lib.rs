@@ -1,8 +1,8 @@
 //! Predicts friction-induced instability of a pad-on-disc tribometer from its operating conditions.
 
-/// A line on standard error; that nobody is there to read it is no error.
+/// A line on standard error, as [`notes::line`] writes it.
 macro_rules! note {
-    ($($text:tt)*) => { $crate::terminal::note(format_args!($($text)*)) };
+    ($($text:tt)*) => { $crate::notes::line(format_args!($($text)*)) };
 }
 
 pub use squealcast_core::{fem, physics, reduction};
@@ -11,6 +11,7 @@ mod ahead;
 pub mod bench;
 pub mod certificate;
 pub mod cmd;
+mod digits;
 pub mod display;
 pub mod export;
 pub mod full_model;
@@ -19,6 +20,7 @@ pub mod html;
 pub mod input_file;
 pub mod io;
 pub mod node;
+mod notes;
 pub mod offline;
 pub mod plot;
 pub mod reproduce;

@@ -8,6 +8,9 @@ use serde::Deserialize;
 use crate::input_file;
 use crate::physics::OperatingPoint;
 
+/// The `frame_id` of simulated measurements, by which recordings and displays know them.
+pub const FRAME_ID: &str = "simulated";
+
 /// Conditions over time: straight lines between points, with noise around them.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -143,9 +143,10 @@ fn a_state_comes_at_most_thirty_times_a_second_whatever_the_input_rate() {
         last = next;
         count += 1;
     }
-    // By the node's own clock, and for as long as another program may have held a single state up.
+    // By the node's own clock. A tick is never less than 34 ms after the one before; the work between a tick and the time
+    // it writes can move the first and the last, so that one more fits.
     let span_s = time_s(&last) - time_s(&first);
-    assert!(f64::from(count) <= 30.0 * (span_s + 1.0), "{count} states in {span_s} s");
+    assert!(f64::from(count) <= span_s / 0.034 + 2.0, "{count} states in {span_s} s");
     if measuring() {
         assert!((25.0..30.5).contains(&(f64::from(count) / span_s)), "{count} states in {span_s} s");
         assert!(last["rate_hz"].as_f64().unwrap() > 1900.0, "{last}");
@@ -154,17 +155,19 @@ fn a_state_comes_at_most_thirty_times_a_second_whatever_the_input_rate() {
 }
 
 #[test]
-fn a_port_that_is_taken_is_said_and_the_node_goes_on() {
+fn an_address_that_is_asked_for_and_taken_is_an_error() {
+    let records = tempfile::tempdir().unwrap();
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap().to_string();
     let output = Command::new(env!("CARGO_BIN_EXE_squealcast"))
-        .args(["demo", "--plain", "--no-shm", "--no-ros", "--duration", "1", "--display", &address])
+        .args(["demo", "--plain", "--no-shm", "--no-ros", "--duration", "1", "--display", &address, "--record"])
+        .arg(records.path())
         .output()
         .unwrap();
-    let told = String::from_utf8_lossy(&output.stderr);
-    assert!(told.contains(&format!("warning: no display on {address}")), "{told}");
-    assert!(output.status.success(), "{told}");
-    assert!(String::from_utf8_lossy(&output.stdout).contains("seq"));
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains(&format!("error: no display on {address}")) && said.contains("--no-display"), "{said}");
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(!records.path().read_dir().unwrap().any(|_| true), "a start that fails leaves no recording");
 }
 
 #[test]
@@ -253,9 +256,9 @@ fn the_page_shows_a_demo_as_it_is() {
     for moment in moments {
         let seq: u64 = moment["seq"].as_str().unwrap().parse().unwrap();
         let (input, prediction) = &published[&seq];
-        // The level is there at once, the numbers follow: within 2 s of them there was such a prediction.
+        // The level is there at once, the numbers follow every 0.3 s: within 0.5 s of them there was such a prediction.
         let level = moment["level"].as_str().unwrap();
-        let near = (seq.saturating_sub(400)..seq + 400).filter_map(|seq| published.get(&seq));
+        let near = (seq.saturating_sub(100)..seq + 100).filter_map(|seq| published.get(&seq));
         let levels: Vec<String> =
             near.map(|(_, near)| squealcast::wire::level::name(near.level).to_lowercase()).collect();
         assert!(levels.iter().any(|near| near == level), "{level} about input {seq}");

@@ -1,12 +1,13 @@
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
+use anyhow::Context;
 use clap::Args;
 
 use super::{finite, not_negative};
 use crate::display::comparison::Criteria;
 use crate::display::live::Live;
-use crate::display::server::{Server, Source};
+use crate::display::server::{About, Server, Source};
 use crate::node::Watch;
 use crate::rig::Rig;
 
@@ -90,25 +91,31 @@ impl DisplayOptions {
     }
 }
 
-/// Serves `source` and says where. A node does without where there is no free address: that is said too.
-pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> Option<Server> {
-    let first = addresses.first()?;
-    match Server::start(addresses, source) {
-        Ok(server) => {
-            note!("display: http://{}/", server.address());
-            Some(server)
-        }
-        Err(error) => {
-            note!("warning: no display on {first}: {error}; another one with --display 127.0.0.1:PORT");
-            None
-        }
-    }
+/// Serves `source` on the first free one of `addresses` and says where; serves nothing where there are none.
+///
+/// # Errors
+/// None of them is free.
+pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> anyhow::Result<Option<Server>> {
+    let Some(first) = addresses.first() else { return Ok(None) };
+    let server = Server::start(addresses, source)
+        .with_context(|| format!("no display on {first}; another address with --display, none with --no-display"))?;
+    note!("display: http://{}/", server.address());
+    Ok(Some(server))
 }
 
-/// The page of a node.
-pub fn of_node(addresses: &[SocketAddr], rig: &Arc<Rig>, watch: &Watch, threshold: ThresholdOption) -> Option<Server> {
-    if addresses.is_empty() {
-        return None;
+impl DisplayOptions {
+    /// The page of a node. An address that was asked for must be free; where none was asked for and none of the usual ones
+    /// is free, the node does without.
+    ///
+    /// # Errors
+    /// The address that was asked for is taken.
+    pub fn of_node(&self, rig: &Arc<Rig>, watch: &Watch, about: About) -> anyhow::Result<Option<Server>> {
+        match serve(&self.addresses()?, Arc::new(Live::new(rig.clone(), watch.clone(), about))) {
+            Err(error) if self.display.is_none() => {
+                note!("warning: {}", super::told(&error));
+                Ok(None)
+            }
+            served => served,
+        }
     }
-    serve(addresses, Arc::new(Live::new(rig.clone(), watch.clone(), threshold.db())))
 }

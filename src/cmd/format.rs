@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 
+pub use crate::digits::significant;
 use crate::physics::{OperatingPoint, StabilityMap, Summary};
 use crate::rig::Rig;
 
@@ -84,21 +85,4 @@ pub fn windows(rig: &Rig, map: &StabilityMap, mu_max: f64) -> String {
 /// `1 root`, `2 roots`.
 pub fn count(number: usize, noun: &str) -> String {
     format!("{number} {noun}{}", if number == 1 { "" } else { "s" })
-}
-
-/// A number with `digits` significant digits, plain where that is readable.
-pub fn significant(value: f64, digits: usize) -> String {
-    if value == 0.0 {
-        return "0".to_owned();
-    }
-    if !value.is_finite() {
-        return "-".to_owned();
-    }
-    let magnitude = value.abs().log10().floor();
-    if (-4.0..digits as f64).contains(&magnitude) {
-        let decimals = (digits as f64 - 1.0 - magnitude).max(0.0) as usize;
-        format!("{value:.decimals$}")
-    } else {
-        format!("{value:.*e}", digits.saturating_sub(3))
-    }
 }

@@ -18,8 +18,8 @@ use crate::io::ros_args::RosArgs;
 use crate::node::Watch;
 use crate::rig::{Rig, RigFile};
 use crate::verify::{Charts, Verification, verify};
-use crate::wire::Time;
 use crate::wire::schema::Topic;
+use crate::wire::{Time, event_kind};
 
 /// Play a recording on live buses, or predict recordings again and compare
 #[derive(Debug, Args)]
@@ -213,6 +213,7 @@ impl Options {
                 match payload {
                     Payload::OperatingPoint(input) => watch.input(&input),
                     Payload::Prediction(prediction) => watch.prediction(&prediction),
+                    Payload::SessionEvent(event) if event.kind == event_kind::SILENCE => watch.silence(),
                     Payload::SessionEvent(_)
                     | Payload::RigInfo(_)
                     | Payload::Sensitivity(_)
@@ -254,9 +255,10 @@ fn frame(path: &Path, recording: &Recording, played: &Arc<AtomicU64>, stopped: &
     let title = rig.as_ref().map_or_else(|| file.clone(), |rig| format!("{}, {file}", rig.name));
     let (played, stopped) = (played.clone(), stopped.clone());
     live::Frame {
-        title,
+        title: vec!["squealcast replay".to_owned(), title],
         instability_threshold: rig.map_or(0.0, |rig| rig.instability_threshold),
-        foot: Box::new(move |_| format!("played {} messages", played.load(Ordering::Relaxed))),
+        inputs: None,
+        foot: Box::new(move |_| vec![format!("played {} messages", played.load(Ordering::Relaxed))]),
         quit: Box::new(move || stopped.store(true, Ordering::Relaxed)),
     }
 }

@@ -8,15 +8,17 @@ use clap::Args;
 use crossbeam_channel::{Receiver, Sender};
 
 use super::buses::BusOptions;
-use super::display::{self, DisplayOptions, ThresholdOption};
+use super::display::{DisplayOptions, ThresholdOption};
 use super::{Outcome, live, signals};
-use crate::display::server::Server;
+use crate::display::server::{About, Server};
 use crate::io::chart_file::ChartFile;
 use crate::io::heard::Heard;
 use crate::io::recorder::{Recorder, RecorderConfig, State};
 use crate::io::ros_args::RosArgs;
+use crate::io::ros2::NODE_NAME;
 use crate::io::ros2::process::{Ros2Process, Sinks};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
+use crate::node::status::InputSources;
 use crate::node::{self, Incoming, Node, Outputs, Shortcut, Watch};
 use crate::rig::{EMBEDDED, Rig};
 use crate::session::Counters;
@@ -91,7 +93,19 @@ pub fn serve(
     let stop = sender.clone();
     signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let mut initial = Settings::for_rig(rig);
-    let addresses = options.display.addresses()?;
+    let ros2 = buses.ros2(ros_args)?;
+    let inputs = match listening {
+        Listening::ToTheBuses => Some(buses.sources(ros2.as_ref())),
+        Listening::ToNobody => None,
+    };
+    let watch = Watch::default();
+    let about = About {
+        simulated: listening == Listening::ToNobody,
+        inputs: inputs.clone(),
+        ..About::new(rig, "live", options.threshold.db())
+    };
+    // Before the recording: an address that is taken leaves none behind.
+    let display = options.display.of_node(rig, &watch, about)?;
     let mut outputs = Outputs::default();
     let shortcut = Shortcut::new(sender.clone());
     if let Some(shm) = buses.shm() {
@@ -110,9 +124,9 @@ pub fn serve(
             outputs.shm_vibration = Some(ShmVibrationInput::spawn(&shm, vibration)?);
         }
     }
-    if let Some(ros2) = buses.ros2(ros_args)? {
+    if let Some(ros2) = ros2 {
         let declared: Vec<(&str, f64)> = initial.values().collect();
-        let name = ros2.args.node_name("squealcast");
+        let name = ros2.args.node_name(NODE_NAME);
         let (values, ignored) = ros2.args.parameters(&declared, &ros2.args.namespace(&name, "/"), &name)?;
         for what in ignored {
             note!("ROS 2: {what}");
@@ -140,9 +154,7 @@ pub fn serve(
     // Last of what can fail: no start that fails leaves a recording.
     let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
     outputs.recorder = recorder.as_ref().map(Recorder::handle);
-    let watch = Watch::default();
-    let display = display::of_node(&addresses, rig, &watch, options.threshold);
-    let shown = live::show(frame(rig, display.as_ref(), sender.clone()), watch.clone(), options.plain);
+    let shown = live::show(frame(rig, inputs, display.as_ref(), sender.clone()), watch.clone(), options.plain);
     let node = Node::new(rig.clone(), initial, outputs, sender.clone(), watch).with_shortcut(&shortcut);
     let kept = || ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);
     let kept = if options.no_chart_cache { None } else { kept() };
@@ -156,24 +168,28 @@ pub fn serve(
     outcome
 }
 
-/// What is around the table of a node for `rig`; what was said before it is covered by it, so that it says again where
-/// the page is.
-fn frame(rig: &Rig, display: Option<&Server>, node: Sender<Incoming>) -> live::Frame {
-    let page = display.map(|display| format!("  http://{}/", display.address()));
+/// What is around the table of a node for `rig`, which listens to `inputs` or else to a simulator. The table covers what
+/// was written before it, so that it names the page again.
+fn frame(rig: &Rig, inputs: Option<InputSources>, display: Option<&Server>, node: Sender<Incoming>) -> live::Frame {
+    let name = if inputs.is_some() { "squealcast" } else { "squealcast (simulated)" };
+    let page = display.map(|display| format!("http://{}/", display.address()));
     live::Frame {
-        title: format!("{}{}", rig.name, page.unwrap_or_default()),
+        title: [name.to_owned(), rig.name.clone()].into_iter().chain(page).collect(),
         instability_threshold: rig.instability_threshold,
+        inputs,
         foot: Box::new(|snapshot| {
             let Counters { solved, charted, reused, faults, .. } = snapshot.counters;
             let passed_over = snapshot.passed_over;
-            if let Some(problem) = &snapshot.recording_problem {
-                return problem.clone();
-            }
+            let mut counts = vec![
+                format!("solved {solved}"),
+                format!("from the chart {charted}"),
+                format!("reused {reused}"),
+                format!("faults {faults}"),
+                format!("passed over {passed_over}"),
+            ];
             let falls = snapshot.ros2_falls;
-            let ros2 = if falls == 0 { String::new() } else { format!("  ROS 2 started again {falls}") };
-            format!(
-                "solved {solved}  from the chart {charted}  reused {reused}  faults {faults}  passed over {passed_over}{ros2}"
-            )
+            counts.extend((falls > 0).then(|| format!("ROS 2 started again {falls}")));
+            counts
         }),
         quit: Box::new(move || drop(node.send(Incoming::Stop))),
     }

@@ -14,7 +14,7 @@ use crate::io::ros2::Ros2Source;
 use crate::io::shm::{ShmSource, ShmVibrationSource};
 use crate::offline::{self, Measured, Quantity};
 use crate::rig::Rig;
-use crate::simulator::{Peak, Profile, Simulator, Tone};
+use crate::simulator::{self, Peak, Profile, Simulator, Tone};
 use crate::wire::{Header, OperatingPoint, Time, Vibration};
 
 /// Publish simulated conditions, or record a simulated session
@@ -82,7 +82,7 @@ impl Measuring {
     /// What is measured then, as messages.
     pub fn measure(&mut self, seq: u32, stamp_ns: i64) -> (OperatingPoint, Option<Vibration>) {
         let time_s = self.time_s(seq);
-        let header = Header { stamp: Time::from_ns(stamp_ns), frame_id: "simulated".to_owned() };
+        let header = Header { stamp: Time::from_ns(stamp_ns), frame_id: simulator::FRAME_ID.to_owned() };
         let every = (VIBRATION_EVERY_S / self.period_s).round().max(1.0) as u32;
         let tone = self.tone.filter(|_| seq.is_multiple_of(every));
         let vibration = tone.map(|tone| {

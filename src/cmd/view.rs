@@ -1,7 +1,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use clap::Args;
 use crossbeam_channel::bounded;
 
@@ -60,7 +60,7 @@ impl Options {
             // Nobody waits any more: it has stopped.
             let _ = stop.send(());
         })?;
-        let server = display::serve(&addresses, Arc::new(recorded)).context("there is nowhere to show it")?;
+        let server = display::serve(&addresses, Arc::new(recorded))?;
         let _ = stopped.recv();
         drop(server);
         Ok(Outcome::Done)

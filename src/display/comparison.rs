@@ -14,9 +14,8 @@
 
 use serde::Serialize;
 
-use super::events::{BRIDGED_S, Event, Events, seconds};
+use super::events::{BRIDGED_S, Event, EventKind, Events, seconds};
 use crate::node::VibrationSample;
-use crate::wire::level;
 
 /// Without a measurement for longer than this nothing is known of the vibration, s.
 const GAP_S: f64 = 1.0;
@@ -142,7 +141,7 @@ impl Measurements {
         if self.count == 0 {
             return None;
         }
-        let predicted: Vec<&Event> = events.iter().filter(|event| event.kind == level::name(level::SQUEAL)).collect();
+        let predicted: Vec<&Event> = events.iter().filter(|event| event.kind == EventKind::Squeal).collect();
         let mut matched = vec![false; predicted.len()];
         let open = self.open.iter().filter(|squeal| self.lasts(squeal));
         let judge = |squeal: &MeasuredSqueal| {
@@ -240,6 +239,7 @@ impl Comparison {
 mod tests {
     use super::*;
     use crate::display::events::tests::sample;
+    use crate::node::status::Status;
 
     /// Predictions every 10 ms over 60 s: mode 3 at 1500 Hz is unstable within the given seconds.
     fn predicted(squeals: &[(f64, f64)]) -> Events {
@@ -247,7 +247,7 @@ mod tests {
         for k in 0..6000 {
             let time_s = 0.01 * f64::from(k);
             let squeals = squeals.iter().any(|&(from, to)| (from..to).contains(&time_s));
-            events.push(&sample((time_s * 1e9) as i64, 0.5, if squeals { level::SQUEAL } else { level::OK }));
+            events.push(&sample((time_s * 1e9) as i64, 0.5, if squeals { Status::Squeal } else { Status::Ok }));
         }
         events
     }

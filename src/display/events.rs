@@ -1,38 +1,124 @@
-//! Onsets and ends of squeal and of faults, from predictions in order.
+//! Squeals, faults and silences, from predictions in order.
 
 use std::collections::VecDeque;
 
 use serde::Serialize;
 
+use crate::node::status::Status;
 use crate::node::{Sample, UnstableMode};
-use crate::wire::{Time, level};
+use crate::wire::Time;
 
-/// A stretch of predictions that were SQUEAL, or FAULT, with interruptions shorter than a quarter of a second.
+/// What an event is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub enum EventKind {
+    #[serde(rename = "SQUEAL")]
+    Squeal,
+    #[serde(rename = "FAULT")]
+    Fault,
+    /// Inputs stopped.
+    #[serde(rename = "NO DATA")]
+    NoData,
+}
+
+impl EventKind {
+    /// The event that a prediction of `status` belongs to. Waiting for the first input is none.
+    fn of(status: Status) -> Option<Self> {
+        match status {
+            Status::Squeal => Some(Self::Squeal),
+            Status::Fault => Some(Self::Fault),
+            Status::NoData => Some(Self::NoData),
+            Status::Waiting | Status::Ok | Status::Warn => None,
+        }
+    }
+
+    /// As people read it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Squeal => Status::Squeal.name(),
+            Self::Fault => Status::Fault.name(),
+            Self::NoData => Status::NoData.name(),
+        }
+    }
+}
+
+/// A stretch of predictions that were all of one kind, with interruptions shorter than a quarter of a second.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Event {
     /// Counted from 1.
     pub number: u64,
-    /// `SQUEAL` or `FAULT`.
-    pub kind: &'static str,
+    pub kind: EventKind,
     /// Time of its first prediction, s since the epoch.
     pub onset_s: f64,
-    /// Time of the first prediction that was not so any more; `null` while it lasts.
+    /// Time of the first prediction that was not of its kind any more; `null` while it lasts.
     pub end_s: Option<f64>,
     /// How often it was interrupted: noise about the limit is not a new event each time.
     pub interruptions: u32,
-    /// Where it is in the sequence of inputs.
+    /// Where its onset is in the sequence of inputs.
     pub input_seq: u64,
-    /// The mode that grew fastest over the event, at its fastest; `null` for faults and static divergence.
+    /// The frequencies over which its unstable modes went, of the fastest at every moment.
+    pub modes: Vec<ModeRange>,
+    /// Its first prediction.
+    pub onset: EventMoment,
+    /// The prediction with the fastest growth; `null` for faults and silences.
+    pub peak: Option<EventMoment>,
+}
+
+/// One prediction of an event: its conditions and the fastest growing mode under them. What is not known is `null`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct EventMoment {
+    /// s since the epoch.
+    pub time_s: f64,
+    /// `null` where nothing grows, or a static root alone.
     pub mode_id: Option<u32>,
     pub frequency_hz: Option<f64>,
     pub growth_rate_per_s: Option<f64>,
-    /// The frequencies over which its unstable modes went, of the fastest at every moment.
-    pub modes: Vec<ModeRange>,
-    /// Conditions at the onset.
-    pub normal_load_n: f64,
-    pub disc_speed_rad_s: f64,
-    pub friction_coefficient: f64,
-    pub critical_friction: f64,
+    pub normal_load_n: Option<f64>,
+    pub disc_speed_rad_s: Option<f64>,
+    pub friction_coefficient: Option<f64>,
+    pub critical_friction: Option<f64>,
+}
+
+impl EventMoment {
+    fn new(sample: &Sample) -> Self {
+        let known = |value: f64| Some(value).filter(|value| value.is_finite());
+        let [fastest, ..] = sample.unstable;
+        let static_growth = known(sample.max_growth_rate_per_s).filter(|_| sample.unstable_modes > 0);
+        Self {
+            time_s: seconds(sample.time_ns),
+            mode_id: fastest.map(|mode| mode.id),
+            frequency_hz: fastest.map(|mode| mode.frequency_hz),
+            growth_rate_per_s: fastest.map(|mode| mode.growth_rate_per_s).or(static_growth),
+            normal_load_n: known(sample.normal_load_n),
+            disc_speed_rad_s: known(sample.disc_speed_rad_s),
+            friction_coefficient: known(sample.friction_coefficient),
+            critical_friction: known(sample.critical_friction),
+        }
+    }
+
+    /// Names and units of the columns of a CSV file, in the order of [`EventMoment::cells`].
+    const COLUMNS: [&str; 8] = [
+        "utc",
+        "mode_id",
+        "frequency_hz",
+        "growth_rate_per_s",
+        "normal_load_n",
+        "disc_speed_rad_s",
+        "friction_coefficient",
+        "critical_friction",
+    ];
+
+    fn cells(&self) -> [String; Self::COLUMNS.len()] {
+        [
+            iso(self.time_s),
+            cell(self.mode_id),
+            cell(self.frequency_hz),
+            cell(self.growth_rate_per_s),
+            cell(self.normal_load_n),
+            cell(self.disc_speed_rad_s),
+            cell(self.friction_coefficient),
+            cell(self.critical_friction),
+        ]
+    }
 }
 
 /// Smallest and largest frequency of a mode.
@@ -57,23 +143,16 @@ pub(super) const BRIDGED_S: f64 = 0.25;
 /// Events kept; older ones are forgotten.
 const MOST_EVENTS: usize = 10_000;
 
-/// First line of the CSV.
-const CSV_HEADER: &str = "number,kind,onset,end,duration_s,interruptions,mode_id,frequency_hz,growth_rate_per_s,normal_load_n,\
-                          disc_speed_rad_s,friction_coefficient,critical_friction,input_seq\r\n";
-
 impl Events {
     /// Takes the next prediction in; whether something began or ended.
     pub fn push(&mut self, sample: &Sample) -> bool {
-        let kind = match sample.level {
-            level::SQUEAL | level::FAULT => Some(level::name(sample.level)),
-            _ => None,
-        };
+        let kind = EventKind::of(sample.status);
         let time_s = seconds(sample.time_ns);
         let mut changed = false;
         if self.open {
             if let Some(last) = self.events.back_mut() {
                 if kind == Some(last.kind) {
-                    last.grew(&sample.unstable);
+                    last.take(sample);
                     return false;
                 }
                 last.end_s = Some(time_s);
@@ -85,15 +164,14 @@ impl Events {
         let resumed = |last: &&mut Event| {
             last.kind == kind && last.end_s.is_some_and(|end_s| (0.0..BRIDGED_S).contains(&(time_s - end_s)))
         };
+        self.open = true;
         if let Some(last) = self.events.back_mut().filter(resumed) {
             last.end_s = None;
             last.interruptions += 1;
-            last.grew(&sample.unstable);
-            self.open = true;
+            last.take(sample);
             return true;
         }
         self.count += 1;
-        self.open = true;
         let mut event = Event {
             number: self.count,
             kind,
@@ -101,16 +179,11 @@ impl Events {
             end_s: None,
             interruptions: 0,
             input_seq: sample.input_seq,
-            mode_id: None,
-            frequency_hz: None,
-            growth_rate_per_s: None,
             modes: vec![],
-            normal_load_n: sample.normal_load_n,
-            disc_speed_rad_s: sample.disc_speed_rad_s,
-            friction_coefficient: sample.friction_coefficient,
-            critical_friction: sample.critical_friction,
+            onset: EventMoment::new(sample),
+            peak: None,
         };
-        event.grew(&sample.unstable);
+        event.take(sample);
         if self.events.len() == MOST_EVENTS {
             self.events.pop_front();
         }
@@ -128,50 +201,56 @@ impl Events {
         self.count
     }
 
-    /// As comma-separated values with a header, times in ISO 8601.
+    /// As comma-separated values with a header that names the units, times in ISO 8601. Onset and peak have columns of
+    /// their own.
     pub fn to_csv(&self) -> String {
-        let mut text = CSV_HEADER.to_owned();
-        let optional = |value: Option<f64>| value.map_or_else(String::new, |value| value.to_string());
-        let known = |value: f64| if value.is_finite() { value.to_string() } else { String::new() };
+        let mut header: Vec<String> =
+            ["number", "kind", "onset_utc", "end_utc", "duration_s", "interruptions", "input_seq"]
+                .map(String::from)
+                .into();
+        for when in ["onset", "peak"] {
+            // The time of the onset has its place already.
+            let columns = EventMoment::COLUMNS.iter().skip(usize::from(when == "onset"));
+            header.extend(columns.map(|column| format!("{when}_{column}")));
+        }
+        let mut text = header.join(",") + "\r\n";
         for event in &self.events {
-            text += &[
+            let [onset_utc, onset @ ..] = event.onset.cells();
+            let mut cells = vec![
                 event.number.to_string(),
-                event.kind.to_owned(),
-                iso(event.onset_s),
+                event.kind.name().to_owned(),
+                onset_utc,
                 event.end_s.map_or_else(String::new, iso),
                 event.end_s.map_or_else(String::new, |end_s| format!("{:.6}", end_s - event.onset_s)),
                 event.interruptions.to_string(),
-                event.mode_id.map_or_else(String::new, |id| id.to_string()),
-                optional(event.frequency_hz),
-                optional(event.growth_rate_per_s),
-                known(event.normal_load_n),
-                known(event.disc_speed_rad_s),
-                known(event.friction_coefficient),
-                known(event.critical_friction),
                 event.input_seq.to_string(),
-            ]
-            .join(",");
+            ];
+            cells.extend(onset);
+            cells.extend(event.peak.map_or_else(Default::default, |peak| peak.cells()));
+            text += &cells.join(",");
             text += "\r\n";
         }
         text
     }
 }
 
+fn cell<T: ToString>(value: Option<T>) -> String {
+    value.map_or_else(String::new, |value| value.to_string())
+}
+
 impl Event {
-    /// Takes the unstable modes of a moment in, fastest first.
-    fn grew(&mut self, unstable: &[Option<UnstableMode>]) {
-        for mode in unstable.iter().flatten() {
-            let hz = mode.frequency_hz;
-            match self.modes.iter_mut().find(|range| range.id == mode.id) {
+    /// Takes one of its predictions in.
+    fn take(&mut self, sample: &Sample) {
+        for UnstableMode { id, frequency_hz: hz, .. } in sample.unstable.iter().flatten().copied() {
+            match self.modes.iter_mut().find(|range| range.id == id) {
                 Some(range) => (range.low_hz, range.high_hz) = (range.low_hz.min(hz), range.high_hz.max(hz)),
-                None => self.modes.push(ModeRange { id: mode.id, low_hz: hz, high_hz: hz }),
+                None => self.modes.push(ModeRange { id, low_hz: hz, high_hz: hz }),
             }
         }
-        let Some(mode) = unstable.first().copied().flatten() else { return };
-        if self.growth_rate_per_s.is_none_or(|before| mode.growth_rate_per_s > before) {
-            self.mode_id = Some(mode.id);
-            self.frequency_hz = Some(mode.frequency_hz);
-            self.growth_rate_per_s = Some(mode.growth_rate_per_s);
+        let now = EventMoment::new(sample);
+        let before = self.peak.and_then(|peak| peak.growth_rate_per_s);
+        if now.growth_rate_per_s.is_some_and(|growth| before.is_none_or(|before| growth > before)) {
+            self.peak = Some(now);
         }
     }
 }
@@ -192,8 +271,8 @@ pub fn iso(time_s: f64) -> String {
 pub(super) mod tests {
     use super::*;
 
-    pub fn sample(time_ns: i64, mu: f64, level: u8) -> Sample {
-        let growing = level == level::SQUEAL;
+    pub fn sample(time_ns: i64, mu: f64, status: Status) -> Sample {
+        let growing = status == Status::Squeal;
         Sample {
             time_ns,
             stamp_ns: time_ns,
@@ -201,7 +280,7 @@ pub(super) mod tests {
             normal_load_n: 500.0,
             disc_speed_rad_s: 13.0,
             friction_coefficient: mu,
-            level,
+            status,
             unstable_modes: u32::from(growing),
             max_growth_rate_per_s: 0.0,
             critical_friction: 0.4,
@@ -215,30 +294,59 @@ pub(super) mod tests {
         }
     }
 
+    /// Onset and peak are moments that were: each has the conditions and the mode of its own prediction.
     #[test]
-    fn a_stretch_of_squeal_is_one_event_with_its_fastest_mode() {
+    fn a_squeal_is_one_event_whose_onset_and_peak_have_their_own_conditions() {
         let mut events = Events::default();
-        assert!(!events.push(&sample(0, 0.3, level::OK)));
-        assert!(events.push(&sample(1_000_000_000, 0.41, level::SQUEAL)));
-        let mut fast = sample(2_000_000_000, 0.5, level::SQUEAL);
+        assert!(!events.push(&sample(0, 0.3, Status::Ok)));
+        assert!(events.push(&sample(1_000_000_000, 0.41, Status::Squeal)));
+        let mut fast =
+            Sample { normal_load_n: 700.0, disc_speed_rad_s: 9.0, ..sample(2_000_000_000, 0.5, Status::Squeal) };
         fast.unstable[0] = Some(UnstableMode { id: 4, frequency_hz: 1600.0, growth_rate_per_s: 9.0 });
         assert!(!events.push(&fast));
-        assert!(events.push(&sample(2_500_000_000, 0.39, level::WARN)));
-        assert!(events.push(&sample(3_000_000_000, 0.5, level::SQUEAL)));
-        assert!(events.push(&sample(4_000_000_000, f64::NAN, level::FAULT)));
+        assert!(!events.push(&sample(2_200_000_000, 0.45, Status::Squeal)), "slower again");
+        assert!(events.push(&sample(2_500_000_000, 0.39, Status::Warn)));
+        assert!(events.push(&sample(3_000_000_000, 0.5, Status::Squeal)));
+        assert!(events.push(&sample(4_000_000_000, f64::NAN, Status::Fault)));
         let all: Vec<&Event> = events.iter().collect();
-        assert_eq!(all.iter().map(|event| event.kind).collect::<Vec<_>>(), ["SQUEAL", "SQUEAL", "FAULT"]);
+        let kinds: Vec<EventKind> = all.iter().map(|event| event.kind).collect();
+        assert_eq!(kinds, [EventKind::Squeal, EventKind::Squeal, EventKind::Fault]);
         let first = all[0];
         assert_eq!((first.onset_s, first.end_s, first.input_seq), (1.0, Some(2.5), 1_000_000_000));
-        assert_eq!((first.mode_id, first.growth_rate_per_s, first.friction_coefficient), (Some(4), Some(9.0), 0.41));
+        let (onset, peak) = (first.onset, first.peak.expect("it grew"));
+        let seen = |at: EventMoment| (at.time_s, at.mode_id, at.frequency_hz, at.growth_rate_per_s);
+        let under = |at: EventMoment| (at.normal_load_n, at.disc_speed_rad_s, at.friction_coefficient);
+        assert_eq!(seen(onset), (1.0, Some(3), Some(1500.0), Some(1.0)));
+        assert_eq!(under(onset), (Some(500.0), Some(13.0), Some(0.41)));
+        assert_eq!(seen(peak), (2.0, Some(4), Some(1600.0), Some(9.0)));
+        assert_eq!(under(peak), (Some(700.0), Some(9.0), Some(0.5)));
         assert_eq!((all[1].end_s, all[2].end_s), (Some(4.0), None), "a fault ends a squeal; the fault lasts");
+        assert_eq!((all[2].peak, all[2].onset.friction_coefficient), (None, None));
+    }
+
+    #[test]
+    fn a_static_divergence_has_a_growth_and_no_mode() {
+        let mut events = Events::default();
+        let diverging = Sample { unstable: [None; 4], max_growth_rate_per_s: 7.0, ..sample(0, 0.5, Status::Squeal) };
+        events.push(&diverging);
+        let peak = events.iter().next().and_then(|event| event.peak).expect("it grows");
+        assert_eq!((peak.mode_id, peak.frequency_hz, peak.growth_rate_per_s), (None, None, Some(7.0)));
+    }
+
+    #[test]
+    fn waiting_for_the_first_input_is_no_event_and_silence_is_no_fault() {
+        let mut events = Events::default();
+        assert!(!events.push(&sample(0, f64::NAN, Status::Waiting)));
+        assert!(events.push(&sample(1, f64::NAN, Status::NoData)));
+        let kinds: Vec<&str> = events.iter().map(|event| event.kind.name()).collect();
+        assert_eq!(kinds, ["NO DATA"]);
     }
 
     #[test]
     fn a_short_interruption_does_not_end_an_event() {
         let mut events = Events::default();
         for (time_ms, at) in
-            [(0, level::SQUEAL), (10, level::OK), (200, level::SQUEAL), (300, level::OK), (600, level::SQUEAL)]
+            [(0, Status::Squeal), (10, Status::Ok), (200, Status::Squeal), (300, Status::Ok), (600, Status::Squeal)]
         {
             events.push(&sample(time_ms * 1_000_000, 0.5, at));
         }
@@ -250,25 +358,32 @@ pub(super) mod tests {
     #[test]
     fn csv_has_a_line_for_each_event_and_no_value_where_there_is_none() {
         let mut events = Events::default();
-        events.push(&sample(1_700_000_000_000_000_000, 0.5, level::SQUEAL));
-        events.push(&sample(1_700_000_001_250_000_000, f64::NAN, level::FAULT));
+        events.push(&sample(1_700_000_000_000_000_000, 0.5, Status::Squeal));
+        events.push(&sample(1_700_000_001_250_000_000, f64::NAN, Status::Fault));
         let csv = events.to_csv();
         let lines: Vec<&str> = csv.lines().collect();
         assert_eq!(lines.len(), 3);
         assert_eq!(
             lines[1],
-            "1,SQUEAL,2023-11-14T22:13:20.000000Z,2023-11-14T22:13:21.250000Z,1.250000,0,3,1500,1,500,13,0.5,0.4,\
-             1700000000000000000"
+            "1,SQUEAL,2023-11-14T22:13:20.000000Z,2023-11-14T22:13:21.250000Z,1.250000,0,1700000000000000000,\
+             3,1500,1,500,13,0.5,0.4,2023-11-14T22:13:20.000000Z,3,1500,1,500,13,0.5,0.4"
         );
-        assert!(lines[2].starts_with("2,FAULT,2023-11-14T22:13:21.250000Z,,,0,,,,500,13,,0.4,"), "{}", lines[2]);
-        assert!(lines.iter().all(|line| line.split(',').count() == 14));
+        assert_eq!(lines[2], "2,FAULT,2023-11-14T22:13:21.250000Z,,,0,1700000001250000000,,,,500,13,,0.4,,,,,,,,");
+        let columns: Vec<&str> = lines[0].split(',').collect();
+        assert!(lines.iter().all(|line| line.split(',').count() == columns.len()));
+        for (column, unit) in
+            [("growth_rate", "_per_s"), ("normal_load", "_n"), ("disc_speed", "_rad_s"), ("duration", "_s")]
+        {
+            let named: Vec<&&str> = columns.iter().filter(|name| name.contains(column)).collect();
+            assert!(!named.is_empty() && named.iter().all(|name| name.ends_with(unit)), "{columns:?}");
+        }
     }
 
     #[test]
     fn the_oldest_events_are_forgotten() {
         let mut events = Events::default();
         for k in 0..2 * (MOST_EVENTS as i64 + 5) {
-            events.push(&sample(k * 1_000_000_000, 0.5, if k % 2 == 0 { level::SQUEAL } else { level::OK }));
+            events.push(&sample(k * 1_000_000_000, 0.5, if k % 2 == 0 { Status::Squeal } else { Status::Ok }));
         }
         assert_eq!((events.iter().count(), events.count()), (MOST_EVENTS, MOST_EVENTS as u64 + 5));
         assert_eq!(events.iter().next().map(|event| event.number), Some(6));

@@ -195,7 +195,7 @@ impl History {
                 *range = Some((low.min(value), high.max(value)));
             }
         }
-        bin.level = bin.level.max(Some(sample.level));
+        bin.level = bin.level.max(sample.status.level());
         if sample.max_growth_rate_per_s as f32 >= fastest && sample.unstable_modes > 0 {
             let shown = |mode: UnstableMode| (mode.frequency_hz as f32, mode.growth_rate_per_s as f32);
             bin.unstable = sample.unstable.map(|mode| mode.map(shown));
@@ -207,24 +207,25 @@ impl History {
 mod tests {
     use super::*;
     use crate::display::events::tests::sample;
+    use crate::node::status::Status;
     use crate::wire::level;
 
     #[test]
     fn bins_hold_ranges_and_the_gravest_level_and_are_bounded() {
         let mut history = History::new(100, 3);
-        for (time_ns, mu, at) in [(0, 0.3, level::OK), (50, 0.1, level::SQUEAL), (99, 0.2, level::WARN)] {
+        for (time_ns, mu, at) in [(0, 0.3, Status::Ok), (50, 0.1, Status::Squeal), (99, 0.2, Status::Warn)] {
             history.push(&sample(time_ns, mu, at));
         }
         assert_eq!(history.bins().len(), 1);
         let bin = &history.bins()[0];
         assert_eq!((bin.index, bin.level), (0, Some(level::SQUEAL)));
         assert_eq!(bin.ranges[2], Some((0.1, 0.3)));
-        history.push(&sample(100, f64::NAN, level::FAULT));
+        history.push(&sample(100, f64::NAN, Status::Fault));
         assert_eq!(history.bins()[1].ranges[2], None, "a quantity that is not known has no range");
-        history.push(&sample(20, 0.4, level::OK));
+        history.push(&sample(20, 0.4, Status::Ok));
         assert_eq!((history.bins().len(), history.bins()[1].ranges[2]), (2, Some((0.4, 0.4))), "time ran backward");
         for time_ns in [1000, 2000] {
-            history.push(&sample(time_ns, 0.5, level::OK));
+            history.push(&sample(time_ns, 0.5, Status::Ok));
         }
         assert_eq!(history.bins().iter().map(|bin| bin.index).collect::<Vec<_>>(), [1, 10, 20]);
         assert_eq!(history.since(2).count(), 2);
@@ -235,7 +236,7 @@ mod tests {
         let mut history = History::coarsening(10, 8);
         let values: Vec<f64> = (0..1000).map(|k| f64::from(k * 37 % 101)).collect();
         for (k, &mu) in values.iter().enumerate() {
-            history.push(&sample(k as i64, mu, if k == 500 { level::FAULT } else { level::OK }));
+            history.push(&sample(k as i64, mu, if k == 500 { Status::Fault } else { Status::Ok }));
         }
         assert!(history.bins().len() <= 8 && history.bin_ns() == 160, "{} ns", history.bin_ns());
         for bin in history.bins() {
@@ -250,7 +251,7 @@ mod tests {
     #[test]
     fn a_bin_shows_the_modes_of_its_fastest_growth() {
         let mut history = History::new(100, 3);
-        let mut slow = sample(0, 0.5, level::SQUEAL);
+        let mut slow = sample(0, 0.5, Status::Squeal);
         slow.max_growth_rate_per_s = 0.1;
         let mut fast = slow;
         fast.max_growth_rate_per_s = 2.0;

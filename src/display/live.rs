@@ -26,8 +26,7 @@ const SIGN_OF_LIFE: Duration = Duration::from_millis(500);
 pub struct Live {
     rig: Arc<Rig>,
     watch: Watch,
-    /// From which level on a measured vibration counts as squeal.
-    threshold_db: f64,
+    about: About,
     followed: Mutex<Followed>,
     solver: Mutex<Solver>,
 }
@@ -50,7 +49,7 @@ struct Followed {
 
 impl Live {
     /// Follows from its first tick on: one that is served nowhere takes nothing.
-    pub fn new(rig: Arc<Rig>, watch: Watch, threshold_db: f64) -> Self {
+    pub fn new(rig: Arc<Rig>, watch: Watch, about: About) -> Self {
         let solver = Mutex::new(Solver::new(rig.model.dimension()));
         let followed = Followed {
             samples: vec![],
@@ -65,7 +64,7 @@ impl Live {
             map_number: 0,
             curves: None,
         };
-        Self { rig, watch, threshold_db, followed: Mutex::new(followed), solver }
+        Self { rig, watch, about, followed: Mutex::new(followed), solver }
     }
 
     fn followed(&self) -> MutexGuard<'_, Followed> {
@@ -95,6 +94,7 @@ impl Followed {
 
     fn state(&mut self, watch: &Watch, with_bins: bool) -> String {
         let snapshot = watch.snapshot();
+        let assessment = snapshot.assessment();
         if let Some(map) = snapshot.map.filter(|map| self.map.as_ref().is_none_or(|known| !Arc::ptr_eq(known, map))) {
             self.map = Some(map);
             self.map_number += 1;
@@ -105,6 +105,7 @@ impl Followed {
             time_s,
             age_s: snapshot.heard.map(|heard| heard.elapsed().as_secs_f64()),
             rate_hz: Some(self.ticks.iter().map(|tick| tick.1).sum::<usize>() as f64),
+            assessment,
             prediction: snapshot.prediction.as_ref().map(|p| Shown::new(snapshot.input.as_ref(), p)),
             spread: spread(&self.history, time_s),
             trend_per_s: trend_per_s(&self.history, time_s),
@@ -126,7 +127,7 @@ impl Followed {
 
 impl Source for Live {
     fn about(&self) -> About {
-        About::new(&self.rig, "live", self.threshold_db)
+        self.about.clone()
     }
 
     fn tick(&self, listened_to: bool) -> Option<String> {
@@ -172,5 +173,48 @@ impl Source for Live {
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
         let shape = shape(&self.rig, &mut solver, snapshot.map.as_deref(), &input.point(), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::node::status::InputSources;
+    use crate::wire::{OperatingPoint, Prediction, level};
+
+    /// What the page is sent is what was predicted, at every level, and nothing is asserted where nothing is known.
+    #[test]
+    fn the_page_is_sent_the_level_that_was_predicted() {
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let watch = Watch::default();
+        let inputs = Some(InputSources { topic: Some("/rig/operating_point".to_owned()), ..InputSources::default() });
+        let about = About { simulated: true, inputs, ..About::new(&rig, "live", 70.0) };
+        let live = Live::new(rig, watch.clone(), about);
+        let state = || serde_json::from_str::<serde_json::Value>(&live.state(None)).expect("JSON");
+        let about = serde_json::to_value(live.about()).expect("JSON");
+        assert_eq!((&about["simulated"], &about["inputs"]["topic"]), (&true.into(), &"/rig/operating_point".into()));
+        assert_eq!((&state()["status"], &state()["level"]), (&"waiting".into(), &serde_json::Value::Null));
+        for (level, status) in [
+            (level::OK, "ok"),
+            (level::WARN, "warn"),
+            (level::SQUEAL, "squeal"),
+            (level::FAULT, "fault"),
+            (level::OK, "ok"),
+        ] {
+            watch.input(&OperatingPoint::default());
+            watch.prediction(&Prediction { level, ..Prediction::default() });
+            let state = state();
+            assert_eq!((state["level"].as_u64(), state["status"].as_str()), (Some(level.into()), Some(status)));
+        }
+        watch.silence();
+        let silence =
+            Prediction { level: level::FAULT, reason: "stale: no input for 1 s".to_owned(), ..Prediction::default() };
+        watch.prediction(&silence);
+        let state = state();
+        assert_eq!(
+            (state["status"].as_str(), state["message"].as_str()),
+            (Some("no_data"), Some("inputs have stopped"))
+        );
+        assert!(state["next"].is_null() && state["fastest"].is_null());
     }
 }

@@ -1,6 +1,6 @@
 //! A recording, as the page sees it: read once, then asked moment by moment.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::comparison::{Comparison, Criteria, Measurements};
@@ -13,9 +13,11 @@ use super::state::{Shown, State, spread, trend_per_s};
 use super::time_line::TimeLine;
 use crate::io::message::Payload;
 use crate::io::recording::{FileDamage, Recorded as Content, Recording};
+use crate::node::status::{Assessment, Inputs, Status};
 use crate::node::{Sample, VibrationSample, session_map};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
+use crate::simulator;
 use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind, level};
 
 /// Bins of the history; they get longer with the recording.
@@ -37,9 +39,10 @@ pub struct Moment {
     pub time_ns: i64,
     pub input: Option<OperatingPoint>,
     pub prediction: Prediction,
+    status: Status,
     /// Number of the prediction in the recording.
     index: u64,
-    /// Its level is not that of the prediction before.
+    /// Its status is not that of the prediction before.
     changed: bool,
 }
 
@@ -54,8 +57,10 @@ pub struct Recorded {
     pub moments: Vec<Moment>,
     /// Of how many predictions one is kept.
     pub stride: u64,
-    /// Predictions by level: OK, WARN, SQUEAL, FAULT.
-    pub levels: [u64; 4],
+    /// Predictions by status.
+    pub counts: HashMap<Status, u64>,
+    /// Whether the rig simulator made an input.
+    pub simulated: bool,
     /// Inputs that were recorded, and those of them that were predicted.
     pub inputs: u64,
     pub answered: u64,
@@ -65,7 +70,9 @@ pub struct Recorded {
     /// Settings and maps, in order, with their time on the time line of the stamps.
     pub session_events: Vec<(i64, SessionEvent)>,
     pub damage: Vec<FileDamage>,
-    level_before: Option<u8>,
+    status_before: Option<Status>,
+    /// Whether inputs came at the latest entry that was read.
+    flow: Inputs,
     maps: Mutex<VecDeque<(u64, Arc<StabilityMap>)>>,
     solver: Mutex<Solver>,
 }
@@ -81,14 +88,16 @@ impl Recorded {
             vibration: Measurements::new(criteria),
             moments: vec![],
             stride: 1,
-            levels: [0; 4],
+            counts: HashMap::new(),
+            simulated: false,
             inputs: 0,
             answered: 0,
             counted: None,
             reused: 0,
             session_events: vec![],
             damage: vec![],
-            level_before: None,
+            status_before: None,
+            flow: Inputs::default(),
             maps: Mutex::default(),
         };
         let mut inputs: VecDeque<OperatingPoint> = VecDeque::new();
@@ -99,6 +108,7 @@ impl Recorded {
             match entry.message {
                 Content::Known(Payload::OperatingPoint(input)) => {
                     recorded.inputs += 1;
+                    recorded.flow.came();
                     if inputs.len() == INPUTS {
                         inputs.pop_front();
                     }
@@ -125,7 +135,10 @@ impl Recorded {
                 }
                 Content::Known(Payload::Diagnostics(counted)) => recorded.counted = Some(counted),
                 Content::Known(Payload::SessionEvent(event)) => {
-                    recorded.session_events.push((line.unstamped(log_ns), event))
+                    if event.kind == event_kind::SILENCE {
+                        recorded.flow.silence();
+                    }
+                    recorded.session_events.push((line.unstamped(log_ns), event));
                 }
                 Content::Known(Payload::RigInfo(_) | Payload::Sensitivity(_))
                 | Content::Unreadable(_)
@@ -137,15 +150,17 @@ impl Recorded {
     }
 
     fn take(&mut self, time_ns: i64, input: Option<&OperatingPoint>, prediction: Prediction) {
-        let sample = Sample::new(time_ns, input, &prediction);
+        self.flow.predicted();
+        let sample = Sample::new(time_ns, input, &prediction, self.flow);
         self.history.push(&sample);
         self.events.push(&sample);
-        let count: u64 = self.levels.iter().sum();
-        self.levels[usize::from(prediction.level).min(3)] += 1;
+        let count = self.predictions();
+        let status = sample.status;
+        *self.counts.entry(status).or_default() += 1;
+        self.simulated |= prediction.header.frame_id == simulator::FRAME_ID;
         self.reused += u64::from(prediction.reused);
         self.answered += u64::from(input.is_some_and(|input| input.header.stamp == prediction.header.stamp));
-        let changed = self.level_before != Some(prediction.level);
-        self.level_before = Some(prediction.level);
+        let changed = self.status_before.replace(status) != Some(status);
         if !changed && !count.is_multiple_of(self.stride) {
             return;
         }
@@ -159,7 +174,25 @@ impl Recorded {
                 self.moments.retain(regular);
             }
         }
-        self.moments.push(Moment { time_ns, input: input.cloned(), prediction, index: count, changed });
+        self.moments.push(Moment { time_ns, input: input.cloned(), prediction, status, index: count, changed });
+    }
+
+    /// How many predictions there were.
+    pub fn predictions(&self) -> u64 {
+        self.counts.values().sum()
+    }
+
+    /// How many predictions of a status there were.
+    pub fn count(&self, status: Status) -> u64 {
+        self.counts.get(&status).copied().unwrap_or(0)
+    }
+
+    /// What is said first of a moment.
+    fn assessment(&self, moment: &Moment) -> Assessment {
+        let map = moment.status.is_known().then(|| self.stability_map(self.map_number(seconds(moment.time_ns))));
+        let map = map.flatten();
+        let windows = map.as_deref().map(|map| (map, &map.ends));
+        Assessment::new(moment.status, &moment.prediction, moment.input.as_ref(), windows)
     }
 
     /// First and last moment, s since the epoch; `None` without any prediction.
@@ -244,6 +277,7 @@ impl Source for Recorded {
             }
         });
         About {
+            simulated: self.simulated,
             span_s: self.span_s(),
             notes: notes.collect(),
             ..About::new(&self.rig, "recording", self.vibration.criteria().threshold_db)
@@ -261,6 +295,7 @@ impl Source for Recorded {
             time_s,
             age_s: moment.map(|moment| (time_s - seconds(moment.time_ns)).max(0.0)),
             rate_hz: None,
+            assessment: moment.map_or_else(Assessment::waiting, |moment| self.assessment(moment)),
             prediction: moment.map(|moment| Shown::new(moment.input.as_ref(), &moment.prediction)),
             spread: spread(&self.history, time_s),
             trend_per_s: trend_per_s(&self.history, time_s),
@@ -298,5 +333,77 @@ impl Source for Recorded {
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
         let shape = shape(&self.rig, &mut solver, map.as_deref(), &input.point(), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::display::comparison::Criteria;
+    use crate::display::events::EventKind;
+    use crate::display::report::{Origin, report};
+    use crate::offline::{self, Measured, Quantity};
+    use crate::wire::{Header, Time, level};
+
+    const STEPS: u32 = 40;
+
+    /// A simulated session every 0.1 s, at friction coefficients from 0.28 to 0.45: `nine-dof-case-2` squeals above 0.3559.
+    fn ramp(directory: &std::path::Path) -> Recorded {
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let inputs = (0..STEPS).map(|seq| {
+            let stamp = Time::from_ns(offline::START_NS + i64::from(seq) * 100_000_000);
+            let header = Header { stamp, frame_id: simulator::FRAME_ID.to_owned() };
+            let friction_coefficient = 0.28 + 0.17 * f64::from(seq) / f64::from(STEPS);
+            let (seq, normal_load_n) = (seq.into(), 500.0);
+            let input = OperatingPoint { header, seq, normal_load_n, disc_speed_rad_s: 13.0, friction_coefficient };
+            Measured::at_its_stamp(Quantity::Conditions(input))
+        });
+        let predicted = offline::record(&rig, None, std::iter::empty(), inputs, directory).expect("recorded");
+        Recorded::read(&Recording::open(&predicted.directory).expect("a recording"), rig, Criteria::default())
+    }
+
+    #[test]
+    fn every_moment_says_what_was_predicted_then() {
+        let directory = tempfile::tempdir().expect("a folder");
+        let recorded = ramp(directory.path());
+        assert_eq!(recorded.moments.len(), STEPS as usize);
+        let mut seen = [0; 3];
+        for moment in &recorded.moments {
+            let text = recorded.state(Some(seconds(moment.time_ns)));
+            let state: serde_json::Value = serde_json::from_str(&text).expect("JSON");
+            let prediction = &moment.prediction;
+            assert_eq!(state["seq"].as_u64(), Some(prediction.input_seq), "{text}");
+            assert_eq!(state["level"].as_u64(), Some(prediction.level.into()), "{text}");
+            let names = [(level::OK, "ok"), (level::WARN, "warn"), (level::SQUEAL, "squeal")];
+            let (level, name) = names[usize::from(prediction.level)];
+            seen[usize::from(level)] += 1;
+            assert_eq!(state["status"], name, "{text}");
+            assert_eq!(state["simulated"], true, "{text}");
+            let growth = state["fastest"]["growth_rate_per_s"].as_f64();
+            assert_eq!(growth, (prediction.unstable_modes > 0).then_some(prediction.max_growth_rate_per_s), "{text}");
+            if prediction.friction_margin.is_finite() {
+                let next = &state["next"];
+                assert_eq!(next["margin"].as_f64(), Some(prediction.friction_margin), "{text}");
+                assert!((next["mu"].as_f64().expect("a place") - 0.3559).abs() < 1e-4, "the only window near: {text}");
+                assert_eq!(next["ids"].as_array().map(Vec::len), Some(2), "a pair merges: {text}");
+            }
+        }
+        assert!(seen.iter().all(|&count| count > 3), "OK, WARN and SQUEAL: {seen:?}");
+    }
+
+    #[test]
+    fn a_report_says_that_its_conditions_were_simulated_and_tells_onset_and_peak_apart() {
+        let directory = tempfile::tempdir().expect("a folder");
+        let recorded = ramp(directory.path());
+        let [event] = recorded.events.iter().collect::<Vec<_>>()[..] else { panic!("{:?}", recorded.events) };
+        let peak = event.peak.expect("it grows");
+        assert_eq!((event.kind, event.end_s), (EventKind::Squeal, None));
+        let (onset_mu, peak_mu) = (event.onset.friction_coefficient, peak.friction_coefficient);
+        assert!(onset_mu < Some(0.37) && peak_mu > Some(0.44), "growth rises with friction: {event:?}");
+        let about = recorded.about();
+        assert!(about.simulated && about.inputs.is_none());
+        let html = report(&recorded, &Origin { file: "ramp".to_owned(), version: None }).expect("a report");
+        assert!(html.contains("Conditions of a rig simulator, not of a rig"), "{html:.2000}");
+        assert!(html.contains("at μ = 0.44"), "the worst moment is that of the peak: {html:.2000}");
     }
 }

@@ -4,11 +4,12 @@ use std::fmt::Write;
 
 use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
-use super::events::{Event, Events, iso, seconds};
+use super::events::{Event, EventKind, EventMoment, Events, iso, seconds};
 use super::recorded::Recorded;
 use crate::html::{escaped, facts, figure, page, section};
+use crate::node::status::Status;
 use crate::plot;
-use crate::wire::{SessionEvent, event_kind, level};
+use crate::wire::{SessionEvent, event_kind};
 
 /// Stability maps drawn.
 const WORST: usize = 3;
@@ -34,6 +35,9 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     let (from_s, to_s) = recorded.span_s().unwrap_or((0.0, 0.0));
     let title = format!("{}, {}", rig.name, iso(from_s));
     let mut html = format!("<h1>Session report</h1>\n<p class=\"lead\">{}</p>\n", escaped(&title));
+    if recorded.simulated {
+        html += "<p class=\"lead\">Conditions of a rig simulator, not of a rig.</p>\n";
+    }
     html += &verdict(recorded, to_s);
     html += &section("Session", &session(recorded, origin, from_s, to_s));
     html += &section(
@@ -57,8 +61,9 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     let mut maps = String::new();
     let mut drawn = vec![];
     for event in worst(&recorded.events) {
-        let at_s = event.onset_s;
-        let number = recorded.map_number(event.end_s.unwrap_or(at_s)).max(1);
+        let Some(peak) = event.peak else { continue };
+        let at_s = peak.time_s;
+        let number = recorded.map_number(at_s).max(1);
         // One figure of each map, at its worst moment.
         if drawn.len() == WORST || drawn.contains(&number) {
             continue;
@@ -75,7 +80,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
             map.point.disc_speed_rad_s,
             map.critical_friction().map_or_else(|| "none".to_owned(), |mu| format!("{mu:.6}")),
         );
-        let mu = at_its_worst(recorded, event);
+        let mu = peak.friction_coefficient.unwrap_or(0.0);
         let last = curves.mu.last().copied().unwrap_or(1.0);
         let wanted = [1.6 * curves.critical_friction.unwrap_or(last), 1.15 * mu, 0.05];
         let to = wanted.into_iter().filter(|mu| mu.is_finite()).fold(0.0, f64::max).min(last);
@@ -98,31 +103,42 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
 /// One sentence for who reads no further.
 fn verdict(recorded: &Recorded, to_s: f64) -> String {
     let events = &recorded.events;
-    let predictions: u64 = recorded.levels.iter().sum();
-    let faults = recorded.levels[usize::from(level::FAULT)];
-    let failed = match faults {
+    let predictions = recorded.predictions();
+    let faults = recorded.count(Status::Fault);
+    let mut failed = match faults {
         0 => String::new(),
         _ => format!(
             "<p class=\"verdict fault\">{faults} of {predictions} predictions are faults: nothing is known of these \
              moments.</p>\n"
         ),
     };
-    let squeals: Vec<&Event> = events.iter().filter(|event| event.kind == level::name(level::SQUEAL)).collect();
+    let silences: Vec<&Event> = events.iter().filter(|event| event.kind == EventKind::NoData).collect();
+    if !silences.is_empty() {
+        let lasted: f64 = silences.iter().map(|event| event.end_s.unwrap_or(to_s) - event.onset_s).sum();
+        let count = silences.len();
+        let times = if count == 1 { "once".to_owned() } else { format!("{count} times") };
+        let _ = writeln!(failed, "<p class=\"verdict fault\">Inputs stopped {times}, for {lasted:.2} s in all.</p>");
+    }
+    let squeals: Vec<&Event> = events.iter().filter(|event| event.kind == EventKind::Squeal).collect();
+    let known = recorded.counts.iter().any(|(status, &count)| status.is_known() && count > 0);
     let lasted: f64 = squeals.iter().map(|event| event.end_s.unwrap_or(to_s) - event.onset_s).sum();
     let worst = worst(events).into_iter().next();
     match worst {
-        None if squeals.is_empty() && faults == predictions => failed,
+        None if squeals.is_empty() && !known => {
+            format!("<p class=\"verdict fault\">Nothing was predicted: no input was usable.</p>\n{failed}")
+        }
         None if squeals.is_empty() => format!("<p class=\"verdict ok\">No squeal was predicted.</p>\n{failed}"),
         worst => {
             format!(
                 "<p class=\"verdict squeal\">Squeal was predicted {} time{}, {lasted:.2} s in all{}.</p>\n",
                 squeals.len(),
                 if squeals.len() == 1 { "" } else { "s" },
-                worst.map_or_else(String::new, |event| format!(
-                    "; worst in mode {} at {} Hz, growing by {} 1/s",
-                    event.mode_id.unwrap_or_default(),
-                    number(event.frequency_hz.unwrap_or(f64::NAN)),
-                    number(event.growth_rate_per_s.unwrap_or(f64::NAN)),
+                worst.and_then(|event| event.peak).map_or_else(String::new, |peak| format!(
+                    "; worst in {} at {} Hz, growing by {} 1/s at μ = {}",
+                    peak.mode_id.map_or_else(|| "static divergence".to_owned(), |id| format!("mode {id}")),
+                    optional(peak.frequency_hz),
+                    optional(peak.growth_rate_per_s),
+                    optional(peak.friction_coefficient),
                 ))
             ) + &failed
         }
@@ -130,7 +146,8 @@ fn verdict(recorded: &Recorded, to_s: f64) -> String {
 }
 
 fn session(recorded: &Recorded, origin: &Origin, from_s: f64, to_s: f64) -> String {
-    let [ok, warn, squeal, fault] = recorded.levels;
+    let counted = Status::ALL.into_iter().filter(|&status| recorded.count(status) > 0);
+    let counted: Vec<String> = counted.map(|status| format!("{} {}", status.name(), recorded.count(status))).collect();
     let mut rows = vec![
         ("recording", origin.file.clone()),
         ("from", iso(from_s)),
@@ -140,10 +157,7 @@ fn session(recorded: &Recorded, origin: &Origin, from_s: f64, to_s: f64) -> Stri
         ("recorded by", origin.version.clone().unwrap_or_else(|| "not known".to_owned())),
         ("report by", format!("squealcast {}", env!("CARGO_PKG_VERSION"))),
         ("inputs", recorded.inputs.to_string()),
-        (
-            "predictions",
-            format!("{} (OK {ok}, WARN {warn}, SQUEAL {squeal}, FAULT {fault})", ok + warn + squeal + fault),
-        ),
+        ("predictions", format!("{} ({})", recorded.predictions(), counted.join(", "))),
     ];
     let settings = recorded.session_events.iter().filter(|(_, event)| event.kind == event_kind::PARAMETER);
     let told: Vec<String> = settings
@@ -161,32 +175,47 @@ fn events(events: &Events, from_s: f64) -> String {
     if count == 0 {
         return "<p>None.</p>\n".to_owned();
     }
-    let mut html = "<table><thead><tr><th>no.</th><th>event</th><th>after, s</th><th>end, s</th><th>duration, s</th><th>mode</th>\
-                    <th>frequency, Hz</th><th>growth, 1/s</th><th>μ</th><th>load, N</th><th>speed, rad/s</th></tr></thead>\
-                    <tbody>\n"
-        .to_owned();
+    let of_moment =
+        "<th>mode</th><th>frequency, Hz</th><th>growth, 1/s</th><th>μ</th><th>load, N</th><th>speed, rad/s</th>";
+    let mut html = format!(
+        "<table><thead><tr><th rowspan=\"2\">no.</th><th rowspan=\"2\">event</th><th rowspan=\"2\">end, s</th>\
+         <th rowspan=\"2\">duration, s</th><th colspan=\"7\">onset</th><th colspan=\"7\">fastest growth</th></tr>\n\
+         <tr><th>after, s</th>{of_moment}<th>after, s</th>{of_moment}</tr></thead><tbody>\n"
+    );
     for event in events.iter().take(LISTED) {
         let cells = [
             event.number.to_string(),
-            event.kind.to_owned(),
-            format!("{:.3}", event.onset_s - from_s),
+            event.kind.name().to_owned(),
             event.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - from_s)),
             event.end_s.map_or_else(|| "–".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s)),
-            event.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
-            event.frequency_hz.map_or_else(|| "–".to_owned(), number),
-            event.growth_rate_per_s.map_or_else(|| "–".to_owned(), number),
-            number(event.friction_coefficient),
-            number(event.normal_load_n),
-            number(event.disc_speed_rad_s),
         ];
-        let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
-        let _ = writeln!(html, "<tr class=\"{}\">{cells}</tr>", event.kind.to_lowercase());
+        let peak = event.peak.map_or_else(|| vec!["–".to_owned(); 7], |peak| event_moment(&peak, from_s));
+        let cells = cells.into_iter().chain(event_moment(&event.onset, from_s)).chain(peak);
+        let cells: String = cells.map(|cell| format!("<td>{cell}</td>")).collect();
+        let class = match event.kind {
+            EventKind::Squeal => "squeal",
+            EventKind::Fault | EventKind::NoData => "fault",
+        };
+        let _ = writeln!(html, "<tr class=\"{class}\">{cells}</tr>");
     }
     html += "</tbody></table>\n";
     if count > LISTED {
         let _ = writeln!(html, "<p>{} more in events.csv.</p>", count - LISTED);
     }
     html
+}
+
+/// When it was, what grew fastest, and under which conditions.
+fn event_moment(moment: &EventMoment, from_s: f64) -> Vec<String> {
+    vec![
+        format!("{:.3}", moment.time_s - from_s),
+        moment.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
+        optional(moment.frequency_hz),
+        optional(moment.growth_rate_per_s),
+        optional(moment.friction_coefficient),
+        optional(moment.normal_load_n),
+        optional(moment.disc_speed_rad_s),
+    ]
 }
 
 /// Hits, misses and false alarms, and what these words mean.
@@ -313,20 +342,10 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
 
 /// The events that grow, the fastest first.
 fn worst(events: &Events) -> Vec<&Event> {
-    let mut squeals: Vec<&Event> = events.iter().filter(|event| event.growth_rate_per_s.is_some()).collect();
-    squeals.sort_by(|a, b| b.growth_rate_per_s.unwrap_or(0.0).total_cmp(&a.growth_rate_per_s.unwrap_or(0.0)));
+    let growth = |event: &Event| event.peak.and_then(|peak| peak.growth_rate_per_s);
+    let mut squeals: Vec<&Event> = events.iter().filter(|event| growth(event).is_some()).collect();
+    squeals.sort_by(|a, b| growth(b).unwrap_or(0.0).total_cmp(&growth(a).unwrap_or(0.0)));
     squeals
-}
-
-/// The friction coefficient of the fastest growth during an event, as far as its moments are kept.
-fn at_its_worst(recorded: &Recorded, event: &Event) -> f64 {
-    let during = |time_s: f64| time_s >= event.onset_s - 1e-7 && event.end_s.is_none_or(|end_s| time_s <= end_s);
-    let moments = recorded.moments.iter().filter(|moment| during(seconds(moment.time_ns)));
-    let growth = |moment: &&super::recorded::Moment| moment.prediction.max_growth_rate_per_s;
-    let worst = moments.filter(|moment| growth(moment).is_finite()).max_by(|a, b| growth(a).total_cmp(&growth(b)));
-    worst
-        .and_then(|moment| moment.input.as_ref())
-        .map_or(event.friction_coefficient, |input| input.friction_coefficient)
 }
 
 /// The largest bounds over the session, by mode.
@@ -378,6 +397,10 @@ fn skipped(recorded: &Recorded) -> String {
         let _ = writeln!(html, "<p>{}</p>", escaped(&damage.to_string()));
     }
     html
+}
+
+fn optional(value: Option<f64>) -> String {
+    number(value.unwrap_or(f64::NAN))
 }
 
 /// A number with six significant digits at most.

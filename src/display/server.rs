@@ -29,6 +29,7 @@ use super::assets;
 use super::comparison::Comparison;
 use super::connections::{self, Bounds};
 use super::events::Events;
+use crate::node::status::InputSources;
 use crate::rig::Rig;
 
 /// Time between two states: not more than 30 a second.
@@ -74,6 +75,10 @@ pub struct About {
     pub instability_threshold: f64,
     /// From which level on a measured vibration counts as squeal.
     pub vibration_threshold_db: f64,
+    /// Whether the inputs come, or came, from the rig simulator.
+    pub simulated: bool,
+    /// What a node listens to.
+    pub inputs: Option<InputSources>,
     /// First and last moment of a recording, s since the epoch.
     pub span_s: Option<(f64, f64)>,
     /// When maps and charts of a recording became ready.
@@ -102,6 +107,8 @@ impl About {
             warn_margin: rig.warning.margin,
             instability_threshold: rig.instability_threshold,
             vibration_threshold_db,
+            simulated: false,
+            inputs: None,
             span_s: None,
             notes: vec![],
         }

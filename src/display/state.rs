@@ -4,7 +4,9 @@ use serde::Serialize;
 
 use super::events::seconds;
 use super::history::{Bin, History};
+use crate::node::status::Assessment;
 use crate::session::Counters;
+use crate::simulator;
 use crate::wire::{OperatingPoint, Prediction};
 
 /// How far back spread and trend look, s.
@@ -19,6 +21,8 @@ pub struct State<'a> {
     pub age_s: Option<f64>,
     /// Predictions in the last second.
     pub rate_hz: Option<f64>,
+    #[serde(flatten)]
+    pub assessment: Assessment,
     #[serde(flatten)]
     pub prediction: Option<Shown<'a>>,
     /// Smallest and largest friction coefficient of the last 2 s.
@@ -45,6 +49,8 @@ pub struct Shown<'a> {
     pub seq: u64,
     pub stamp_s: f64,
     pub reused: bool,
+    /// Whether the input came from the rig simulator. Shared memory does not carry that.
+    pub simulated: bool,
     pub load: Option<f64>,
     pub speed: Option<f64>,
     pub mu: Option<f64>,
@@ -95,6 +101,7 @@ impl<'a> Shown<'a> {
             seq: prediction.input_seq,
             stamp_s: seconds(prediction.header.stamp.as_ns()),
             reused: prediction.reused,
+            simulated: prediction.header.frame_id == simulator::FRAME_ID,
             load: input.map(|input| input.normal_load_n),
             speed: input.map(|input| input.disc_speed_rad_s),
             mu: input.map(|input| input.friction_coefficient),
@@ -145,14 +152,15 @@ pub fn trend_per_s(history: &History, time_s: f64) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::display::events::tests::sample;
-    use crate::wire::{Mode, level};
+    use crate::node::status::Status;
+    use crate::wire::Mode;
 
     #[test]
     fn spread_and_trend_look_two_seconds_back() {
         let mut history = History::new(200_000_000, 100);
         for k in 0..500 {
             let time_s = 0.01 * f64::from(k);
-            history.push(&sample((time_s * 1e9) as i64, 0.3 + 0.02 * time_s, level::OK));
+            history.push(&sample((time_s * 1e9) as i64, 0.3 + 0.02 * time_s, Status::Ok));
         }
         let (low, high) = spread(&history, 4.99).unwrap();
         assert!((f64::from(low) - (0.3 + 0.02 * 2.8)).abs() < 1e-6 && (f64::from(high) - 0.3998).abs() < 1e-6);

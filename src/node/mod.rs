@@ -11,6 +11,7 @@ mod recorded_tests;
 mod sensitivity;
 mod shortcut;
 mod statistics;
+pub mod status;
 mod watch;
 
 use std::collections::{HashMap, VecDeque};
@@ -334,6 +335,7 @@ impl Node {
             Ok(Ok(ends)) if in_force => {
                 self.statistics.ends += 1;
                 self.note(at_load_and_speed(event_kind::WINDOW_ENDS, &ends.point, ends_hash(&ends)));
+                self.watch.ends(&ends);
                 self.step(Event::EndsReady(ends), None);
             }
             Ok(Err(point)) if in_force => self.mapper.want(point),
@@ -394,6 +396,7 @@ impl Node {
         let header = now_header();
         let stamp = header.stamp;
         self.note(SessionEvent { header, kind: event_kind::SILENCE, ..Default::default() });
+        self.watch.silence();
         self.step(Event::Silence { stamp }, None);
     }
 

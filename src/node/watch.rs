@@ -3,8 +3,11 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
+use serde::Serialize;
+
+use super::status::{Assessment, Inputs, Status};
 use crate::io::clock;
-use crate::physics::StabilityMap;
+use crate::physics::{Ends, StabilityMap};
 use crate::session::Counters;
 use crate::wire::{OperatingPoint, Prediction, Vibration};
 
@@ -16,7 +19,11 @@ pub struct Snapshot {
     pub prediction: Option<Prediction>,
     /// When the last input was heard.
     pub heard: Option<Instant>,
+    /// Whether inputs come.
+    pub inputs: Inputs,
     pub map: Option<Arc<StabilityMap>>,
+    /// The ends of the map's windows at another load and speed than the map's.
+    pub ends: Option<Arc<Ends>>,
     /// The margin below which the node warns now; `None` before it began.
     pub warn_margin: Option<f64>,
     pub counters: Counters,
@@ -25,6 +32,17 @@ pub struct Snapshot {
     pub ros2_falls: u64,
     /// Why not everything is recorded.
     pub recording_problem: Option<String>,
+}
+
+impl Snapshot {
+    /// What is said first of it.
+    pub fn assessment(&self) -> Assessment {
+        let Some(prediction) = &self.prediction else { return Assessment::waiting() };
+        let status = Status::new(Some(prediction.level), self.inputs);
+        let map = self.map.as_deref();
+        let windows = map.map(|map| (map, self.ends.as_deref().unwrap_or(&map.ends)));
+        Assessment::new(status, prediction, self.input.as_ref(), windows)
+    }
 }
 
 /// Unstable modes kept of a [`Sample`].
@@ -44,7 +62,7 @@ pub struct Sample {
     pub normal_load_n: f64,
     pub disc_speed_rad_s: f64,
     pub friction_coefficient: f64,
-    pub level: u8,
+    pub status: Status,
     pub unstable_modes: u32,
     pub max_growth_rate_per_s: f64,
     pub critical_friction: f64,
@@ -54,33 +72,38 @@ pub struct Sample {
 }
 
 /// A growing mode.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct UnstableMode {
     pub id: u32,
     pub frequency_hz: f64,
     pub growth_rate_per_s: f64,
 }
 
-impl Sample {
-    /// The sample of a prediction made at `time_ns` for `input`.
-    pub fn new(time_ns: i64, input: Option<&OperatingPoint>, prediction: &Prediction) -> Self {
-        let value = |of: fn(&OperatingPoint) -> f64| input.map_or(f64::NAN, of);
-        let mut unstable = [None; SAMPLE_MODES];
-        // Roots that do not oscillate count as unstable too but are not among the modes.
-        let kept = SAMPLE_MODES.min(prediction.unstable_modes as usize);
-        for mode in prediction.modes.iter().filter(|mode| mode.growth_rate_per_s > 0.0) {
-            let mut candidate = Some(UnstableMode {
-                id: mode.id,
-                frequency_hz: mode.frequency_hz,
-                growth_rate_per_s: mode.growth_rate_per_s,
-            });
-            for place in &mut unstable[..kept] {
-                let growth = |mode: &Option<UnstableMode>| mode.map_or(0.0, |mode| mode.growth_rate_per_s);
-                if growth(&candidate) > growth(place) {
-                    std::mem::swap(place, &mut candidate);
-                }
+/// The fastest growing unstable modes of a prediction, fastest first.
+pub fn fastest_modes(prediction: &Prediction) -> [Option<UnstableMode>; SAMPLE_MODES] {
+    let mut unstable = [None; SAMPLE_MODES];
+    // Roots that do not oscillate count as unstable too but are not among the modes.
+    let kept = SAMPLE_MODES.min(prediction.unstable_modes as usize);
+    for mode in prediction.modes.iter().filter(|mode| mode.growth_rate_per_s > 0.0) {
+        let mut candidate = Some(UnstableMode {
+            id: mode.id,
+            frequency_hz: mode.frequency_hz,
+            growth_rate_per_s: mode.growth_rate_per_s,
+        });
+        for place in &mut unstable[..kept] {
+            let growth = |mode: &Option<UnstableMode>| mode.map_or(0.0, |mode| mode.growth_rate_per_s);
+            if growth(&candidate) > growth(place) {
+                std::mem::swap(place, &mut candidate);
             }
         }
+    }
+    unstable
+}
+
+impl Sample {
+    /// The sample of a prediction made at `time_ns` for `input`.
+    pub fn new(time_ns: i64, input: Option<&OperatingPoint>, prediction: &Prediction, inputs: Inputs) -> Self {
+        let value = |of: fn(&OperatingPoint) -> f64| input.map_or(f64::NAN, of);
         Self {
             time_ns,
             stamp_ns: prediction.header.stamp.as_ns(),
@@ -88,12 +111,12 @@ impl Sample {
             normal_load_n: value(|input| input.normal_load_n),
             disc_speed_rad_s: value(|input| input.disc_speed_rad_s),
             friction_coefficient: value(|input| input.friction_coefficient),
-            level: prediction.level,
+            status: Status::new(Some(prediction.level), inputs),
             unstable_modes: prediction.unstable_modes,
             max_growth_rate_per_s: prediction.max_growth_rate_per_s,
             critical_friction: prediction.critical_friction,
             friction_margin: prediction.friction_margin,
-            unstable,
+            unstable: fastest_modes(prediction),
         }
     }
 }
@@ -123,6 +146,8 @@ struct Watched {
     snapshot: Snapshot,
     /// The latest input, which may not be predicted yet.
     input: Option<OperatingPoint>,
+    /// Whether it came after the latest prediction.
+    is_new: bool,
     /// `None` while nobody follows.
     samples: Option<Vec<Sample>>,
     /// Of the same follower.
@@ -161,16 +186,26 @@ impl Watch {
         self.with(|watched| {
             watched.snapshot.heard = Some(Instant::now());
             watched.input = Some(input.clone());
+            watched.is_new = true;
         });
     }
 
-    /// It was predicted.
+    /// The node noticed that no input comes; its prediction follows.
+    pub fn silence(&self) {
+        self.with(|watched| watched.snapshot.inputs.silence());
+    }
+
+    /// A prediction was made.
     pub fn prediction(&self, prediction: &Prediction) {
         self.with(|watched| {
-            let Watched { snapshot, input, samples, lost, .. } = watched;
+            let Watched { snapshot, input, is_new, samples, lost, .. } = watched;
+            match std::mem::take(is_new) {
+                true => snapshot.inputs.came(),
+                false => snapshot.inputs.predicted(),
+            }
             if let Some(samples) = samples {
                 if samples.len() < MOST_SAMPLES {
-                    samples.push(Sample::new(clock::now_ns(), input.as_ref(), prediction));
+                    samples.push(Sample::new(clock::now_ns(), input.as_ref(), prediction, snapshot.inputs));
                 } else {
                     *lost += 1;
                 }
@@ -190,7 +225,11 @@ impl Watch {
     }
 
     pub(super) fn map(&self, map: &Arc<StabilityMap>) {
-        self.with(|watched| watched.snapshot.map = Some(map.clone()));
+        self.with(|watched| (watched.snapshot.map, watched.snapshot.ends) = (Some(map.clone()), None));
+    }
+
+    pub(super) fn ends(&self, ends: &Arc<Ends>) {
+        self.with(|watched| watched.snapshot.ends = Some(ends.clone()));
     }
 
     pub(super) fn warn_margin(&self, warn_margin: f64) {
@@ -211,7 +250,7 @@ impl Watch {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::Mode;
+    use crate::wire::{Mode, level};
 
     fn prediction(growth: &[f64], unstable_modes: u32) -> Prediction {
         let mode =
@@ -221,15 +260,38 @@ mod tests {
 
     #[test]
     fn samples_keep_the_fastest_growing_modes_in_order() {
-        let sample = Sample::new(0, None, &prediction(&[0.5, -1.0, 2.0, 0.1, 3.0, 0.7], 5));
+        let sample = Sample::new(0, None, &prediction(&[0.5, -1.0, 2.0, 0.1, 3.0, 0.7], 5), Inputs::default());
         assert_eq!(sample.unstable.map(|mode| mode.map(|mode| mode.id)), [Some(4), Some(2), Some(5), Some(0)]);
-        let sample = Sample::new(0, None, &prediction(&[1e-12, 2.0], 1));
+        let sample = Sample::new(0, None, &prediction(&[1e-12, 2.0], 1), Inputs::default());
         assert_eq!(
             sample.unstable.map(|mode| mode.map(|mode| mode.id)),
             [Some(1), None, None, None],
             "one is unstable"
         );
         assert!(sample.normal_load_n.is_nan());
+    }
+
+    /// A node that hears nothing waits; it is no fault, before the first input or after the last.
+    #[test]
+    fn the_status_follows_inputs_and_silence() {
+        let watch = Watch::default();
+        let status = || watch.snapshot().assessment().status;
+        let faulty = Prediction { level: level::FAULT, ..Prediction::default() };
+        assert_eq!(status(), Status::Waiting);
+        watch.silence();
+        watch.prediction(&faulty);
+        assert_eq!(status(), Status::Waiting);
+        watch.input(&OperatingPoint::default());
+        for (level, expected) in [(level::OK, Status::Ok), (level::WARN, Status::Warn), (level::SQUEAL, Status::Squeal)]
+        {
+            watch.prediction(&Prediction { level, ..Prediction::default() });
+            assert_eq!(status(), expected);
+        }
+        watch.prediction(&faulty);
+        assert_eq!(status(), Status::Fault);
+        watch.silence();
+        watch.prediction(&faulty);
+        assert_eq!(status(), Status::NoData);
     }
 
     #[test]

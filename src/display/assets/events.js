@@ -31,13 +31,15 @@ export class Events {
 
   #row(event) {
     const row = document.createElement("tr");
-    row.className = event.class ?? event.kind.toLowerCase();
+    row.className = event.class ?? (event.kind === "SQUEAL" ? "squeal" : "fault");
     const moment = (at_s) => (this.start === undefined ? time(at_s) : `${fixed(at_s - this.start, 2)} s`);
     const ends = known(event.end_s);
+    // Where it grows fastest; a fault where it begins; notes and measurements have values of their own.
+    const shown = event.peak ?? event.onset ?? event;
     const values = [
       event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, moment(event.onset_s),
-      ends ? moment(event.end_s) : event.end_s === null ? "lasts" : NONE, ends ? fixed(event.end_s - event.onset_s, 2) : NONE, event.mode_id ?? NONE, this.#frequency(event.frequency_hz),
-      fixed(event.friction_coefficient, 4), fixed(event.normal_load_n, 1), fixed(event.disc_speed_rad_s, 2),
+      ends ? moment(event.end_s) : event.end_s === null ? "lasts" : NONE, ends ? fixed(event.end_s - event.onset_s, 2) : NONE, shown.mode_id ?? NONE, this.#frequency(shown.frequency_hz),
+      fixed(shown.friction_coefficient, 4), fixed(shown.normal_load_n, 1), fixed(shown.disc_speed_rad_s, 2),
     ];
     values.forEach((value, k) => {
       const cell = document.createElement("td");

@@ -1,0 +1,359 @@
+//! What every surface says first about a node: one status, the mode it is about, the window its margin is measured to,
+//! and one sentence. Page, terminal, log, events and reports take it from here.
+
+use std::fmt::Write;
+
+use serde::Serialize;
+
+use super::watch::{UnstableMode, fastest_modes};
+use crate::digits::significant;
+use crate::physics::{Ends, OperatingPoint as Point, StabilityMap};
+use crate::wire::{OperatingPoint, Prediction, level};
+
+/// How a node does, in one word.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Status {
+    /// No input was ever heard.
+    Waiting,
+    Ok,
+    Warn,
+    Squeal,
+    Fault,
+    /// Inputs were heard and have stopped.
+    NoData,
+}
+
+/// Whether inputs come.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Inputs {
+    heard: bool,
+    silent: bool,
+}
+
+impl Inputs {
+    /// An input came.
+    pub fn came(&mut self) {
+        *self = Self { heard: true, silent: false };
+    }
+
+    /// The node noticed that no input comes.
+    pub fn silence(&mut self) {
+        self.silent = true;
+    }
+
+    /// A prediction was made: of an input, even if that was not seen, unless the silence was noticed before.
+    pub fn predicted(&mut self) {
+        self.heard |= !self.silent;
+    }
+}
+
+impl Status {
+    /// Every status.
+    pub const ALL: [Self; 6] = [Self::Waiting, Self::Ok, Self::Warn, Self::Squeal, Self::Fault, Self::NoData];
+
+    /// The status of the latest prediction, which has `level`; `None` before the first.
+    pub fn new(level: Option<u8>, inputs: Inputs) -> Self {
+        match (level, inputs) {
+            (None, _) | (_, Inputs { heard: false, silent: true }) => Self::Waiting,
+            (_, Inputs { heard: true, silent: true }) => Self::NoData,
+            (Some(level::OK), _) => Self::Ok,
+            (Some(level::WARN), _) => Self::Warn,
+            (Some(level::SQUEAL), _) => Self::Squeal,
+            (Some(_), _) => Self::Fault,
+        }
+    }
+
+    /// As people read it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Waiting => "WAITING",
+            Self::Ok => "OK",
+            Self::Warn => "WARN",
+            Self::Squeal => "SQUEAL",
+            Self::Fault => "FAULT",
+            Self::NoData => "NO DATA",
+        }
+    }
+
+    /// The level of the message; `None` where nothing was predicted for want of inputs.
+    pub fn level(self) -> Option<u8> {
+        match self {
+            Self::Waiting | Self::NoData => None,
+            Self::Ok => Some(level::OK),
+            Self::Warn => Some(level::WARN),
+            Self::Squeal => Some(level::SQUEAL),
+            Self::Fault => Some(level::FAULT),
+        }
+    }
+
+    /// Whether anything is known of the rig's stability.
+    pub fn is_known(self) -> bool {
+        match self {
+            Self::Ok | Self::Warn | Self::Squeal => true,
+            Self::Waiting | Self::Fault | Self::NoData => false,
+        }
+    }
+}
+
+/// The end of a window of instability that the margin is measured to.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct NextSqueal {
+    /// The pair that merges, or the mode that begins to grow; none for a static divergence.
+    pub ids: Vec<u32>,
+    /// Frequency where the window begins, Hz; 0 for a static divergence.
+    pub frequency_hz: f64,
+    /// Friction coefficient of the end.
+    pub mu: f64,
+    /// The published margin: the distance to this end, negative inside the window.
+    pub margin: f64,
+    /// Bound of the error of both; NaN where none is known.
+    pub error: f64,
+    /// Whether the friction coefficient is inside the window.
+    pub inside: bool,
+}
+
+impl NextSqueal {
+    /// The end that the margin of `prediction`, made at `point`, is measured to; `map` and `ends` were in force then.
+    pub fn new(prediction: &Prediction, point: &Point, map: &StabilityMap, ends: &Ends) -> Option<Self> {
+        let margin = Some(prediction.friction_margin).filter(|margin| margin.is_finite())?;
+        // Outside, a window begins above or ends below by the margin; inside, the reverse.
+        let (begins, finishes) = (point.friction_coefficient + margin, point.friction_coefficient - margin);
+        let found = map.windows.iter().zip(ends.at(point)).flat_map(|(window, (from, to))| {
+            let end = |mu: f64, value: f64| (window, mu, (value - mu).abs());
+            [Some(end(begins, from.value)), to.map(|to| end(finishes, to.value))]
+        });
+        let (window, mu, _) = found.flatten().min_by(|a, b| a.2.total_cmp(&b.2))?;
+        Some(Self {
+            ids: window.mode_ids.clone(),
+            frequency_hz: window.frequency_hz,
+            mu,
+            margin,
+            error: prediction.friction_margin_error,
+            inside: margin < 0.0,
+        })
+    }
+
+    /// Who squeals: a pair or a mode and its frequency.
+    pub fn modes(&self) -> String {
+        let ids: Vec<String> = self.ids.iter().map(u32::to_string).collect();
+        match ids.as_slice() {
+            [] => "static divergence".to_owned(),
+            [one] => format!("mode {one} at {} Hz", significant(self.frequency_hz, 5)),
+            several => format!("modes {} at {} Hz", several.join(" and "), significant(self.frequency_hz, 5)),
+        }
+    }
+
+    /// Where, and how far that is.
+    pub fn place(&self) -> String {
+        let what = if self.inside { "ends at" } else { "at" };
+        format!("{what} friction coefficient {:.4}, {:.4} away", self.mu, self.margin.abs())
+    }
+}
+
+/// What is said first.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Assessment {
+    pub status: Status,
+    /// One sentence for people. It holds no number that ages.
+    pub message: String,
+    /// The mode that grows fastest; `None` where none grows.
+    pub fastest: Option<UnstableMode>,
+    /// `None` where no margin is known.
+    pub next: Option<NextSqueal>,
+}
+
+impl Assessment {
+    /// Before anything is known.
+    pub fn waiting() -> Self {
+        let message = "no input was heard yet".to_owned();
+        Self { status: Status::Waiting, message, fastest: None, next: None }
+    }
+
+    /// Of `prediction`, made for `input`, while `map` and `ends` were in force.
+    pub fn new(
+        status: Status,
+        prediction: &Prediction,
+        input: Option<&OperatingPoint>,
+        windows: Option<(&StabilityMap, &Ends)>,
+    ) -> Self {
+        let [fastest, ..] = fastest_modes(prediction);
+        let input = input.filter(|input| input.seq == prediction.input_seq);
+        let next = input.zip(windows).and_then(|(input, (map, ends))| {
+            NextSqueal::new(prediction, &input.point(), map, ends).filter(|_| status.is_known())
+        });
+        let fastest = fastest.filter(|_| status.is_known());
+        let message = match status {
+            Status::Waiting => return Self::waiting(),
+            Status::NoData => "inputs have stopped".to_owned(),
+            Status::Fault => prediction.reason.clone(),
+            Status::Squeal => growing(fastest, prediction.unstable_modes),
+            Status::Ok | Status::Warn if fastest.is_some() => {
+                format!("{}, too slowly to squeal", growing(fastest, prediction.unstable_modes))
+            }
+            Status::Warn => match &next {
+                Some(next) => format!("squeal is near: {} {}", next.modes(), next.place()),
+                None => prediction.reason.clone(),
+            },
+            Status::Ok => "no mode grows".to_owned(),
+        };
+        Self { status, message, fastest, next }
+    }
+}
+
+/// What grows, of `unstable` modes and static roots.
+fn growing(fastest: Option<UnstableMode>, unstable: u32) -> String {
+    let Some(mode) = fastest else { return "static divergence: a root that does not oscillate grows".to_owned() };
+    let (hz, growth) = (significant(mode.frequency_hz, 5), significant(mode.growth_rate_per_s, 3));
+    let mut text = format!("mode {} at {hz} Hz grows by {growth} 1/s", mode.id);
+    if unstable > 1 {
+        let _ = write!(text, ", the fastest of {unstable}"); // a String takes everything
+    }
+    text
+}
+
+/// What a node listens to, and what can be started in place of a rig.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct InputSources {
+    /// Topic of ROS 2, as remapped, and its domain; `None` off ROS 2.
+    pub topic: Option<String>,
+    pub domain: Option<u16>,
+    /// Service of shared memory; `None` off shared memory.
+    pub service: Option<String>,
+    /// The command that publishes simulated conditions there.
+    pub start: Option<String>,
+}
+
+impl InputSources {
+    /// For whoever waits for the first input.
+    pub fn sentence(&self) -> String {
+        let ros2 = self.topic.as_ref().map(|topic| match self.domain {
+            Some(domain) => format!("{topic} (ROS 2, domain {domain})"),
+            None => format!("{topic} (ROS 2)"),
+        });
+        let shm = self.service.as_ref().map(|service| format!("{service} (shared memory)"));
+        let places: Vec<String> = ros2.into_iter().chain(shm).collect();
+        let mut text = match places.is_empty() {
+            true => "it listens to no bus".to_owned(),
+            false => format!("it listens to {}", places.join(" and ")),
+        };
+        if let Some(start) = &self.start {
+            text += &format!("; without a rig, start: {start}");
+        }
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::physics::Solver;
+    use crate::rig::Rig;
+    use crate::session::map_options;
+    use crate::wire::Mode;
+
+    fn inputs(heard: bool, silent: bool) -> Inputs {
+        Inputs { heard, silent }
+    }
+
+    #[test]
+    fn silence_is_not_a_fault_and_each_level_has_its_own_status() {
+        let heard = inputs(true, false);
+        let of = |level| Status::new(Some(level), heard);
+        let levels = [level::OK, level::WARN, level::SQUEAL, level::FAULT];
+        assert_eq!(levels.map(of), [Status::Ok, Status::Warn, Status::Squeal, Status::Fault]);
+        assert_eq!(Status::new(None, Inputs::default()), Status::Waiting);
+        assert_eq!(Status::new(None, heard), Status::Waiting, "heard, not predicted yet");
+        assert_eq!(Status::new(Some(level::FAULT), inputs(false, true)), Status::Waiting);
+        assert_eq!(Status::new(Some(level::FAULT), inputs(true, true)), Status::NoData);
+    }
+
+    #[test]
+    fn inputs_stop_and_come_back() {
+        let mut inputs = Inputs::default();
+        inputs.silence();
+        inputs.predicted();
+        assert_eq!(Status::new(Some(level::FAULT), inputs), Status::Waiting, "the silence at the start");
+        inputs.came();
+        inputs.predicted();
+        assert_eq!(Status::new(Some(level::OK), inputs), Status::Ok);
+        inputs.silence();
+        assert_eq!(Status::new(Some(level::FAULT), inputs), Status::NoData);
+        let mut cut_off = Inputs::default();
+        cut_off.predicted();
+        assert_eq!(Status::new(Some(level::FAULT), cut_off), Status::Fault, "a fault whose input was not recorded");
+    }
+
+    fn squeal() -> Prediction {
+        let mode =
+            |id, frequency_hz, growth_rate_per_s| Mode { id, frequency_hz, growth_rate_per_s, ..Mode::default() };
+        Prediction {
+            level: level::SQUEAL,
+            unstable_modes: 2,
+            friction_margin: -0.1,
+            modes: vec![mode(1, 727.712647, 20.0), mode(15, 3114.6, 636.0)],
+            reason: "mode 1 at 727.712647 Hz: damping ratio -0.004 below -0.0005".to_owned(),
+            ..Prediction::default()
+        }
+    }
+
+    #[test]
+    fn the_banner_names_the_fastest_growing_mode_whatever_the_reason_says() {
+        let said = Assessment::new(Status::Squeal, &squeal(), None, None);
+        assert_eq!(said.fastest.map(|mode| mode.id), Some(15));
+        assert_eq!(said.message, "mode 15 at 3114.6 Hz grows by 636 1/s, the fastest of 2");
+        let divergence = Prediction { modes: vec![], unstable_modes: 1, ..squeal() };
+        let said = Assessment::new(Status::Squeal, &divergence, None, None);
+        assert!(said.fastest.is_none() && said.message.starts_with("static divergence"), "{}", said.message);
+    }
+
+    #[test]
+    fn without_data_nothing_is_asserted() {
+        for status in [Status::Waiting, Status::Fault, Status::NoData] {
+            let said = Assessment::new(status, &squeal(), None, None);
+            assert_eq!((said.fastest, said.next), (None, None), "{status:?}");
+            assert!(!said.message.contains("grows"), "{status:?}: {}", said.message);
+        }
+    }
+
+    /// The margin of a prediction is measured to the window that is named: windows and margin come from the same map.
+    #[test]
+    fn the_window_named_is_the_one_the_margin_is_measured_to() {
+        let rig = Rig::load("nine-dof-case-2").expect("embedded");
+        let mut solver = Solver::new(rig.model.dimension());
+        let map = StabilityMap::build(&rig.model, &mut solver, &rig.reference, &map_options(&rig)).expect("a map");
+        let at = |mu: f64| {
+            let point = rig.reference.with_friction(mu);
+            let margin = map.ends.margin(&point).expect("it has windows");
+            let prediction = Prediction { friction_margin: margin.value, ..Prediction::default() };
+            NextSqueal::new(&prediction, &point, &map, &map.ends).expect("a next one")
+        };
+        let [first, second] = &map.windows[..] else { panic!("{:?}", map.windows) };
+        let (middle, above) = (at(0.5 * (first.mu_from + 1.0)), at(second.mu_from + 1e-3));
+        let below = at(first.mu_from - 0.03);
+        assert!((below.mu - first.mu_from).abs() < 1e-12 && (below.margin - 0.03).abs() < 1e-12 && !below.inside);
+        assert_eq!((&below.ids, below.frequency_hz), (&first.mode_ids, first.frequency_hz));
+        assert!(middle.inside && middle.margin < 0.0, "{middle:?}");
+        assert!(above.inside, "{above:?}");
+        for next in [&below, &middle, &above] {
+            let ends = map.windows.iter().flat_map(|window| [Some(window.mu_from), window.mu_to]).flatten();
+            assert!(ends.map(|end| (end - next.mu).abs()).fold(1.0, f64::min) < 1e-12, "an end of a window: {next:?}");
+        }
+    }
+
+    #[test]
+    fn who_waits_learns_where_and_what_to_start() {
+        let sources = InputSources {
+            topic: Some("/rig/operating_point".to_owned()),
+            domain: Some(7),
+            service: Some("rig/operating_point".to_owned()),
+            start: Some("squealcast simulate --domain 7".to_owned()),
+        };
+        assert_eq!(
+            sources.sentence(),
+            "it listens to /rig/operating_point (ROS 2, domain 7) and rig/operating_point (shared memory); without a \
+             rig, start: squealcast simulate --domain 7"
+        );
+        assert_eq!(InputSources::default().sentence(), "it listens to no bus");
+    }
+}
