@@ -112,7 +112,7 @@ impl DisplayOptions {
     pub fn of_node(&self, rig: &Arc<Rig>, watch: &Watch, about: About) -> anyhow::Result<Option<Server>> {
         match serve(&self.addresses()?, Arc::new(Live::new(rig.clone(), watch.clone(), about))) {
             Err(error) if self.display.is_none() => {
-                note!("warning: {}", super::told(&error));
+                note!("warning: {}", super::failure(&error));
                 Ok(None)
             }
             served => served,

@@ -19,7 +19,7 @@ use crate::io::ros2::NODE_NAME;
 use crate::io::ros2::process::{Ros2Process, Sinks};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::node::status::InputSources;
-use crate::node::{self, Incoming, Node, Outputs, Shortcut, Watch};
+use crate::node::{self, Incoming, Node, NodeName, Outputs, Shortcut, Watch};
 use crate::rig::{EMBEDDED, Rig};
 use crate::session::Counters;
 use crate::settings::Settings;
@@ -127,7 +127,9 @@ pub fn serve(
     if let Some(ros2) = ros2 {
         let declared: Vec<(&str, f64)> = initial.values().collect();
         let name = ros2.args.node_name(NODE_NAME);
-        let (values, ignored) = ros2.args.parameters(&declared, &ros2.args.namespace(&name, "/"), &name)?;
+        let namespace = ros2.args.namespace(&name, "/");
+        outputs.node_name = NodeName::new(&namespace, &name);
+        let (values, ignored) = ros2.args.parameters(&declared, &namespace, &name)?;
         for what in ignored {
             note!("ROS 2: {what}");
         }

@@ -24,7 +24,7 @@ use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
 pub use mapper::{
     chart_hash, ends_hash, kept_chart, map_hash, session_chart, session_ends, session_map, yield_to_predictions,
 };
-pub use outputs::Outputs;
+pub use outputs::{NodeName, Outputs};
 pub use sensitivity::end_derivatives;
 pub use shortcut::Shortcut;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
@@ -397,6 +397,7 @@ impl Node {
         let stamp = header.stamp;
         self.note(SessionEvent { header, kind: event_kind::SILENCE, ..Default::default() });
         self.watch.silence();
+        self.statistics.silence();
         self.step(Event::Silence { stamp }, None);
     }
 
@@ -411,7 +412,7 @@ impl Node {
         match self.session.step(event) {
             Ok(effects) => {
                 if let Some(prediction) = effects.publish {
-                    self.statistics.level = prediction.level;
+                    self.statistics.published(prediction.level);
                     self.outputs.prediction_to_shm(prediction);
                     if let Some(heard) = input {
                         self.watch.input(&heard.message);

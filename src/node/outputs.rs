@@ -8,6 +8,7 @@ use crate::io::clock::Reading;
 use crate::io::heard::Counts;
 use crate::io::message::{Message, Payload};
 use crate::io::recorder::RecorderHandle;
+use crate::io::ros2::NODE_NAME;
 use crate::io::ros2::process::{Health, Ros2Process};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::wire::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
@@ -21,6 +22,7 @@ pub struct Outputs {
     pub shm_vibration: Option<ShmVibrationInput>,
     pub ros2: Option<Ros2Process>,
     pub recorder: Option<RecorderHandle>,
+    pub node_name: NodeName,
     /// Inputs that came into a full queue.
     pub lost_inputs: Arc<AtomicU64>,
     /// Messages a bus refused, and what it said last since the last report.
@@ -32,6 +34,27 @@ pub struct Outputs {
     pub encodings_skipped: u64,
     /// Whether predictions have readers on ROS 2.
     pub ros2_readers: Readers,
+}
+
+/// The name of a node in its diagnostics.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NodeName(String);
+
+impl NodeName {
+    /// The node `name` in `namespace`.
+    pub fn new(namespace: &str, name: &str) -> Self {
+        Self(format!("{namespace}/{name}").trim_start_matches('/').to_owned())
+    }
+
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl Default for NodeName {
+    fn default() -> Self {
+        Self(NODE_NAME.to_owned())
+    }
 }
 
 /// How many readers a topic of ROS 2 has, asked for now and then: the answer takes locks.

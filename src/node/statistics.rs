@@ -4,12 +4,13 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use super::Outputs;
-use crate::io::heard::Bus;
+use super::status::{Inputs, Status};
+use crate::io::heard::{Bus, Counts};
 use crate::io::recorder::State;
 use crate::physics::Chart;
 use crate::rig::Rig;
 use crate::session::Counters;
-use crate::wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, level};
+use crate::wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
 
 /// Levels of `diagnostic_msgs/DiagnosticStatus`.
 mod diagnostic_level {
@@ -33,15 +34,68 @@ pub struct Statistics {
     chart: Option<(usize, usize)>,
     pub map_failure: Option<String>,
     pub chart_failure: Option<String>,
-    /// What had been passed over at the last report.
-    passed_over_before: u64,
     pub refused: Option<String>,
-    pub level: u8,
+    inputs: Inputs,
+    level: Option<u8>,
+    /// What had been lost at the last report.
+    lost_before: Lost,
     times: Vec<Duration>,
+}
+
+/// What was lost since the start.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+struct Lost {
+    passed_over: u64,
+    /// Inputs that came into a full queue.
+    overflowed: u64,
+    /// Messages that a bus refused, and what it said last.
+    unpublished: u64,
+    why_unpublished: Option<String>,
+    /// What the listening side of each bus counted.
+    buses: Vec<(&'static str, Counts)>,
+}
+
+impl Lost {
+    fn new(passed_over: u64, outputs: &mut Outputs) -> Self {
+        Self {
+            passed_over,
+            overflowed: outputs.lost_inputs.load(Ordering::Relaxed),
+            unpublished: outputs.failures,
+            why_unpublished: outputs.last_failure.take(),
+            buses: outputs.counts(),
+        }
+    }
+
+    /// What was lost since `before`, in words.
+    fn since(&self, before: &Self) -> Vec<String> {
+        let mut warnings = vec![];
+        let mut warn = |count: u64, what: &str| {
+            if count > 0 {
+                warnings.push(format!("{what} since the last report: {count}"));
+            }
+        };
+        warn(self.passed_over - before.passed_over, "inputs passed over");
+        warn(self.overflowed - before.overflowed, "inputs lost in a full queue");
+        for (bus, counts) in &self.buses {
+            let of_bus = before.buses.iter().find(|(other, _)| other == bus);
+            let before = of_bus.map(|(_, counts)| *counts).unwrap_or_default();
+            // A bus that was started again counts from 0.
+            warn(counts.missed.saturating_sub(before.missed), &format!("inputs missed on {bus}"));
+            warn(counts.malformed.saturating_sub(before.malformed), &format!("malformed inputs on {bus}"));
+            warn(counts.failures.saturating_sub(before.failures), &format!("failures of {bus}"));
+        }
+        let unpublished = self.unpublished - before.unpublished;
+        if unpublished > 0 {
+            let why = self.why_unpublished.as_deref().unwrap_or("no reason given");
+            warnings.push(format!("messages not published since the last report: {unpublished}, {why}"));
+        }
+        warnings
+    }
 }
 
 impl Statistics {
     pub fn heard(&mut self, bus: Bus) {
+        self.inputs.came();
         match bus {
             Bus::Shm => self.heard_shm += 1,
             Bus::Ros2 => self.heard_ros2 += 1,
@@ -49,8 +103,18 @@ impl Statistics {
         }
     }
 
+    /// Nothing was heard for too long.
+    pub fn silence(&mut self) {
+        self.inputs.silence();
+    }
+
     pub fn charted(&mut self, chart: &Chart) {
         self.chart = Some((chart.leaf_count(), chart.size_bytes()));
+    }
+
+    /// The latest prediction has this level.
+    pub fn published(&mut self, level: u8) {
+        self.level = Some(level);
     }
 
     pub fn predicted(&mut self, took: Duration) {
@@ -67,6 +131,50 @@ impl Statistics {
         map_pending: bool,
         outputs: &mut Outputs,
     ) -> DiagnosticArray {
+        let lost = Lost::new(self.passed_over, outputs);
+        let mut values = self.values(counters, queued, map_pending, outputs);
+        for (bus, counts) in &lost.buses {
+            values.push(pair(&format!("{bus}_missed"), counts.missed));
+            values.push(pair(&format!("{bus}_malformed"), counts.malformed));
+            values.push(pair(&format!("{bus}_failures"), counts.failures));
+            values.push(pair(&format!("{bus}_incompatible_peers"), counts.incompatible));
+        }
+        let ros2 = outputs.ros2_health();
+        if let Some((health, _)) = &ros2 {
+            values.push(pair("ros2_side_falls", health.falls));
+            values.push(pair("ros2_side_process", health.process_id));
+            values.push(pair("ros2_refused", health.refused));
+        }
+        self.times.clear();
+        let mut warnings: Vec<String> = vec![];
+        warnings.extend(self.map_failure.iter().map(|why| format!("no stability map: {why}")));
+        warnings.extend(self.chart_failure.iter().map(|why| format!("no chart: {why}")));
+        warnings.extend(self.sensitivity_failure.iter().map(|why| format!("no sensitivities: {why}")));
+        warnings.extend(self.refused.take());
+        warnings.extend(outputs.other_nodes());
+        warnings.extend(ros2.into_iter().flat_map(|(_, wrong)| wrong));
+        let incompatible = lost.buses.iter().map(|(_, counts)| counts.incompatible).sum::<u64>();
+        if incompatible > 0 {
+            warnings.push(format!("peers not connected, their quality of service is incompatible: {incompatible}"));
+        }
+        warnings.extend(lost.since(&self.lost_before));
+        self.lost_before = lost;
+        let status = Status::new(self.level, self.inputs);
+        let level = if warnings.is_empty() { level_of(status) } else { level_of(status).max(diagnostic_level::WARN) };
+        let mut message = status.name().to_owned();
+        for warning in &warnings {
+            message += "; ";
+            message += warning;
+        }
+        let name = outputs.node_name.as_str();
+        let hardware_id = rig.name.clone();
+        let predictions =
+            DiagnosticStatus { level, name: format!("{name}: predictions"), message, hardware_id, values };
+        let status = std::iter::once(predictions).chain(recorder_status(rig, outputs)).collect();
+        DiagnosticArray { header, status }
+    }
+
+    fn values(&mut self, counters: Counters, queued: usize, map_pending: bool, outputs: &Outputs) -> Vec<KeyValue> {
         self.times.sort_unstable();
         let quantile = |q: f64| {
             let index = (q * self.times.len().saturating_sub(1) as f64).round() as usize;
@@ -102,51 +210,16 @@ impl Statistics {
             values.push(pair("chart_leaves", leaves));
             values.push(pair("chart_bytes", bytes));
         }
-        let ros2 = outputs.ros2_health();
-        if let Some((health, _)) = &ros2 {
-            values.push(pair("ros2_side_falls", health.falls));
-            values.push(pair("ros2_side_process", health.process_id));
-            values.push(pair("ros2_refused", health.refused));
-        }
-        for (bus, counts) in outputs.counts() {
-            values.push(pair(&format!("{bus}_missed"), counts.missed));
-            values.push(pair(&format!("{bus}_malformed"), counts.malformed));
-            values.push(pair(&format!("{bus}_failures"), counts.failures));
-            values.push(pair(&format!("{bus}_incompatible_peers"), counts.incompatible));
-        }
-        self.times.clear();
-        let mut warnings: Vec<String> = vec![];
-        warnings.extend(self.map_failure.iter().map(|why| format!("no stability map: {why}")));
-        warnings.extend(self.chart_failure.iter().map(|why| format!("no chart: {why}")));
-        warnings.extend(self.sensitivity_failure.iter().map(|why| format!("no sensitivities: {why}")));
-        warnings.extend(self.refused.take());
-        warnings.extend(outputs.last_failure.take());
-        warnings.extend(ros2.into_iter().flat_map(|(_, wrong)| wrong));
-        warnings.extend(outputs.other_nodes());
-        let incompatible = outputs.counts().iter().map(|(_, counts)| counts.incompatible).sum::<u64>();
-        if incompatible > 0 {
-            warnings.push(format!("peers not connected, their quality of service is incompatible: {incompatible}"));
-        }
-        let passed_over = self.passed_over - self.passed_over_before;
-        self.passed_over_before = self.passed_over;
-        if passed_over > 0 {
-            warnings.push(format!("{passed_over} inputs passed over since the last report"));
-        }
-        let node_level = match (self.level, warnings.is_empty()) {
-            (level::FAULT, _) => diagnostic_level::ERROR,
-            (_, false) => diagnostic_level::WARN,
-            (_, true) => diagnostic_level::OK,
-        };
-        let message = if warnings.is_empty() { level::name(self.level).to_owned() } else { warnings.join("; ") };
-        let mut status = vec![DiagnosticStatus {
-            level: node_level,
-            name: "squealcast: predictions".to_owned(),
-            message,
-            hardware_id: rig.name.clone(),
-            values,
-        }];
-        status.extend(recorder_status(rig, outputs));
-        DiagnosticArray { header, status }
+        values
+    }
+}
+
+/// Squeal is worth a warning, though the node itself does well; without inputs or with unusable ones nothing is predicted.
+fn level_of(status: Status) -> u8 {
+    match status {
+        Status::Ok => diagnostic_level::OK,
+        Status::Waiting | Status::Warn | Status::Squeal => diagnostic_level::WARN,
+        Status::Fault | Status::NoData => diagnostic_level::ERROR,
     }
 }
 
@@ -161,7 +234,7 @@ fn recorder_status(rig: &Rig, outputs: &Outputs) -> Option<DiagnosticStatus> {
     };
     Some(DiagnosticStatus {
         level,
-        name: "squealcast: recorder".to_owned(),
+        name: format!("{}: recorder", outputs.node_name.as_str()),
         message,
         hardware_id: rig.name.clone(),
         values: vec![
@@ -176,4 +249,111 @@ fn recorder_status(rig: &Rig, outputs: &Outputs) -> Option<DiagnosticStatus> {
 
 fn pair(key: &str, value: impl ToString) -> KeyValue {
     KeyValue { key: key.to_owned(), value: value.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wire::level;
+
+    struct Reporter {
+        statistics: Statistics,
+        outputs: Outputs,
+        rig: Rig,
+    }
+
+    impl Reporter {
+        fn new() -> Self {
+            let rig = Rig::load("nine-dof-case-2").expect("embedded");
+            Self { statistics: Statistics::default(), outputs: Outputs::default(), rig }
+        }
+
+        /// Level and message of the predictions.
+        fn report(&mut self) -> (u8, String) {
+            let Self { statistics, outputs, rig } = self;
+            let mut array = statistics.report(Header::default(), rig, Counters::default(), 0, false, outputs);
+            let status = array.status.remove(0);
+            (status.level, status.message)
+        }
+    }
+
+    #[test]
+    fn the_level_says_that_nothing_was_heard_that_it_squeals_and_that_inputs_stopped() {
+        let mut reporter = Reporter::new();
+        assert_eq!(reporter.report(), (diagnostic_level::WARN, "WAITING".to_owned()), "nothing is known yet");
+        reporter.statistics.silence();
+        reporter.statistics.published(level::FAULT);
+        assert_eq!(reporter.report(), (diagnostic_level::WARN, "WAITING".to_owned()), "a start is no fault");
+        for (level, expected, name) in [
+            (level::OK, diagnostic_level::OK, "OK"),
+            (level::WARN, diagnostic_level::WARN, "WARN"),
+            (level::SQUEAL, diagnostic_level::WARN, "SQUEAL"),
+            (level::FAULT, diagnostic_level::ERROR, "FAULT"),
+        ] {
+            reporter.statistics.heard(Bus::Shm);
+            reporter.statistics.published(level);
+            assert_eq!(reporter.report(), (expected, name.to_owned()));
+        }
+        reporter.statistics.silence();
+        assert_eq!(reporter.report(), (diagnostic_level::ERROR, "NO DATA".to_owned()));
+    }
+
+    /// Every loss raises the level of the report after it, and of that one alone.
+    #[test]
+    fn losses_and_failures_raise_the_level_once() {
+        let mut reporter = Reporter::new();
+        reporter.statistics.heard(Bus::Ros2);
+        reporter.statistics.published(level::OK);
+        let quiet = (diagnostic_level::OK, "OK".to_owned());
+        assert_eq!(reporter.report(), quiet);
+        reporter.statistics.passed_over += 3;
+        let warns = |message: &str| (diagnostic_level::WARN, format!("OK; {message}"));
+        assert_eq!(reporter.report(), warns("inputs passed over since the last report: 3"));
+        assert_eq!(reporter.report(), quiet);
+        reporter.outputs.lost_inputs.fetch_add(2, Ordering::Relaxed);
+        assert_eq!(reporter.report(), warns("inputs lost in a full queue since the last report: 2"));
+        assert_eq!(reporter.report(), quiet);
+        (reporter.outputs.failures, reporter.outputs.last_failure) = (1, Some("no room".to_owned()));
+        assert_eq!(reporter.report(), warns("messages not published since the last report: 1, no room"));
+        assert_eq!(reporter.report(), quiet, "an old failure is not reported again");
+    }
+
+    #[test]
+    fn what_a_bus_missed_or_could_not_read_is_a_loss() {
+        let lost = |missed, malformed, failures| Lost {
+            buses: vec![("ros2", Counts { heard: 9, missed, malformed, failures, incompatible: 0 })],
+            ..Lost::default()
+        };
+        let words = lost(4, 2, 1).since(&lost(1, 1, 0));
+        let expected = [("inputs missed on ros2", 3), ("malformed inputs on ros2", 1), ("failures of ros2", 1)];
+        assert_eq!(words, expected.map(|(what, count)| format!("{what} since the last report: {count}")));
+        assert!(lost(4, 2, 1).since(&lost(4, 2, 1)).is_empty());
+        assert_eq!(lost(1, 0, 0).since(&Lost::default()).len(), 1, "before the first report");
+    }
+
+    #[test]
+    fn prediction_times_are_those_since_the_last_report() {
+        let mut reporter = Reporter::new();
+        (1..=100).for_each(|us| reporter.statistics.predicted(Duration::from_micros(us)));
+        let Reporter { statistics, outputs, rig } = &mut reporter;
+        let mut value = |key: &str| {
+            let array = statistics.report(Header::default(), rig, Counters::default(), 0, false, outputs);
+            let found = array.status[0].values.iter().find(|pair| pair.key == key);
+            found.map(|pair| pair.value.clone()).expect("there is such a value")
+        };
+        assert_eq!(value("prediction_time_p99_us"), "99.0");
+        assert_eq!(value("prediction_time_median_us"), "NaN", "none since");
+    }
+
+    #[test]
+    fn the_node_is_named() {
+        let mut reporter = Reporter::new();
+        let name = |reporter: &mut Reporter| {
+            let Reporter { statistics, outputs, rig } = reporter;
+            statistics.report(Header::default(), rig, Counters::default(), 0, false, outputs).status.remove(0).name
+        };
+        assert_eq!(name(&mut reporter), "squealcast: predictions");
+        reporter.outputs.node_name = super::super::outputs::NodeName::new("/brake1", "left");
+        assert_eq!(name(&mut reporter), "brake1/left: predictions");
+    }
 }
