@@ -85,7 +85,7 @@ impl View<'_> {
             format!("margin {}{bound}", significant(prediction.friction_margin, 4)),
             format!("unstable modes {}", prediction.unstable_modes),
         ]));
-        if let Some(next) = &said.next {
+        if let Some(next) = said.next.as_ref().filter(|next| !said.message.contains(&next.place())) {
             let what = if next.inside { "window" } else { "next" };
             let text = format!("{what}: {} {}", next.modes(), next.place());
             lines.extend(wrapped(&text, 0, width).into_iter().map(Line::from));
@@ -171,14 +171,23 @@ static COLUMNS: [Column; 7] = [
             false => significant(mode.damping_ratio, 4),
         },
     },
-    Column { title: "pad share", width: 9, text: |mode, _| significant(mode.pad_participation, 3) },
+    Column { title: "pad share", width: 9, text: |mode, _| share(mode.pad_participation) },
     Column { title: "+- Hz", width: 8, text: |mode, _| error(mode.frequency_error_hz) },
     Column { title: "+- 1/s", width: 8, text: |mode, _| error(mode.growth_rate_error_per_s) },
 ];
 
 /// The bound of an error says its order of magnitude.
 fn error(bound: f64) -> String {
-    if bound.is_finite() { format!("{bound:.0e}") } else { "-".to_owned() }
+    match bound {
+        0.0 => "0".to_owned(),
+        _ if bound.is_finite() => format!("{bound:.0e}"),
+        _ => "-".to_owned(),
+    }
+}
+
+/// A share to a thousandth.
+fn share(value: f64) -> String {
+    if value.is_finite() { format!("{value:.3}") } else { "-".to_owned() }
 }
 
 /// The columns that fit into `width`, whole.
