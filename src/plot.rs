@@ -18,15 +18,15 @@ use crate::wire::level;
 
 /// The library places points on whole units; this many to a px keeps curves smooth.
 const FINE: u32 = 8;
-/// Colours of neighbouring curves; told apart by the colour-blind too (Okabe and Ito, 2008).
-const COLOURS: [RGBColor; 7] = [
-    RGBColor(0, 114, 178),
-    RGBColor(213, 94, 0),
-    RGBColor(0, 158, 115),
-    RGBColor(204, 121, 167),
-    RGBColor(86, 180, 233),
-    RGBColor(230, 159, 0),
-    RGBColor(60, 60, 60),
+/// Colours of neighbouring curves, those of the page on white: told apart by the colour-blind too.
+pub(crate) const COLOURS: [RGBColor; 7] = [
+    RGBColor(26, 53, 216),
+    RGBColor(122, 0, 18),
+    RGBColor(129, 89, 146),
+    RGBColor(224, 106, 0),
+    RGBColor(82, 145, 255),
+    RGBColor(75, 4, 133),
+    RGBColor(176, 60, 0),
 ];
 
 /// Dashes tell modes of the same colour apart: px drawn and px left out.

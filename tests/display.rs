@@ -265,7 +265,6 @@ fn the_page_shows_a_demo_as_it_is() {
         let numbers = &moment["numbers"];
         for (name, value) in [
             ("margin", prediction.friction_margin),
-            ("critical", prediction.critical_friction),
             ("growth", prediction.max_growth_rate_per_s),
             ("worst", prediction.worst_frequency_hz),
             ("unstable", f64::from(prediction.unstable_modes)),
@@ -284,6 +283,14 @@ fn the_page_shows_a_demo_as_it_is() {
                 assert_eq!((exact, text.as_str()), ("", "–"), "{name} of input {seq}");
             }
         }
+        // What squeals next is the end of a window that the margin is measured to.
+        if let Ok(end) = numbers["answer-mu"]["value"].as_str().unwrap().parse::<f64>() {
+            let (away, margin) = ((end - input.friction_coefficient).abs(), prediction.friction_margin.abs());
+            assert!(
+                (away - margin).abs() < 1e-6,
+                "input {seq}: the end at {end} is {away} away, the margin is {margin}"
+            );
+        }
         let modes = moment["modes"].as_array().unwrap();
         assert_eq!(modes.len(), prediction.modes.len());
         for mode in modes {
@@ -293,9 +300,9 @@ fn the_page_shows_a_demo_as_it_is() {
                 known.frequency_hz,
                 known.growth_rate_per_s,
                 known.damping_ratio,
+                known.pad_participation,
                 known.frequency_error_hz,
                 known.growth_rate_error_per_s,
-                known.pad_participation,
             ];
             assert_eq!(mode["values"].as_array().unwrap().len(), values.len());
             for (shown, value) in mode["values"].as_array().unwrap().iter().zip(values) {
@@ -316,6 +323,61 @@ fn the_page_shows_a_demo_as_it_is() {
         assert!(seen["work"].as_f64().unwrap() < 0.2, "the page takes {} of a core", seen["work"]);
     }
     assert!(seen["csv"].as_str().unwrap().contains(",SQUEAL,"));
+}
+
+/// Fields of an answer, sorted.
+fn fields(answer: &serde_json::Value) -> Vec<&str> {
+    let mut fields: Vec<&str> = answer.as_object().unwrap().keys().map(String::as_str).collect();
+    fields.sort_unstable();
+    fields
+}
+
+/// Made-up answers lead the page into every status; that they are as a node's answers, a demo shows.
+#[test]
+fn the_page_tells_every_status_and_shows_what_squeals_next() {
+    let _alone = alone();
+    if !browser_ready() {
+        return;
+    }
+    let made_up = browse("states.mjs", &[]);
+    let shown = Shown::demo(&["nine-dof-case-2", "--rate", "100"]);
+    let json = |path: &str| serde_json::from_str::<serde_json::Value>(&shown.get(path).2).unwrap_or_default();
+    let began = Instant::now();
+    let state = loop {
+        let state = json("/state.json");
+        if state["fastest"].is_object() && state["next"].is_object() && state["map"].as_u64() > Some(0) {
+            break state;
+        }
+        assert!(began.elapsed() < PATIENCE, "no mode grows: {state}");
+        std::thread::sleep(Duration::from_millis(50));
+    };
+    let (about, events) = (json("/about.json"), json("/events.json"));
+    let map = json(&format!("/map.json?number={}", state["map"]));
+    let shape = json(&format!("/shape.json?id={}", state["fastest"]["id"]));
+    shown.stop();
+    for (name, answer) in [
+        ("state", &state),
+        ("fastest", &state["fastest"]),
+        ("next", &state["next"]),
+        ("about", &about),
+        ("map", &map),
+        ("curve", &map["modes"][0]),
+        ("window", &map["windows"][0]),
+        ("shape", &shape),
+        ("part", &shape["parts"][0]),
+        ("growth_change", &shape["growth_change"]),
+        ("event", &events[0]),
+        ("moment", &events[0]["onset"]),
+    ] {
+        let known: Vec<&str> = made_up[name].as_array().unwrap().iter().map(|field| field.as_str().unwrap()).collect();
+        assert_eq!(fields(answer), known, "{name}");
+    }
+    let disc = serde_json::to_value(tribometer_axis()).unwrap();
+    assert_eq!(serde_json::json!(fields(&disc)), made_up["disc"]);
+}
+
+fn tribometer_axis() -> squealcast::rig::DiscAxis {
+    squealcast::rig::Rig::load("tribometer").unwrap().disc_axis.unwrap()
 }
 
 /// A ring of 24 nodes with a pair of modes, `z = cos 2θ` and `z = sin 2θ`, and two contact points that couple them:

@@ -130,7 +130,7 @@ impl Curves {
 }
 
 /// `λ` of `λ²` with `ω ≥ 0`, and `σ ≥ 0` where `ω = 0`.
-fn root(square: c64) -> c64 {
+pub(super) fn root(square: c64) -> c64 {
     let root = square.sqrt();
     if root.im < 0.0 || (root.im == 0.0 && root.re < 0.0) { -root } else { root }
 }

@@ -6,8 +6,9 @@
 use faer::{MatRef, c64};
 use serde::Serialize;
 
+use super::change::GrowthChange;
 use crate::physics::{OperatingPoint, Solver, StabilityMap, Vectors};
-use crate::rig::Rig;
+use crate::rig::{DiscAxis, Rig};
 
 /// A mode's shape; the largest displacement has magnitude 1 and phase 0.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -15,6 +16,12 @@ pub struct Shape {
     pub id: u32,
     pub frequency_hz: f64,
     pub growth_rate_per_s: f64,
+    /// The pad's share of the motion; `null` where the rig does not tell pad and disc apart.
+    pub pad_share: Option<f64>,
+    /// What makes it grow faster or slower; `null` where that is not known.
+    pub growth_change: Option<GrowthChange>,
+    /// The axis about which the disc turns, for its outline.
+    pub disc: Option<DiscAxis>,
     /// Pad, disc, or the whole system.
     pub parts: Vec<Part>,
 }
@@ -60,7 +67,10 @@ pub fn shape(
             }
         }
     }
-    Ok(Shape { id, frequency_hz: root.frequency_hz(), growth_rate_per_s: root.growth_rate_per_s(), parts })
+    let (frequency_hz, growth_rate_per_s) = (root.frequency_hz(), root.growth_rate_per_s());
+    let pad_share = Some(root.pad_participation).filter(|share| share.is_finite());
+    let growth_change = GrowthChange::new(&rig.model, &spectrum, index).ok();
+    Ok(Shape { id, frequency_hz, growth_rate_per_s, pad_share, growth_change, disc: rig.disc_axis, parts })
 }
 
 fn parts(rig: &Rig, shapes: MatRef<'_, c64>, column: usize) -> Vec<Part> {
@@ -110,6 +120,11 @@ mod tests {
             spectrum.modes().iter().enumerate().max_by(|a, b| a.1.lambda.re.total_cmp(&b.1.lambda.re)).unwrap();
         assert!(root.lambda.re > 0.0, "it flutters there");
         let shape = shape(&rig, &mut solver, None, &point, id as u32).unwrap();
+        assert!(
+            shape.pad_share.is_some_and(|share| (share - 1.0).abs() < 1e-12),
+            "the belt is rigid: only the mass moves"
+        );
+        assert_eq!(shape.disc, None);
         let u: Vec<c64> = shape.parts[0].re.iter().zip(&shape.parts[0].im).map(|(&re, &im)| c64::new(re, im)).collect();
         // First row of the equation of motion, the paper's equation (3): λ² x + k11 x + (k12 ± μ kn) y = 0; the belt
         // runs along +x and the normal is -y, so that the friction force on the mass is -μ kn y.
@@ -118,5 +133,19 @@ mod tests {
         let found = u[1] / u[0];
         assert!((found - ratio).norm() < 1e-9 * ratio.norm(), "{found} {ratio}");
         assert!(u.iter().any(|u| (u - c64::new(1.0, 0.0)).norm() < 1e-12), "scaled to 1");
+    }
+
+    #[test]
+    fn the_shape_of_an_embedded_tribometer_has_named_parts_a_pad_share_and_the_axis_of_the_disc() {
+        let rig = Rig::load("tribometer").unwrap();
+        let mut solver = Solver::new(rig.model.dimension());
+        let shape = shape(&rig, &mut solver, None, &rig.reference, 0).unwrap();
+        let names: Vec<&str> = shape.parts.iter().map(|part| part.name.as_str()).collect();
+        assert_eq!(names, ["pad", "disc"]);
+        assert!(shape.pad_share.is_some_and(|share| (0.0..=1.0).contains(&share)), "{:?}", shape.pad_share);
+        // As `launch/rigs/tribometer.toml` says.
+        let up = [0.0, 1.0, 0.0];
+        let axis = DiscAxis { axis_point_m: [0.0; 3], axis_direction: up, normal: up };
+        assert_eq!(shape.disc, Some(axis));
     }
 }

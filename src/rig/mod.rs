@@ -78,6 +78,18 @@ pub struct Rig {
     pub made_for: Option<MadeFor>,
     /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
     pub shapes: Vec<SideShapes>,
+    /// Where the disc turns, for pictures; `None` where no `[[contact_patch]]` says it.
+    pub disc_axis: Option<DiscAxis>,
+}
+
+/// The disc's axis as the first `[[contact_patch]]` gives it.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct DiscAxis {
+    pub axis_point_m: [f64; 3],
+    /// Positive speed turns right-handed about it; of any length.
+    pub axis_direction: [f64; 3],
+    /// From disc to pad; of any length.
+    pub normal: [f64; 3],
 }
 
 /// The contact that a model of substructures was built with.
@@ -258,6 +270,11 @@ impl Rig {
         if let Some(basis) = &raw.basis {
             built.contents.extend(basis.describe(&source.rig_file)?);
         }
+        let disc_axis = raw.contact_patch.iter().flatten().next().map(|patch| DiscAxis {
+            axis_point_m: patch.axis_point_m,
+            axis_direction: patch.axis_direction,
+            normal: patch.normal,
+        });
         Ok(Self {
             name: raw.name,
             model: built.model,
@@ -281,6 +298,7 @@ impl Rig {
                 disc_speed_rad_s: basis.disc_speed_rad_s,
             }),
             shapes: built.shapes,
+            disc_axis,
         })
     }
 

@@ -11,7 +11,7 @@ const reaches = (page, wanted) => page.waitForSelector(`#status[data-level="${wa
 /** The numbers of one moment, as they are on the page. */
 const look = (page) => page.evaluate(() => {
   const value = (id) => ({ text: document.getElementById(id).textContent, value: document.getElementById(id).value });
-  const ids = ["margin", "mu", "critical", "growth", "worst", "load", "speed", "unstable"];
+  const ids = ["margin", "mu", "answer-mu", "growth", "worst", "load", "speed", "unstable"];
   const modes = [...document.querySelectorAll("#modes tbody tr")].map((row) => ({
     id: Number(row.querySelector("button").dataset.mode),
     values: [...row.querySelectorAll("data")].map((data) => data.value),

@@ -8,7 +8,7 @@ import { Modes } from "./modes.js";
 import { ShapeView } from "./shape.js";
 import { Status } from "./status.js";
 import { Timeline } from "./timeline.js";
-import { forgetColours, known } from "./format.js";
+import { asserts, forgetColours, known } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 const ask = async (path) => {
@@ -22,13 +22,13 @@ const NUMBERS_EVERY = 300;
 const about = await ask("about.json");
 const recording = about.kind === "recording";
 at("rig").textContent = about.rig;
-document.title = `squealcast: ${about.rig}`;
+at("simulated").hidden = !about.simulated;
 
 const status = new Status(about);
 const map = new StabilityMap(about);
 const history = new History(about);
 const shape = new ShapeView();
-const modes = new Modes(about, choose);
+const modes = new Modes(about, choose, () => follow(false));
 let timeline;
 const events = new Events(about, recording ? (moment) => timeline.go(moment) : undefined);
 
@@ -38,9 +38,17 @@ let mapShown = 0;
 let eventsShown = -1;
 let asking = { map: false, history: false, events: false };
 
+/** Time for which a shape stays before another one is asked for, ms. */
+const SETTLED = 1500;
+/** The same before that of another mode. */
+const FOLLOWED = 500;
+
 let chosenAt = 0;
+let later;
 let chosenFor = [];
 let choices = 0;
+/** Whether the shape is that of the mode which grows, or else of the one that will next. */
+let following = true;
 
 /** The conditions, and how far each may move before a shape is asked for again. */
 const conditions = (state) => [state.mu, state.load, state.speed];
@@ -54,11 +62,18 @@ async function choose(id) {
     const moment = recording && latest ? `&at=${latest.time_s}` : "";
     const answer = await ask(`shape.json?id=${id}${moment}`);
     // Of two on their way the later one counts.
-    if (order === choices) await shape.show(answer);
+    if (order === choices) await shape.show(answer, Math.sign(latest?.speed ?? 1));
   } catch (error) {
     shape.missing(error.message);
   }
 }
+
+function follow(on) {
+  following = on;
+  at("shape-follow").setAttribute("aria-pressed", String(on));
+  if (on && latest) numbers();
+}
+at("shape-follow").addEventListener("click", () => follow(!following));
 
 /** Does one thing at a time of each kind; what is asked meanwhile is asked again by the next state. */
 async function once(kind, work) {
@@ -75,10 +90,19 @@ async function once(kind, work) {
 
 const loadHistory = () => once("history", async () => history.load(await ask("history.json")));
 
-function take(state) {
+/** Without inputs, or after a fault, what was predicted before is not shown as if it still held. */
+function sifted(state) {
+  if (asserts(state)) return state;
+  const nothing = { margin: null, growth: null, worst_hz: null, unstable: null, modes: [], fastest: null, next: null, spread: null, trend_per_s: null };
+  const silent = state.status === "fault" ? {} : { mu: null, load: null, speed: null };
+  return { ...state, ...nothing, ...silent };
+}
+
+function take(heard) {
+  const state = sifted(heard);
   latest = state;
   heardAt = performance.now();
-  if (!recording && at("link").dataset.link !== "live") link("live", "live");
+  if (!recording) connected();
   next(paint);
   if (!recording) history.now = state.time_s;
   if (!history.add(state.bins)) loadHistory();
@@ -105,26 +129,28 @@ function take(state) {
 function paint() {
   // It may have been due when the connection went.
   if (at("link").dataset.link === "gone") return;
-  status.level(latest.level, latest.reason);
+  status.level(latest);
   status.needle(latest);
+  shape.still(!asserts(latest));
   map.cursor(latest);
 }
 
 function numbers() {
   if (!latest) return;
   const age = typeof latest.age_s === "number" ? latest.age_s + (recording ? 0 : (performance.now() - heardAt) / 1000) : undefined;
-  status.numbers(latest, age);
+  status.numbers(latest, age, (id) => (shape.shape?.id === id ? shape.shape.pad_share : undefined));
   modes.numbers(latest);
-  if (modes.chosen === null && latest.modes?.length) {
-    // The one to look at first: the fastest growing, or else the one that would grow first.
-    const fastest = latest.modes.reduce((best, mode) => (mode[1][1] > best[1][1] ? mode : best));
-    const first = map.curves?.windows[0]?.mode_ids[0];
-    if (latest.unstable) modes.select(fastest[0]);
-    else if (map.curves) modes.select(first ?? fastest[0]);
-  } else if (modes.chosen !== null && performance.now() - chosenAt > 1500 && known(latest.mu) && moved(conditions(latest), chosenFor)) {
-    // Its shape changes with the conditions.
-    choose(modes.chosen);
-  }
+  at("simulated").hidden = !(about.simulated || latest.simulated);
+  if (!asserts(latest)) return;
+  const wanted = latest.fastest?.id ?? latest.next?.ids[0] ?? modes.chosen ?? latest.modes?.[0]?.[0];
+  const since = performance.now() - chosenAt;
+  const settled = since > SETTLED;
+  // A recording that is not played says nothing more by itself.
+  clearTimeout(later);
+  if (recording && !settled) later = setTimeout(numbers, SETTLED);
+  if (following && wanted !== undefined && wanted !== modes.chosen && (since > FOLLOWED || modes.chosen === null)) modes.select(wanted);
+  // Its shape changes with the conditions.
+  else if (modes.chosen !== null && settled && known(latest.mu) && moved(conditions(latest), chosenFor)) choose(modes.chosen);
 }
 
 const refresh = () => history.refreshIfDue();
@@ -133,6 +159,18 @@ function link(kind, text) {
   at("link").dataset.link = kind;
   at("link-text").textContent = text;
   status.disconnected(kind === "gone");
+  if (kind !== "gone") return;
+  shape.still(true);
+  if (!latest) return;
+  latest = sifted({ ...latest, status: "no_data" });
+  status.needle(latest);
+  map.cursor(latest);
+}
+
+/** The page hears from the node; green only where the node hears from the rig. */
+function connected() {
+  const kind = asserts(latest) ? "live" : "up";
+  if (at("link").dataset.link !== kind) link(kind, kind === "live" ? "live" : "connected");
 }
 
 const THEMES = ["auto", "light", "dark"];
@@ -189,7 +227,7 @@ if (recording) {
     heardAt = performance.now();
     stream = new EventSource("stream");
     stream.onopen = async () => {
-      link("live", "live");
+      link("up", "connected");
       mapShown = 0;
       loadHistory();
       // Another node may serve here now.

@@ -22,8 +22,9 @@ export class Events {
     const alarms = new Set(comparison?.false_alarms);
     const told = events.map((event) => (alarms.has(event.number) ? { ...event, note: "false alarm" } : event));
     const shown = [...told, ...this.notes, ...measured].sort((a, b) => a.onset_s - b.onset_s).slice(-MOST).reverse();
-    const squeals = events.filter((event) => event.kind === "SQUEAL").length;
-    const summary = events.length ? `${squeals} × squeal, ${events.length - squeals} × fault${events.length > MOST ? `, the last ${MOST} shown` : ""}` : "none so far";
+    const counted = ["SQUEAL", "FAULT", "NO DATA"].map((kind) => [kind.toLowerCase(), events.filter((event) => event.kind === kind).length]);
+    const counts = counted.filter(([, count]) => count).map(([kind, count]) => `${count} × ${kind}`).join(", ");
+    const summary = events.length ? `${counts}${events.length > MOST ? `, the last ${MOST} shown` : ""}` : "none so far";
     const verdict = comparison && `; measured: ${measured.filter((squeal) => squeal.verdict === "hit").length} hits, ${measured.filter((squeal) => squeal.verdict !== "hit").length} misses, ${alarms.size} false alarms`;
     this.note.textContent = summary + (verdict ?? "");
     this.body.replaceChildren(...shown.map((event) => this.#row(event)));
@@ -39,7 +40,7 @@ export class Events {
     const values = [
       event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, moment(event.onset_s),
       ends ? moment(event.end_s) : event.end_s === null ? "lasts" : NONE, ends ? fixed(event.end_s - event.onset_s, 2) : NONE, shown.mode_id ?? NONE, this.#frequency(shown.frequency_hz),
-      fixed(shown.friction_coefficient, 4), fixed(shown.normal_load_n, 1), fixed(shown.disc_speed_rad_s, 2),
+      this.#friction(event), fixed(shown.normal_load_n, 1), fixed(shown.disc_speed_rad_s, 2),
     ];
     values.forEach((value, k) => {
       const cell = document.createElement("td");
@@ -57,6 +58,12 @@ export class Events {
       row.append(cell);
     });
     return row;
+  }
+
+  /** At the onset, and where it grows fastest. */
+  #friction({ onset, peak, friction_coefficient: measured }) {
+    const [from, to] = [onset, peak].map((moment) => moment?.friction_coefficient);
+    return known(from) && known(to) ? `${fixed(from, 4)} → ${fixed(to, 4)}` : fixed(from ?? to ?? measured, 4);
   }
 
   #frequency(hz) {

@@ -17,9 +17,9 @@ export function signed(value, decimals) {
   return text === NONE || text.startsWith("\u2212") ? text : `+${text}`;
 }
 
-/** Labels of evenly spaced ticks: as many decimals as the step between them needs. */
+/** Labels of evenly spaced ticks: as many decimals as the step between them needs, or a single tick itself. */
 export function labels(ticks) {
-  const step = Math.abs(ticks[1] - ticks[0]);
+  const step = Math.abs(ticks.length > 1 ? ticks[1] - ticks[0] : ticks[0]);
   let decimals = 0;
   while (decimals < 8 && Math.abs(step * 10 ** decimals - Math.round(step * 10 ** decimals)) > 1e-6) decimals++;
   return ticks.map((tick) => fixed(tick, decimals));
@@ -75,3 +75,6 @@ export const forgetColours = () => colours.clear();
 export const modeColour = (id) => colour(`--mode-${id % 7}`);
 
 export const LEVELS = ["ok", "warn", "squeal", "fault"];
+
+/** Whether a state says something of the rig; without inputs, or after a fault, nothing is known. */
+export const asserts = (state) => ["ok", "warn", "squeal"].includes(state?.status);

@@ -1,7 +1,7 @@
 // The last minutes: ranges of load, speed, friction, growth and margin, of the measured vibration where there is one, and
 // a waterfall of the unstable frequencies with the measured ones.
 
-import { colour, fixed, known, labels, time } from "./format.js";
+import { NONE, colour, fixed, known, labels, put, time } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 /** `least` is the least range shown of a quantity, so that noise does not fill the plot. */
@@ -71,15 +71,18 @@ export class History {
     for (const plot of this.plots) plot.u.destroy();
     const holder = at("history-plots");
     holder.replaceChildren();
+    holder.classList.toggle("measured", this.measured);
     const rows = this.measured ? [...ROWS, MEASURED] : ROWS;
-    this.plots = rows.map((row) => this.#row(holder, row));
+    this.columns = columns(holder);
+    // Beside one another each column has an axis of its own.
+    this.plots = rows.map((row) => this.#row(holder, row, this.columns > 1 && row.key === "margin"));
     this.plots.push(this.#waterfall(holder));
     this.refresh();
   }
 
   #element(holder, row, name) {
     const box = document.createElement("div");
-    box.className = `row ${name}`;
+    box.className = `row ${name} ${row.key}`;
     const label = document.createElement("p");
     label.innerHTML = `<b></b><span></span>`;
     label.firstChild.textContent = row.label;
@@ -93,7 +96,8 @@ export class History {
     return plot;
   }
 
-  #options(element, xAxis, y) {
+  /** `filled` says whether there is anything to label the axes for. */
+  #options(element, xAxis, y, filled) {
     const ink = colour("--muted");
     const grid = { stroke: colour("--grid"), width: 1 };
     const px = Math.round(parseFloat(getComputedStyle(element).fontSize) * 0.75);
@@ -108,8 +112,13 @@ export class History {
       cursor: { show: false },
       scales: { x: { time: true, range: () => this.#span() }, y },
       axes: [
-        { show: xAxis, stroke: ink, grid, ticks: grid, font, size: 2.2 * px, space: 6 * px, values: (_, ticks) => ticks.map((tick) => this.#clock(tick)) },
-        { stroke: ink, grid, ticks: { ...grid, size: 4 }, font, size: 5 * px, space: 1.9 * px, values: (_, ticks) => labels(ticks) },
+        { show: xAxis, stroke: ink, grid, ticks: grid, font, size: 2.2 * px, space: 6 * px, values: (_, ticks) => ticks.map((tick) => (this.bins.length || this.live ? this.#clock(tick) : "")) },
+        // Labels at the ends would touch those of the next plot.
+        { stroke: ink, grid, ticks: { ...grid, size: 4 }, font, size: 5 * px, space: (u, axis, low, high, height) => Math.min(1.9 * px, 0.45 * height), values: (u, ticks) => {
+          const height = u.bbox.height / uPlot.pxRatio;
+          const inside = (tick) => Math.abs(u.valToPos(tick, "y") - height / 2) < height / 2 - 0.4 * px;
+          return filled() ? labels(ticks).map((label, k) => (inside(ticks[k]) ? label : "")) : ticks.map(() => "");
+        } },
       ],
     };
   }
@@ -131,8 +140,9 @@ export class History {
     return [Math.min(start, end - this.binS), end];
   }
 
-  #row(holder, row) {
+  #row(holder, row, xAxis) {
     const element = this.#element(holder, row, "range");
+    let some = false;
     const paint = colour(row.paint);
     const y = {
       range: (_, low, high) => {
@@ -152,25 +162,29 @@ export class History {
       ctx.fillRect(bbox.left, y, bbox.width, devicePixelRatio);
     };
     const u = new uPlot({
-      ...this.#options(element, false, y),
+      ...this.#options(element, xAxis, y, () => some),
       series: [{}, { stroke: paint, width: 1.5, points: { show: false } }, { stroke: paint, width: 1.5, points: { show: false } }],
       bands: [{ series: [2, 1], fill: `${paint}66` }],
       hooks: { drawClear: [zero] },
     }, [[], [], []], element);
     return { u, element, marker: this.#marker(u), data: (bins) => {
       const range = bins.map(row.range);
+      some = range.some(Boolean);
       return [bins.map((bin) => (bin.k + 0.5) * this.binS), range.map((r) => r?.[0] ?? null), range.map((r) => r?.[1] ?? null)];
     } };
   }
 
   #waterfall(holder) {
-    const element = this.#element(holder, { label: "unstable", unit: "Hz" }, "waterfall");
+    const element = this.#element(holder, { key: "unstable", label: "unstable", unit: "Hz" }, "waterfall");
     let shown = [];
     let heard = [];
-    let range = [0, 1];
+    let range = null;
+    const heat = heatScale();
     const paint = (u) => {
       const { ctx, bbox } = u;
       const fastest = Math.max(1e-12, ...shown.flatMap((bin) => bin.u.map(([, growth]) => growth)));
+      put(at("heat-low"), "0");
+      put(at("heat-high"), shown.length ? `${Number(fastest.toPrecision(3))} 1/s` : `${NONE} 1/s`);
       const width = Math.max(1.5 * devicePixelRatio, bbox.width * this.shownS / (u.scales.x.max - u.scales.x.min) + 1);
       const height = 6 * devicePixelRatio;
       for (const bin of shown) {
@@ -189,7 +203,7 @@ export class History {
       }
     };
     const u = new uPlot({
-      ...this.#options(element, true, { range: () => range }),
+      ...this.#options(element, true, { range: () => range ?? [0, 1] }, () => range !== null),
       series: [{}, { show: true, stroke: "transparent", points: { show: false } }],
       hooks: { draw: [paint] },
     }, [[], []], element);
@@ -256,6 +270,7 @@ export class History {
   }
 
   #resize() {
+    if (columns(at("history-plots")) !== this.columns) return this.draw();
     for (const { u, element } of this.plots) {
       const size = { width: Math.max(120, element.clientWidth), height: Math.max(40, element.clientHeight) };
       if (size.width !== u.width || size.height !== u.height) u.setSize(size);
@@ -286,11 +301,25 @@ function merged(bins, each, gap) {
   return all;
 }
 
-/** From dark to bright with rising growth; its brightness alone tells (after cividis). */
-function heat(share) {
-  const stops = [[0, 59, 111], [87, 93, 109], [138, 134, 120], [196, 179, 92], [254, 232, 56]];
-  const place = Math.min(0.9999, Math.max(0, share)) * (stops.length - 1);
-  const k = Math.floor(place);
-  const mix = stops[k].map((value, i) => Math.round(value + (place - k) * (stops[k + 1][i] - value)));
-  return `rgb(${mix.join(" ")})`;
+/** How many plots stand beside one another. */
+function columns(holder) {
+  const { display, gridTemplateColumns } = getComputedStyle(holder);
+  return display === "grid" ? gridTemplateColumns.split(" ").length : 1;
+}
+
+/** The colour of a growth rate from 0 to 1, further from the panel's with rising growth; paints the scale beside the plot. */
+function heatScale() {
+  const stops = [0, 1, 2, 3].map((k) => colour(`--heat-${k}`).match(/[0-9a-f]{2}/gi).map((pair) => parseInt(pair, 16)));
+  const heat = (share) => {
+    const place = Math.min(0.9999, Math.max(0, share)) * (stops.length - 1);
+    const k = Math.floor(place);
+    return `rgb(${stops[k].map((value, i) => Math.round(value + (place - k) * (stops[k + 1][i] - value))).join(" ")})`;
+  };
+  const scale = at("heat");
+  const ctx = scale.getContext("2d");
+  for (let x = 0; x < scale.width; x++) {
+    ctx.fillStyle = heat(x / (scale.width - 1));
+    ctx.fillRect(x, 0, 1, scale.height);
+  }
+  return heat;
 }

@@ -6,17 +6,23 @@ import { Decimals, NONE, fixed, known, leastGrowth, put } from "./format.js";
 const bound = (error) => (error === 0 ? "0" : error.toExponential(0).replace("-", "\u2212"));
 
 export class Modes {
-  constructor(about, choose) {
+  /** `choose` shows the shape of a mode; `picked` hears that somebody picked one. */
+  constructor(about, choose, picked) {
     this.threshold = about.instability_threshold;
     this.body = document.querySelector("#modes tbody");
+    this.scroll = this.body.closest(".scroll");
     this.rows = new Map();
     this.chosen = null;
     this.choose = choose;
+    this.picked = picked;
     this.decimals = { frequency: new Decimals(6, 1), growth: new Decimals(4, 2) };
+    // A table that gets another size shows the chosen mode still.
+    new ResizeObserver(() => this.#reveal()).observe(this.scroll);
   }
 
   numbers(state) {
     const modes = [...(state.modes ?? [])].sort((a, b) => a[0] - b[0]);
+    const count = this.rows.size;
     for (const id of [...this.rows.keys()]) {
       if (!modes.some((mode) => mode[0] === id)) {
         this.rows.get(id).row.remove();
@@ -36,10 +42,11 @@ export class Modes {
       put(cells[0], this.decimals.frequency.text(hz), hz);
       put(cells[1], this.decimals.growth.text(growth), growth);
       put(cells[2], fixed(damping, 5), damping);
-      put(cells[3], known(hzError) ? bound(hzError) : NONE, hzError);
-      put(cells[4], known(growthError) ? bound(growthError) : NONE, growthError);
-      put(cells[5], known(pad) ? `${fixed(100 * pad, 0)} %` : NONE, pad);
+      put(cells[3], known(pad) ? `${fixed(100 * pad, 0)} %` : NONE, pad);
+      put(cells[4], known(hzError) ? bound(hzError) : NONE, hzError);
+      put(cells[5], known(growthError) ? bound(growthError) : NONE, growthError);
     });
+    if (this.rows.size !== count) this.#reveal();
   }
 
   #row(id) {
@@ -58,6 +65,7 @@ export class Modes {
     head.append(button);
     row.append(head);
     row.addEventListener("click", () => {
+      this.picked();
       this.select(id);
       // On a small screen the picture is elsewhere.
       document.querySelector(".panel.shape").scrollIntoView({ block: "nearest" });
@@ -80,12 +88,25 @@ export class Modes {
     button.setAttribute("aria-pressed", String(chosen));
   }
 
+  /** Scrolls the table, and nothing but the table, to the chosen mode. */
+  #reveal() {
+    const row = this.rows.get(this.chosen)?.row;
+    if (!row) return;
+    const head = this.body.parentElement.tHead.offsetHeight;
+    const { scroll } = this;
+    const top = row.offsetTop - head;
+    const bottom = row.offsetTop + row.offsetHeight;
+    if (top < scroll.scrollTop) scroll.scrollTop = top;
+    else if (bottom > scroll.scrollTop + scroll.clientHeight) scroll.scrollTop = bottom - scroll.clientHeight;
+  }
+
   select(id) {
     const before = this.rows.get(this.chosen);
     if (before) this.#mark(before, false);
     this.chosen = id;
     const entry = this.rows.get(id);
     if (entry) this.#mark(entry, true);
+    this.#reveal();
     this.choose(id);
   }
 }

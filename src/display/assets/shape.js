@@ -1,7 +1,7 @@
 // A mode in motion: Re(x e^{iφ}) with the phase φ running forward, so that travelling waves travel the right way.
 
 import { next } from "./clock.js";
-import { colour, fixed } from "./format.js";
+import { colour, fixed, known, signed } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 /** Seconds of a period on the screen. */
@@ -45,6 +45,8 @@ export class ShapeView {
     this.shape = null;
     this.picture = null;
     this.visible = true;
+    /** Nothing is known of the mode now: its last shape does not move. */
+    this.stopped = false;
     at("shape-play").addEventListener("click", () => this.#play(!this.playing));
     at("shape-phase").addEventListener("input", (event) => {
       this.#play(false);
@@ -63,7 +65,58 @@ export class ShapeView {
     }).observe(this.stage);
   }
 
-  async show(shape) {
+  /** Stands still while nothing is known of the rig. */
+  still(stopped) {
+    if (stopped === this.stopped) return;
+    this.stopped = stopped;
+    this.stage.classList.toggle("still", stopped);
+    this.#note();
+    this.#run();
+  }
+
+  #note() {
+    const { shape } = this;
+    if (!shape) return;
+    const growth = shape.growth_rate_per_s;
+    const grown = growth > 0 ? "grows" : growth < 0 ? "decays" : "neither grows nor decays";
+    const now = this.stopped ? "the last shape known" : `slowed down; it ${grown}`;
+    at("shape-note").textContent = `mode ${shape.id}, ${fixed(shape.frequency_hz, shape.frequency_hz >= 100 ? 1 : 4)} Hz, ${now}`;
+  }
+
+  /** What the parts are, in their colours, and how far each moves. */
+  #name(parts) {
+    const largest = parts.map((part) => {
+      const squares = part.re.map((re, k) => re * re + part.im[k] * part.im[k]);
+      if (!part.spatial) return Math.sqrt(Math.max(0, ...squares));
+      return Math.sqrt(squares.reduce((most, _, k) => (k % 3 ? most : Math.max(most, squares[k] + squares[k + 1] + squares[k + 2])), 0));
+    });
+    const most = Math.max(...largest);
+    at("shape-parts").replaceChildren(...parts.map((part, p) => {
+      const item = document.createElement("li");
+      const swatch = document.createElement("span");
+      swatch.className = `swatch part-${part.name}`;
+      item.append(swatch, `${part.name} ${most > 0 ? fixed(100 * largest[p] / most, 0) : "0"} %`);
+      return item;
+    }));
+  }
+
+  /** What makes it grow faster or slower: the conditions, and stiffness and damping of the contact. */
+  #changes(change) {
+    const named = { friction: "μ", load: "load", speed: "speed", contact_stiffness: "stiffness", contact_damping: "damping" };
+    const entry = (kind, text) => Object.assign(document.createElement(kind), { textContent: text });
+    const told = Object.entries(named).filter(([key]) => known(change?.[key]));
+    const pairs = told.map(([key, name]) => {
+      const pair = document.createElement("div");
+      pair.append(entry("dt", name), entry("dd", change[key] === 0 ? "0" : signed(change[key], 2)));
+      return pair;
+    });
+    const title = document.createElement("div");
+    title.append(entry("dt", "+1 % of"), entry("dd", "growth"));
+    at("shape-changes").replaceChildren(...(pairs.length ? [title, ...pairs] : []));
+  }
+
+  /** `way` is the sign of the disc's speed. */
+  async show(shape, way = 1) {
     const spatial = shape.parts.some((part) => part.spatial);
     this.wanted = shape;
     if (spatial) this.three ??= await import("./vendor/three.module.min.js");
@@ -79,11 +132,11 @@ export class ShapeView {
     }
     if (this.shape?.id === shape.id) keepPhase(shape, this.shape);
     this.shape = shape;
-    const growth = shape.growth_rate_per_s;
-    const grown = growth > 0 ? "grows" : growth < 0 ? "decays" : "neither grows nor decays";
-    at("shape-note").textContent = `mode ${shape.id}, ${fixed(shape.frequency_hz, shape.frequency_hz >= 100 ? 1 : 4)} Hz, slowed down; it ${grown}`;
+    this.#note();
+    this.#name(shape.parts);
+    this.#changes(shape.growth_change);
     this.canvas.setAttribute("aria-label", `Mode ${shape.id} in motion`);
-    this.picture.take(shape);
+    this.picture.take(shape, way);
     this.#draw();
     this.#run();
   }
@@ -108,14 +161,14 @@ export class ShapeView {
   }
 
   #run() {
-    if (this.running || !this.playing || !this.visible || !this.shape) return;
+    if (this.running || this.stopped || !this.playing || !this.visible || !this.shape) return;
     this.running = true;
     this.before = performance.now();
     next(this.frame);
   }
 
   frame(now) {
-    this.running = this.playing && this.visible;
+    this.running = this.playing && this.visible && !this.stopped;
     if (!this.running) return;
     this.#turn(this.phase + 2 * Math.PI * Math.max(0, Math.min(0.2, (now - this.before) / 1000)) / PERIOD);
     this.before = now;
@@ -155,7 +208,7 @@ class Sticks {
 
   take(shape) {
     this.shape = shape;
-    this.paint = { ink: colour("--ink"), muted: colour("--muted"), grid: colour("--grid"), pad: colour("--mode-0"), disc: colour("--mode-1"), other: colour("--mode-2") };
+    this.paint = { ink: colour("--ink"), muted: colour("--muted"), grid: colour("--grid"), pad: colour("--pad"), disc: colour("--disc"), other: colour("--mode-2") };
     this.laidFor = undefined;
   }
 
@@ -264,6 +317,29 @@ class Sticks {
 /** The largest displacement, in units of the extent of what is shown. */
 const ENLARGED = 0.15;
 
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const unit = (a) => { const size = Math.hypot(...a) || 1; return a.map((value) => value / size); };
+
+/** Turns vectors so that the pad is above the disc and the radius from the disc's axis to `centre` is the first axis. */
+function towards({ axis_point_m: point, axis_direction: axis, normal }, centre) {
+  const along = unit(axis);
+  // The disc's plane is seen from the pad's side.
+  const up = dot(along, normal) < 0 ? along.map((value) => -value) : along;
+  const from = centre.map((value, k) => value - point[k]);
+  const away = from.map((value, k) => value - dot(from, along) * along[k]);
+  // About a centre on the axis any direction will do.
+  const first = unit(Math.hypot(...away) > 1e-9 ? away : cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  const second = cross(up, first);
+  return (v) => [dot(v, first), dot(v, second), dot(v, up)];
+}
+
+/** Without the disc's axis the patch lies flat: its thinnest direction points up. */
+function flat(sizes) {
+  const up = sizes.indexOf(Math.min(...sizes));
+  return (v) => [v[(up + 1) % 3], v[(up + 2) % 3], v[up]];
+}
+
 /** Interface nodes in space. */
 class Space {
   constructor(three, canvas) {
@@ -297,6 +373,7 @@ class Space {
   }
 
   #clear() {
+    this.outline = undefined;
     this.scene.traverse((object) => {
       object.geometry?.dispose();
       object.material?.dispose();
@@ -304,35 +381,34 @@ class Space {
     this.scene.clear();
   }
 
-  take(shape) {
+  take(shape, way = this.way) {
     const spatial = shape.parts.filter((part) => part.spatial && part.nodes_m.length);
     // Most shapes are of the rig that stands there already.
-    const nodes = JSON.stringify(spatial.map((part) => part.nodes_m));
-    if (nodes !== this.nodes) this.#build(spatial);
-    this.nodes = nodes;
+    const nodes = JSON.stringify([shape.disc, way, spatial.map((part) => part.nodes_m)]);
+    if (nodes !== this.nodes) this.#build(spatial, shape.disc, way);
+    [this.nodes, this.way] = [nodes, way];
     spatial.forEach((part, p) => {
       const drawn = this.parts[p];
       drawn.part = part;
-      drawn.tone.set(colour(part.name === "disc" ? "--mode-1" : "--mode-0"));
+      drawn.tone.set(colour(part.name === "disc" ? "--disc" : "--pad"));
       drawn.ghost.color.set(colour("--muted"));
     });
+    this.outline?.color.set(colour("--disc"));
   }
 
-  /** The parts at rest: their nodes, and a net between them. */
-  #build(spatial) {
+  /** The parts at rest: their nodes, and a net between them; the disc's outline around them where its axis is known. */
+  #build(spatial, disc, way) {
     const { three, scene } = this;
     this.#clear();
     const all = spatial.flatMap((part) => part.nodes_m);
     const low = [0, 1, 2].map((axis) => Math.min(...all.map((node) => node[axis])));
     const high = [0, 1, 2].map((axis) => Math.max(...all.map((node) => node[axis])));
     const extent = Math.max(...high.map((value, axis) => value - low[axis]), 1e-9);
-    // The patch lies flat: its thinnest direction points up.
-    const sizes = high.map((value, axis) => value - low[axis]);
-    const up = sizes.indexOf(Math.min(...sizes));
-    this.turned = (v) => [v[(up + 1) % 3], v[(up + 2) % 3], v[up]];
+    const centre = low.map((value, axis) => (value + high[axis]) / 2);
+    this.turned = disc ? towards(disc, centre) : flat(high.map((value, axis) => value - low[axis]));
     // In units of the patch, about its middle; sides that touch are drawn a little apart.
     const apart = (part) => (spatial.length < 2 ? 0 : part.name === "disc" ? -0.06 : 0.06);
-    const place = (node) => this.turned(node.map((value, axis) => (value - (low[axis] + high[axis]) / 2) / extent));
+    const place = (node) => this.turned(node.map((value, axis) => (value - centre[axis]) / extent));
     this.parts = spatial.map((part) => {
       const rest = part.nodes_m.map(place).map(([x, y, z]) => [x, y, z + apart(part)]);
       const geometry = new three.BufferGeometry();
@@ -356,6 +432,48 @@ class Space {
       }
       return { rest, positions, colours, ghost, tone: new three.Color() };
     });
+    // Positive speed turns right-handed about the axis, which may point away from who looks.
+    const sense = disc && dot(disc.axis_direction, disc.normal) < 0 ? -1 : 1;
+    if (disc) this.#outline(place(disc.axis_point_m), spatial.findIndex((part) => part.name === "disc"), sense * way);
+  }
+
+  /** The edges of the track that the pad rubs on the disc, fading away from the pad, and the way the disc slides. */
+  #outline([ax, ay], k, way) {
+    const { three, scene } = this;
+    const nodes = this.parts[k < 0 ? 0 : k].rest;
+    const radii = nodes.map(([x, y]) => Math.hypot(x - ax, y - ay));
+    const angles = nodes.map(([x, y]) => Math.atan2(y - ay, x - ax));
+    const z = nodes[0][2];
+    const [inner, outer] = [Math.min(...radii), Math.max(...radii)];
+    // Nodes around the whole axis, or around a middle angle on which the first axis of the picture points.
+    const reach = Math.max(...angles.map(Math.abs));
+    const ends = Math.min(Math.PI, reach + Math.max(0.7, 2.5 / outer));
+    const at = (radius, angle) => [ax + radius * Math.cos(angle), ay + radius * Math.sin(angle), z];
+    const [points, shades] = [[], []];
+    const line = (from, to, ...fades) => { points.push(...from, ...to); shades.push(...fades); };
+    const fade = (angle) => Math.min(1, Math.max(0, (ends - Math.abs(angle)) / Math.max(1e-9, ends - reach)));
+    const full = ends === Math.PI;
+    const steps = 96;
+    for (const radius of [inner, outer]) {
+      for (let i = 0; i < steps; i++) {
+        const [from, to] = [i, i + 1].map((n) => ends * (2 * n / steps - 1));
+        line(at(radius, from), at(radius, to), full ? 1 : fade(from), full ? 1 : fade(to));
+      }
+    }
+    if (way !== 0 && !full) {
+      const [middle, length] = [(inner + outer) / 2, 0.35 / outer];
+      const tail = way * (reach + 0.08 / outer);
+      const tip = tail + way * length;
+      line(at(middle, tail), at(middle, tip), 1, 1);
+      for (const side of [-0.07, 0.07]) line(at(middle, tip), at(middle + side, tip - way * 0.3 * length), 1, 1);
+    }
+    const geometry = new three.BufferGeometry();
+    geometry.setAttribute("position", new three.BufferAttribute(new Float32Array(points), 3));
+    geometry.setAttribute("color", new three.BufferAttribute(new Float32Array(shades.flatMap((shade) => [1, 1, 1, shade])), 4));
+    this.outline = new three.LineBasicMaterial({ vertexColors: true, transparent: true });
+    const lines = new three.LineSegments(geometry, this.outline);
+    lines.frustumCulled = false;
+    scene.add(lines);
   }
 
   draw(phase, width, height) {
@@ -368,7 +486,7 @@ class Space {
       camera.aspect = width / height;
       camera.updateProjectionMatrix();
     }
-    const far = 2 / Math.min(1, camera.aspect);
+    const far = (this.outline ? 2.8 : 2) / Math.min(1, camera.aspect);
     const [ca, sa, ce, se] = [Math.cos(this.azimuth), Math.sin(this.azimuth), Math.cos(this.elevation), Math.sin(this.elevation)];
     camera.up.set(0, 0, 1);
     camera.position.set(far * ca * ce, far * sa * ce, far * se);
@@ -380,7 +498,7 @@ class Space {
       rest.forEach((node, k) => {
         const d = this.turned([u[3 * k], u[3 * k + 1], u[3 * k + 2]]);
         positions.setXYZ(k, ...node.map((value, axis) => value + ENLARGED * d[axis]));
-        mixed.copy(tone).lerp(bright, Math.min(0.7, 0.7 * Math.hypot(...d)));
+        mixed.copy(tone).lerp(bright, 0.35 * Math.min(1, Math.hypot(...d)));
         colours.setXYZ(k, mixed.r, mixed.g, mixed.b);
       });
       positions.needsUpdate = true;

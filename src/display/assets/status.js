@@ -1,34 +1,44 @@
-// Status in words, colour and shape; the gauge of the margin; the numbers.
+// Status in words, colour and shape; what squeals next; the gauge of the margin; the numbers.
 
-import { Decimals, LEVELS, fixed, known, leastGrowth, put, signed } from "./format.js";
+import { Decimals, NONE, asserts, fixed, known, leastGrowth, put, signed } from "./format.js";
 
-const WORDS = ["OK", "WARN", "SQUEAL", "FAULT"];
-const CALM = "quiet: no mode grows";
+const WORDS = { ok: "OK", warn: "WARN", squeal: "SQUEAL", fault: "FAULT", waiting: "WAITING", no_data: "NO DATA" };
 const at = (id) => document.getElementById(id);
+
+/** Where inputs are waited for, and what stands in for a rig. */
+function listening(inputs) {
+  if (!inputs) return "";
+  const { topic, domain, service, start } = inputs;
+  const places = [topic && `topic ${topic} in ROS domain ${domain ?? 0}`, service && `shared-memory service ${service}`].filter(Boolean);
+  const heard = places.length ? `Listens to ${places.join(" and ")}.` : "Listens to no bus.";
+  return start ? `${heard} Without a rig, start: ${start}` : heard;
+}
 
 export class Status {
   constructor(about) {
     this.warn = about.warn_margin;
+    this.muMax = about.mu_max;
+    this.rig = about.rig;
+    this.listening = listening(about.inputs);
     this.reach = 0;
     this.decimals = { growth: new Decimals(4, 2), worst: new Decimals(6, 1), load: new Decimals(5, 1), speed: new Decimals(4, 2) };
     this.#scale(Math.max(0.1, 2 * this.warn));
+    this.#show("none", "");
   }
 
-  /** The level at once, and its reason with it. */
-  level(level, reason) {
-    const name = LEVELS[level] ?? "none";
-    const panel = at("status");
-    if (panel.dataset.level !== name) {
-      this.#reason(level, reason);
-      panel.dataset.level = name;
-      document.documentElement.dataset.level = name;
-      at("status-shape").setAttribute("href", `#shape-${name}`);
-      at("level").textContent = WORDS[level] ?? "WAITING";
-    }
+  /** The status at once, and its message with it. */
+  level({ status, message }) {
+    if (at("status").dataset.level !== status) this.#show(status, message);
   }
 
-  #reason(level, reason) {
-    if (level !== undefined) put(at("reason"), reason || CALM);
+  #show(status, message) {
+    at("status").dataset.level = status;
+    document.documentElement.dataset.level = status;
+    at("status-shape").setAttribute("href", `#shape-${["waiting", "no_data"].includes(status) ? "none" : status}`);
+    const word = WORDS[status] ?? "CONNECTING";
+    at("level").textContent = word;
+    document.title = `${word} · ${this.rig} · squealcast`;
+    put(at("reason"), message);
   }
 
   /** No connection: what is shown is old. */
@@ -38,11 +48,8 @@ export class Status {
     panel.classList.toggle("stale", gone);
     if (!gone) return;
     // An old OK must not be taken for a new one. The next state brings its own level.
-    const before = WORDS[LEVELS.indexOf(panel.dataset.level)];
-    panel.dataset.level = "none";
-    at("status-shape").setAttribute("href", "#shape-none");
-    at("level").textContent = "NO DATA";
-    put(at("reason"), before ? `no connection to the node; the last was ${before}` : "no connection to the node");
+    const before = asserts({ status: panel.dataset.level }) ? `; the last was ${WORDS[panel.dataset.level]}` : "";
+    this.#show("no_data", `no connection to the node${before}`);
   }
 
   needle(state) {
@@ -64,25 +71,53 @@ export class Status {
     }
   }
 
-  numbers(state, age) {
+  /** `padShare` tells the pad's share of a mode where the prediction does not. */
+  numbers(state, age, padShare) {
     const { growth, worst, load, speed } = this.decimals;
     for (const [, [hz]] of state.modes ?? []) growth.of(leastGrowth(hz));
+    const fresh = !at("status").classList.contains("stale");
     // Its numbers change with every state; nobody reads as fast.
-    if (!at("status").classList.contains("stale")) this.#reason(state.level, state.reason);
+    if (fresh) put(at("reason"), state.message ?? "");
+    this.#answer(state, padShare, fresh);
     put(at("margin"), signed(state.margin, 4), state.margin);
     put(at("mu"), fixed(state.mu, 4), state.mu);
-    put(at("critical"), fixed(state.critical, 4), state.critical);
     put(at("growth"), growth.text(state.growth), state.growth);
     put(at("worst"), worst.text(state.worst_hz), state.worst_hz);
     put(at("load"), load.text(state.load), state.load);
     put(at("speed"), speed.text(state.speed), state.speed);
     put(at("unstable"), fixed(state.unstable, 0), state.unstable);
-    put(at("age"), known(age) ? fixed(age, 1) : "–", age);
-    put(at("seq"), known(state.seq) ? String(state.seq) : "–", state.seq);
+    put(at("age"), known(age) ? fixed(age, 1) : "none yet", age);
+    at("age-unit").hidden = !known(age);
+    put(at("seq"), known(state.seq) ? String(state.seq) : NONE, state.seq);
     put(at("rate"), fixed(state.rate_hz, 0), state.rate_hz);
     const c = state.counters;
     if (c) put(at("counters"), `${c.solved} solved, ${c.charted} charted, ${c.reused} reused, ${c.faults} faults, ${c.passed_over} passed over`);
     this.#trend(state);
+  }
+
+  /** What squeals, or squeals next: which modes, at what frequency, where, and which part moves. */
+  #answer(state, padShare, fresh) {
+    const { fastest, next, status, mu } = state;
+    const told = asserts(state) && (fastest || next);
+    at("answer-facts").hidden = !told;
+    at("answer-text").hidden = Boolean(told);
+    const silent = ["waiting", "no_data"].includes(status);
+    put(at("answer-title"), status === "squeal" ? "Squeals now" : silent ? "Inputs" : "Squeals next");
+    if (!told) {
+      const stable = state.map ? `Nothing up to μ ${fixed(this.muMax, 2)}.` : "Not known yet: the stability map is being made.";
+      put(at("answer-text"), !fresh ? "" : asserts(state) ? stable : silent ? this.listening : "Not known: there is no prediction for this input.");
+      return;
+    }
+    const ids = fastest ? [fastest.id] : next.ids;
+    const hz = (fastest ?? next).frequency_hz;
+    put(at("answer-modes"), ids.length ? ids.join(" + ") : "none: static");
+    put(at("answer-modes-name"), ids.length > 1 ? "modes" : "mode");
+    put(at("answer-hz"), hz > 0 ? fixed(hz, hz >= 100 ? 1 : 4) : NONE, hz);
+    put(at("answer-mu-name"), !next ? "end, μ" : next.inside ? "ends at μ" : mu > next.mu ? "below μ" : "from μ");
+    put(at("answer-mu"), fixed(next?.mu, 4), next?.mu);
+    const share = (state.modes ?? []).find(([id]) => id === ids[0])?.[1][3] ?? padShare?.(ids[0]);
+    const part = share >= 0.5 ? `pad ${fixed(100 * share, 0)} %` : `disc ${fixed(100 * (1 - share), 0)} %`;
+    put(at("answer-part"), known(share) ? part : NONE, share);
   }
 
   #trend(state) {
