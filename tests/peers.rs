@@ -658,6 +658,19 @@ fn collect(heard: &Receiver<Prediction>, count: u64) -> HashMap<u64, u32> {
 }
 
 #[test]
+fn the_launch_file_puts_the_node_into_a_namespace() {
+    let Some(python) = peer_program("python") else { return };
+    let file = manifest_dir().join("launch/squealcast.launch.py").display().to_string();
+    for namespace in ["left", "/left"] {
+        let loaded = peer(&python, "load_launch.py", &[&file, &format!("namespace:={namespace}")]);
+        let command: Vec<String> = serde_json::from_value(loaded["command"].clone()).expect("a command line");
+        assert!(command.windows(2).any(|pair| pair == ["-r", "__ns:=/left"]), "{command:?}");
+    }
+    let loaded = peer(&python, "load_launch.py", &[&file]);
+    assert!(!loaded["command"].to_string().contains("__ns"), "{loaded}");
+}
+
+#[test]
 fn the_launch_file_starts_the_node() {
     let (Some(ros_python), Some(python)) = (peer_program("ros-python"), peer_program("python")) else { return };
     let _alone = alone();
