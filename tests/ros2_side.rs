@@ -9,7 +9,7 @@ use std::fs::{self, File};
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
 use std::process::{Child, Stdio};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 use bus::{into, wait_until};
@@ -23,7 +23,7 @@ use squealcast::io::ros_args::RosArgs;
 use squealcast::io::ros2::process::{Ros2Process, Sinks};
 use squealcast::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::io::shm::{ShmOptions, ShmSink, ShmSource};
-use squealcast::wire::{Header, OperatingPoint, Prediction, RigInfo, Time, level};
+use squealcast::wire::{DiagnosticStatus, Header, OperatingPoint, Prediction, RigInfo, Time, level};
 use tempfile::TempDir;
 
 /// How far the memory of a node may be from what it was before an attack, bytes.
@@ -49,7 +49,7 @@ impl Node {
     fn start(number: u16) -> Self {
         let folder = TempDir::new().expect("a folder");
         let process_id = std::process::id();
-        let domain = 10 + (process_id % 13) as u16 * 7 + number;
+        let domain = 10 + (process_id % 9) as u16 * 10 + number;
         let prefix = format!("ros2-side-{process_id}-{number}/");
         let records = text(&folder.path().join("records"));
         let domain_text = domain.to_string();
@@ -115,8 +115,9 @@ impl Node {
         self.answer_within(bus::PATIENCE).unwrap_or_else(|| panic!("no answer over shared memory: {}", self.said()))
     }
 
-    /// Ends it, and checks that every input that it answered is in its recording with its answer.
-    fn finish(mut self) {
+    /// Ends it, and checks that every input that it answered is in its recording with its answer. Gives back
+    /// the recorded state of the node, once a second, and the sequence numbers of the inputs over ROS 2.
+    fn finish(mut self) -> (Vec<DiagnosticStatus>, Vec<u64>) {
         signal(self.process.id(), "INT");
         let status = self.process.wait().expect("it ends");
         assert!(status.success(), "{status}: {}", self.said());
@@ -126,15 +127,19 @@ impl Node {
             .collect();
         let recording = Recording::open(&records[0]).expect("a recording");
         assert!(recording.is_complete(), "{:?}", recording.damage());
-        let (mut inputs, mut answers) = (vec![], vec![]);
+        let (mut inputs, mut over_ros2, mut answers, mut states) = (vec![], vec![], vec![], vec![]);
         for entry in recording.messages() {
             match entry.message {
                 Recorded::Known(Payload::OperatingPoint(input)) if input.seq < FIRST_OVER_ROS => inputs.push(input.seq),
+                Recorded::Known(Payload::OperatingPoint(input)) => over_ros2.push(input.seq),
                 Recorded::Known(Payload::Prediction(answer)) if answer.input_seq < FIRST_OVER_ROS => {
                     // The note of a silence is no answer to an input.
                     if !answer.reason.starts_with("stale") {
                         answers.push(answer.input_seq);
                     }
+                }
+                Recorded::Known(Payload::Diagnostics(array)) => {
+                    states.extend(array.status.into_iter().find(|status| status.name.ends_with("predictions")));
                 }
                 _ => {}
             }
@@ -144,6 +149,7 @@ impl Node {
             let recorded: Vec<u64> = seqs.into_iter().filter(|&seq| seq >= self.first_seq).collect();
             assert!(recorded == asked, "{} {what} recorded of {}", recorded.len(), asked.len());
         }
+        (states, over_ros2)
     }
 }
 
@@ -318,7 +324,96 @@ fn a_ros2_side_that_is_killed_is_started_again_with_the_rig() {
     late_reader_of_the_rig(node.domain, |rig| {
         node.wait("the latched rig", |_| rig().is_some_and(|rig| rig.mode_count == 9))
     });
+    let (states, _) = node.finish();
+    let warned = |state: &&DiagnosticStatus| state.level == 1 && state.message.contains("the ROS 2 side fell");
+    assert!(states.iter().filter(warned).any(|state| state.message.contains("SIGKILL")), "{states:?}");
+    let last = states.last().expect("one a second");
+    assert!(last.values.iter().any(|pair| pair.key == "ros2_side_falls" && pair.value == "3"), "{last:?}");
+}
+
+/// A value that a peer set is in force in the next ROS 2 side too, and what must be refused is.
+#[test]
+fn parameters_outlive_the_ros2_side() {
+    let mut node = Node::start(7);
+    let client = ParameterClient::join(node.domain);
+    assert_eq!(client.set("warn_margin", 0.33), Ok(()));
+    assert!(client.set("warn_margin", -1.0).is_err_and(|reason| reason.contains("warn_margin")));
+    signal(node.side().expect("it is there"), "KILL");
+    node.wait("the note of the fall", |node| node.answers() > Duration::ZERO && node.falls() == 1);
+    node.wait("the next ROS 2 side", |node| node.side().is_some());
+    assert_eq!(ParameterClient::join(node.domain).get("warn_margin"), 0.33);
     node.finish();
+}
+
+/// Asks a node for its parameters.
+struct ParameterClient {
+    node: Mutex<ros2_client::Node>,
+    runtime: tokio::runtime::Runtime,
+    _context: ros2_client::Context,
+}
+
+impl ParameterClient {
+    fn join(domain: u16) -> Self {
+        use ros2_client::{Context, NodeName, NodeOptions};
+        let participant =
+            rustdds::DomainParticipantBuilder::new(domain).with_only_networks([Ipv4Addr::LOCALHOST]).build();
+        let context = Context::from_domain_participant(participant.expect("participant")).expect("context");
+        let mut node = context.new_node(NodeName::new("/", "asking").expect("name"), NodeOptions::new()).expect("node");
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+        let runtime = runtime.expect("runtime");
+        runtime.spawn(node.spinner().expect("spinner").spin());
+        Self { node: Mutex::new(node), runtime, _context: context }
+    }
+
+    fn set(&self, name: &str, value: f64) -> Result<(), String> {
+        use ros2_client::rcl_interfaces::{SetParametersRequest, SetParametersResponse};
+        use ros2_client::{Parameter, ParameterValue};
+        let parameter = Parameter { name: name.to_owned(), value: ParameterValue::Double(value) };
+        let request = SetParametersRequest { parameter: vec![parameter.into()] };
+        let answer: SetParametersResponse = self.call("SetParameters", "set_parameters", request);
+        let result = &answer.results[0];
+        if result.successful { Ok(()) } else { Err(result.reason.clone()) }
+    }
+
+    fn get(&self, name: &str) -> f64 {
+        use ros2_client::rcl_interfaces::{GetParametersRequest, GetParametersResponse};
+        let request = GetParametersRequest { names: vec![name.to_owned()] };
+        let answer: GetParametersResponse = self.call("GetParameters", "get_parameters", request);
+        answer.values[0].double_value
+    }
+
+    fn call<Q, A>(&self, kind: &str, name: &str, request: Q) -> A
+    where
+        Q: ros2_client::Message + Clone + 'static,
+        A: ros2_client::Message + 'static,
+    {
+        use ros2_client::{Name, QosProfile, ServiceMapping, ServiceTypeName};
+        let mut node = self.node.lock().expect("whole");
+        let profile = QosProfile::publisher_default();
+        let client = node.create_client::<Q, A>(
+            ServiceMapping::Enhanced,
+            &Name::new("/squealcast", name).expect("name"),
+            &ServiceTypeName::new("rcl_interfaces", kind),
+            profile.clone(),
+            profile,
+        );
+        let client = client.expect("client");
+        let begun = Instant::now();
+        loop {
+            // The client may know the service before the service knows the client: then the request is lost.
+            let answered = self.runtime.block_on(async {
+                tokio::time::timeout(Duration::from_secs(1), async {
+                    client.wait_for_service(&node).await;
+                    client.async_call_service(request.clone()).await.expect("answered")
+                })
+                .await
+            });
+            match answered {
+                Ok(answer) => return answer,
+                Err(_) => assert!(begun.elapsed() < bus::PATIENCE, "no answer: {name}"),
+            }
+        }
+    }
 }
 
 #[test]
@@ -334,6 +429,32 @@ fn a_ros2_side_that_hangs_is_replaced() {
     node.wait("an answer over ROS 2 again", |node| node.answers() > Duration::ZERO && peer.is_answered());
     assert_ne!(node.side(), Some(side));
     node.finish();
+}
+
+/// The ROS 2 side hears on while its node is stopped, and the node gets what came meanwhile.
+#[test]
+fn a_node_that_is_stopped_for_a_while_loses_no_input() {
+    const COUNT: u64 = 2000;
+    let mut node = Node::start(9);
+    let mut peer = Peer::join(node.domain);
+    node.wait("an answer over ROS 2", |_| peer.is_answered());
+    let first = peer.seq;
+    signal(node.process.id(), "STOP");
+    let begun = Instant::now();
+    while peer.seq < first + COUNT {
+        peer.is_answered();
+        std::thread::sleep(Duration::from_millis(2 * (peer.seq - first)).saturating_sub(begun.elapsed()));
+    }
+    signal(node.process.id(), "CONT");
+    node.wait("an answer to the last input", |_| {
+        peer.heard.try_iter().any(|heard| heard.message.input_seq == first + COUNT)
+    });
+    assert_eq!(node.falls(), 0, "{}", node.said());
+    let (_, recorded) = node.finish();
+    let recorded = recorded.iter().filter(|&&seq| seq > first).count() as u64;
+    eprintln!("{recorded} of {COUNT} recorded");
+    // The subscription itself may lose some on a busy machine; the socket alone holds a few hundred.
+    assert!(recorded > COUNT * 9 / 10, "{recorded}");
 }
 
 /// Also one that is stopped: it cannot read that its socket was closed.
@@ -373,7 +494,9 @@ fn a_reader_that_does_not_acknowledge_holds_up_no_other() {
     let (first, begun) = (node.seq, Instant::now());
     let (mut heard, mut last_heard, mut longest_pause, mut last_seq) = (0, begun, Duration::ZERO, 0);
     while last_seq < first + COUNT {
-        for prediction in peer.heard.try_iter().filter(|heard| heard.message.input_seq > first) {
+        for prediction in
+            peer.heard.try_iter().filter(|heard| (first + 1..FIRST_OVER_ROS).contains(&heard.message.input_seq))
+        {
             heard += 1;
             last_seq = prediction.message.input_seq;
             longest_pause = longest_pause.max(last_heard.elapsed());
@@ -398,6 +521,8 @@ fn a_reader_that_does_not_acknowledge_holds_up_no_other() {
         "{heard} of {COUNT} heard beside a frozen reader in {:.1?}, longest pause {longest_pause:.1?}",
         begun.elapsed()
     );
+    // What this reader cannot keep up with at 2 kHz on a busy machine is lost in its own queue.
+    assert!(heard >= COUNT / 2, "{heard}");
     // A renewal holds predictions back for 0.1 s; a busy machine adds to it. Without, it is the reader's lease.
     assert!(longest_pause < Duration::from_secs(3), "{longest_pause:?}");
     assert_eq!(node.falls(), 0, "{}", node.said());
@@ -408,14 +533,14 @@ fn a_reader_that_does_not_acknowledge_holds_up_no_other() {
 fn the_ros2_side_costs_little_time() {
     const BLOCKS: usize = 10;
     const ROUNDS: usize = 100;
-    let domain = 10 + (std::process::id() % 13) as u16 * 7;
-    let options = |number: u16, topic: &str| {
+    let domain = 10 + (std::process::id() % 9) as u16 * 10 + 8;
+    let options = |topic: &str| {
         let rules = ["/rig/operating_point", "/squealcast/prediction"].map(|name| format!("{name}:={topic}{name}"));
         let arguments = ["--ros-args", "-r", &rules[0], "-r", &rules[1]].map(str::to_owned);
         let (args, _) = RosArgs::split(arguments).expect("well formed");
-        Ros2Options::new(Some(domain + number), true, args).expect("a domain")
+        Ros2Options::new(Some(domain), true, args).expect("a domain")
     };
-    let (inside, beside) = (options(4, "/inside"), options(4, "/beside"));
+    let (inside, beside) = (options("/inside"), options("/beside"));
 
     let echo: Arc<OnceLock<Ros2>> = Arc::default();
     let echoing = echo.clone();

@@ -1,5 +1,8 @@
 //! ROS 2: the node `/squealcast`, and its mirror, a rig that publishes conditions and hears predictions.
 //!
+//! A node that runs for long holds its [`Ros2`] in a child process, [`process::Ros2Process`]: a datagram can make RustDDS allocate
+//! without bound. What ends with its task (`simulate`, `replay`) holds it itself.
+//!
 //! Pure Rust DDS underneath (RustDDS): no ROS 2 installation is needed. Publishing works from any thread and never
 //! waits. A peer that was killed is only forgotten after its lease; who listens should look at sequence numbers.
 

@@ -8,10 +8,12 @@ use std::io::{self, Write};
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::process;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
 use std::time::{Duration, Instant};
 
+use crossbeam_channel::{Receiver, Sender, bounded};
 use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal, setrlimit};
 use serde::Serialize;
 
@@ -26,6 +28,8 @@ const MEMORY_LIMIT: u64 = 256 << 20;
 /// Resident memory above which this process ends in order to be started anew, bytes: RustDDS keeps some of the memory
 /// of every peer that died.
 const RESIDENT_LIMIT: usize = 128 << 20;
+/// Messages that may wait for a node that is held up: 8 s of inputs at 1 kHz.
+const QUEUE: usize = 8192;
 /// The longest CDR form of an input or a vibration that is passed on to the node, bytes; longer ones count as malformed.
 const MAX_INPUT: usize = 4096;
 /// Time between looks at the numbers of readers and writers.
@@ -56,7 +60,10 @@ pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Er
         return Err(Ros2Error::Side("standard input is no socket of a node: this command is for `run`".to_owned()));
     }
     contain()?;
-    let node = ToNode(Arc::new(Mutex::new(socket.try_clone()?)));
+    let (queue, queued) = bounded(QUEUE);
+    let node = ToNode { queue, lost: Arc::default(), malformed: Arc::default() };
+    let to_node = socket.try_clone()?;
+    let writer = thread::Builder::new().name("to node".to_owned()).spawn(move || write(&to_node, &queued))?;
     let mut frames = Frames::new(socket.try_clone()?, MAX_TO_SIDE);
     let start = loop {
         match frames.next::<ToSide>().map_err(|error| Ros2Error::Side(error.to_string()))? {
@@ -66,23 +73,20 @@ pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Er
             Next::End => return Ok(()),
         }
     };
-    let too_long = Arc::new(AtomicU64::new(0));
-    match join(start, validate, &node, &too_long) {
+    match join(start, validate, &node) {
         Ok(ros2) => {
             node.send(&FromSide::Joined(ros2.full_name()));
             socket.set_read_timeout(Some(LOOK_EVERY))?;
-            Side {
-                ros2,
-                node,
-                too_long,
-                renewed: None,
-                held_back: VecDeque::new(),
-                refused: 0,
-                last_refusal: String::new(),
-            }
-            .serve(&mut frames);
+            let side =
+                Side { ros2, node, renewed: None, held_back: VecDeque::new(), refused: 0, last_refusal: String::new() };
+            side.serve(&mut frames);
         }
-        Err(error) => node.send(&FromSide::Refused(error.to_string())),
+        Err(error) => {
+            node.send(&FromSide::Refused(error.to_string()));
+            drop(node);
+            // A writer that failed has ended the process.
+            let _ = writer.join();
+        }
     }
     Ok(())
 }
@@ -105,14 +109,8 @@ fn contain() -> io::Result<()> {
     Ok(())
 }
 
-fn join(
-    start: Start,
-    validate: fn(&str, f64) -> Result<(), String>,
-    node: &ToNode,
-    too_long: &Arc<AtomicU64>,
-) -> Result<Ros2, Ros2Error> {
+fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNode) -> Result<Ros2, Ros2Error> {
     let (inputs, vibrations, parameters) = (node.clone(), node.clone(), node.clone());
-    let (long_inputs, long_vibrations) = (too_long.clone(), too_long.clone());
     let parameters = Parameters {
         values: start.parameters,
         validate: Box::new(validate),
@@ -124,35 +122,45 @@ fn join(
         &start.options,
         parameters,
         MAX_UNANSWERED,
-        move |Heard { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }, &long_inputs),
-        move |Heard { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }, &long_vibrations),
+        move |Heard { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }),
+        move |Heard { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }),
     )
 }
 
-/// The socket to the node. A node that does not read is waited for.
+/// The way to the node. It is never waited for: what does not fit into the queue is lost, and counted.
 #[derive(Clone)]
-struct ToNode(Arc<Mutex<UnixStream>>);
+struct ToNode {
+    queue: Sender<Vec<u8>>,
+    lost: Arc<AtomicU64>,
+    /// Messages that are no frame, or too long a one.
+    malformed: Arc<AtomicU64>,
+}
 
 impl ToNode {
     fn send(&self, frame: &impl Serialize) {
-        match encode(frame) {
-            Ok(bytes) => self.write(&bytes),
-            Err(error) => note!("not sent to the node: {error}"),
-        }
+        self.send_up_to(usize::MAX, frame);
     }
 
-    /// Sends a frame that others decided the length of.
-    fn send_short(&self, frame: &impl Serialize, too_long: &AtomicU64) {
-        match encode(frame) {
-            Ok(bytes) if bytes.len() <= MAX_INPUT => self.write(&bytes),
-            _ => drop(too_long.fetch_add(1, Ordering::Relaxed)),
-        }
+    /// Sends a frame whose length others decided.
+    fn send_short(&self, frame: &impl Serialize) {
+        self.send_up_to(MAX_INPUT, frame);
     }
 
-    fn write(&self, bytes: &[u8]) {
-        let mut socket = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if socket.write_all(bytes).is_err() {
-            // The node has gone.
+    fn send_up_to(&self, limit: usize, frame: &impl Serialize) {
+        match encode(frame) {
+            Ok(bytes) if bytes.len() <= limit => {
+                let sent = self.queue.try_send(bytes).is_ok();
+                self.lost.fetch_add(u64::from(!sent), Ordering::Relaxed);
+            }
+            _ => drop(self.malformed.fetch_add(1, Ordering::Relaxed)),
+        }
+    }
+}
+
+/// Writes what is queued until nobody can queue any more; ends the process where the node has gone.
+fn write(mut socket: &UnixStream, queued: &Receiver<Vec<u8>>) {
+    for bytes in queued {
+        if socket.write_all(&bytes).is_err() {
             process::exit(0);
         }
     }
@@ -162,7 +170,6 @@ impl ToNode {
 struct Side {
     ros2: Ros2,
     node: ToNode,
-    too_long: Arc<AtomicU64>,
     /// When the publisher of predictions was renewed, until the one before it is dropped.
     renewed: Option<Instant>,
     held_back: VecDeque<Prediction>,
@@ -274,7 +281,8 @@ impl Side {
 
     fn status(&self) -> Status {
         let mut counts = self.ros2.counts();
-        counts.malformed += self.too_long.load(Ordering::Relaxed);
+        counts.malformed += self.node.malformed.load(Ordering::Relaxed);
+        counts.missed += self.node.lost.load(Ordering::Relaxed);
         Status {
             prediction_readers: self.ros2.prediction_readers() as u64,
             sensitivity_readers: self.ros2.sensitivity_readers() as u64,
