@@ -6,3 +6,5 @@
 pub mod fem;
 pub mod physics;
 pub mod reduction;
+#[cfg(test)]
+mod spoil;

@@ -75,6 +75,14 @@ impl Dense {
             unsymmetric_params(),
         )
         .map_err(|_| SolveError::NoConvergence { dimension })?;
+        #[cfg(test)]
+        if crate::spoil::spoilt(crate::spoil::Spoil::Value) {
+            re[0] += 1e-6 * norm;
+        }
+        #[cfg(test)]
+        if crate::spoil::spoilt(crate::spoil::Spoil::Vector) && vectors != Vectors::None {
+            self.right[(0, 0)] += 1e-3;
+        }
         self.values.extend(re.iter().zip(im.iter()).map(|(&re, &im)| c64::new(re, im)));
         // faer does not report whether the iteration converged; the traces of what it left tell.
         let rounding = 64.0 * dimension as f64 * f64::EPSILON;

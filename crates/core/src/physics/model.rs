@@ -691,3 +691,57 @@ pub(super) fn congruence(a: MatRef<'_, f64>, d: &[f64], b: MatRef<'_, f64>) -> M
     }
     product
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::solver::Solver;
+    use super::super::spectrum::Vectors;
+    use super::*;
+
+    /// Two pairs of contact in two coordinates, of which one moves along the direction of sliding and one across it: each obeys
+    /// `λ² + c λ + k = 0`. The slope of friction makes `c = N dμ/dv`, the turning of friction `c = μ N / (|ω| r)`, whichever way
+    /// the disc turns; by hand, -10 and 153.846 1/s.
+    #[test]
+    fn friction_damps_along_and_across_the_direction_of_sliding_as_by_hand() {
+        let law = |slope_s_per_m: f64, lateral_damping: bool| ContactLaw {
+            slope_s_per_m,
+            lateral_damping,
+            ..Default::default()
+        };
+        let row = |along: usize| Mat::from_fn(2, 2, |_, column| if column == along { 1.0 } else { 0.0 });
+        let pairs = ContactPairs {
+            normal: Mat::zeros(2, 2),
+            sliding: row(0),
+            lateral: row(1),
+            stiffness_n_per_m: vec![0.0; 2],
+            damping_n_s_per_m: vec![0.0; 2],
+            radius_m: vec![0.1; 2],
+        };
+        let stiffness = faer::mat![[4e4, 0.0], [0.0, 1e6]];
+        let point =
+            |disc_speed_rad_s| OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s, friction_coefficient: 0.4 };
+        let across = 0.4 * 500.0 / (13.0 * 0.1);
+        let cases =
+            [(law(-0.02, false), [-10.0, 0.0]), (law(0.0, true), [0.0, across]), (law(0.03, true), [15.0, across])];
+        for (law, expected) in cases {
+            let terms = vec![Term { matrix: stiffness.clone(), law: Law::Constant }];
+            let model = Model::new(2, terms, vec![], law, None).and_then(|model| model.with_contact(&pairs)).unwrap();
+            for speed in [13.0, -13.0] {
+                let (mut k, mut c) = (Mat::zeros(2, 2), Mat::zeros(2, 2));
+                model.assemble(&point(speed), &mut k, &mut c).unwrap();
+                let spectrum = Solver::new(2).solve(&model, &point(speed), Vectors::Right).unwrap();
+                for (mode, damping) in expected.into_iter().enumerate() {
+                    assert!((c[(mode, mode)] - damping).abs() < 1e-12 * across, "{law:?} at {speed}: {c:?}");
+                    // σ = -c/2 of a root that oscillates.
+                    let growth = spectrum.roots[mode].lambda.re;
+                    assert!((growth + 0.5 * damping).abs() < 1e-9, "{law:?} at {speed}: {growth} 1/s");
+                }
+                assert_eq!((c[(0, 1)], c[(1, 0)]), (0.0, 0.0));
+            }
+            // Twice the speed, half the damping across; along it speed takes no part.
+            let (mut k, mut c) = (Mat::zeros(2, 2), Mat::zeros(2, 2));
+            model.assemble(&point(-26.0), &mut k, &mut c).unwrap();
+            assert!((c[(1, 1)] - 0.5 * expected[1]).abs() < 1e-12 * across && (c[(0, 0)] - expected[0]).abs() < 1e-12);
+        }
+    }
+}

@@ -487,6 +487,30 @@ mod tests {
         }
     }
 
+    /// A vector that is not one is refused by its residual; a value that is not one by the traces where no vectors are asked for.
+    #[test]
+    fn an_answer_that_is_none_is_refused() {
+        use crate::spoil::{Spoil, with};
+        let (model, mut solver) = (nine_dof(1.0, 1.0, 1.0), Solver::new(9));
+        let mut solve =
+            |vectors| solver.solve(&model, &REFERENCE.with_friction(0.5), vectors).map(|found| found.mode_count);
+        for vectors in [Vectors::Right, Vectors::Both] {
+            let found = with(Spoil::Vector, || solve(vectors));
+            let Err(SolveError::Residual { residual, limit, .. }) = found else { panic!("{found:?}") };
+            assert!(residual > limit && limit == RESIDUAL_LIMIT);
+        }
+        let found = with(Spoil::Value, || solve(Vectors::None));
+        assert!(matches!(found, Err(SolveError::Trace { power: 1, .. })), "{found:?}");
+        assert_eq!(solve(Vectors::None), Ok(9));
+    }
+
+    /// A root is unstable when its growth rate exceeds the threshold times its size.
+    #[test]
+    fn the_threshold_of_instability() {
+        let root = |growth: f64| Root { lambda: c64::new(growth, 1.0), ..solve(&one(25.0, 6.0), 0.0).roots[0] };
+        assert!(!root(0.99e-6).is_unstable(1e-6) && root(1.01e-6).is_unstable(1e-6));
+    }
+
     /// `d(λ²)/dμ` from left and right vectors against a central difference of the roots.
     #[test]
     fn friction_sensitivity_is_the_derivative() {

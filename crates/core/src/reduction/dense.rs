@@ -236,12 +236,12 @@ mod tests {
     }
 
     #[test]
-    fn a_free_body_has_frequency_zero_exactly() {
+    fn a_free_body_has_frequency_zero_to_rounding() {
         let mass = faer::mat![[0.3, 0.0, 0.0], [0.0, 0.7, 0.0], [0.0, 0.0, 1.1]];
         let stiffness = faer::mat![[1e9, -1e9, 0.0], [-1e9, 3e9, -2e9], [0.0, -2e9, 2e9]];
         let modes = free_interface_modes("pad", mass.as_ref(), stiffness.as_ref(), &ModeSelection::All).unwrap();
-        // Rounding leaves |ω²| of 1e-16 of the largest, 1e-8 of it in ω.
-        assert!(modes.omega_rad_s[0] < 1e-7 * modes.omega_rad_s[2], "{:?}", modes.omega_rad_s);
+        // Rounding leaves ω² below n ε times the largest: 2.6e-8 of it in ω with n = 3.
+        assert!(modes.omega_rad_s[0] < (3.0 * f64::EPSILON).sqrt() * modes.omega_rad_s[2], "{:?}", modes.omega_rad_s);
     }
 
     #[test]

@@ -268,7 +268,11 @@ impl<'a> FullSolver<'a> {
         let mut problem = Problem::new(&self.what, self.model, p, vectors, self.parts.is_some(), GROWTH * band_rad_s)?;
         let mut found: Vec<Found> = vec![];
         while let Some(gap) = first_gap(&found, band_rad_s) {
-            if found.len() == MOST_SHIFTS {
+            #[cfg(not(test))]
+            let most = MOST_SHIFTS;
+            #[cfg(test)]
+            let most = if crate::spoil::spoilt(crate::spoil::Spoil::Shifts) { 1 } else { MOST_SHIFTS };
+            if found.len() == most {
                 return Err(ReductionError::NotCovered { what: self.what.clone(), covered: gap[0], band: band_rad_s });
             }
             let [low, high] = gap;
@@ -283,6 +287,10 @@ impl<'a> FullSolver<'a> {
             progress(FullProgress::Covered { disc: new.disc, roots: new.roots.len() });
             found.push(new);
             found.sort_by(|a, b| a.disc.shift_rad_s.total_cmp(&b.disc.shift_rad_s));
+        }
+        #[cfg(test)]
+        if crate::spoil::spoilt(crate::spoil::Spoil::Root) {
+            tests::lose_a_root(&mut found);
         }
         agree(&self.what, &found)?;
         Ok(assemble(&found, band_rad_s))
@@ -406,6 +414,33 @@ pub(super) mod tests {
         }
         assert!(found.discs.len() > 2 && found.covered_growth_per_s > 100.0, "{:?}", found.discs);
         vectors_belong(&model, &p, &found);
+    }
+
+    /// Takes a root that it shares with the one before from the first disc that has one.
+    pub(super) fn lose_a_root(found: &mut [Found]) {
+        for k in 1..found.len() {
+            let (before, disc) = (found[k - 1].disc, found[k].disc);
+            let shared = found[k].roots.iter().position(|root| before.holds(root.lambda) && disc.holds(root.lambda));
+            if let Some(shared) = shared {
+                found[k].roots.remove(shared);
+                return;
+            }
+        }
+        panic!("no two discs share a root");
+    }
+
+    /// A root that one of two discs lost is an error that names both, and so is a band that the allowed shifts do not cover.
+    #[test]
+    fn a_lost_root_and_a_gap_are_errors() {
+        use crate::spoil::{Spoil, with};
+        let model = touching(60, 0.0, ContactLaw::default());
+        let mut solver = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
+        let mut roots = || solver.roots(&point(0.7), 900.0, FullVectors::None, &mut |_| {});
+        let lost = with(Spoil::Root, &mut roots).map(|found| found.roots.len());
+        assert!(matches!(lost, Err(ReductionError::MissedRoot { found, missed, .. }) if found != missed), "{lost:?}");
+        let gap = with(Spoil::Shifts, &mut roots).map(|found| found.roots.len());
+        assert!(matches!(gap, Err(ReductionError::NotCovered { covered, band, .. }) if covered < band), "{gap:?}");
+        assert!(roots().is_ok());
     }
 
     pub(in crate::reduction) fn point(friction_coefficient: f64) -> OperatingPoint {
