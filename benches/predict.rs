@@ -9,7 +9,7 @@ use criterion::{Criterion, criterion_group, criterion_main};
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::chart::build::{ChartOptions, build};
 use squealcast::physics::synthetic::{Synthetic, Uniform, rig};
-use squealcast::physics::{Chart, ContactLaw, Mode, Model, OperatingPoint, Root, Solver, Summary, Traces, Vectors};
+use squealcast::physics::{Chart, ContactLaw, Model, OperatingPoint, Root, Solver, Summary, Traces, Vectors};
 
 const BAND_MAX_HZ: f64 = 5000.0;
 /// More than caches keep of one condition for the next.
@@ -39,10 +39,10 @@ fn check(model: &Model, chart: &Chart, traces: &Traces, points: &[OperatingPoint
         let spectrum = solver.solve(model, p, Vectors::Both).expect("it solves");
         modes.clear();
         chart.evaluate(p, traces.at(model, p), &mut scratch, &mut modes).expect("it is charted");
-        for mode in &modes {
-            let off = |root: &Root| (root.square - mode.root.square).norm();
+        for charted in &modes {
+            let off = |root: &Root| (root.square - charted.square).norm();
             let nearest = spectrum.roots.iter().min_by(|a, b| off(a).total_cmp(&off(b))).expect("there are roots");
-            assert!(off(nearest) <= mode.root.error.square + nearest.error.square, "{mode:?} is not {nearest:?}");
+            assert!(off(nearest) <= charted.error.square + nearest.error.square, "{charted:?} is not {nearest:?}");
         }
     }
 }
@@ -67,7 +67,7 @@ fn routes(criterion: &mut Criterion) {
                 bencher.iter(|| next.next().map(|p| black_box(solver.solve(&model, p, vectors))));
             });
         }
-        let (mut scratch, mut values, mut roots): (_, _, Vec<Mode>) = (Scratch::default(), vec![], vec![]);
+        let (mut scratch, mut values, mut roots): (_, _, Vec<Root>) = (Scratch::default(), vec![], vec![]);
         let mut next = points.iter().cycle();
         group.sample_size(100).bench_function("chart values", |bencher| {
             bencher.iter(|| {
@@ -82,7 +82,8 @@ fn routes(criterion: &mut Criterion) {
                 let Some(p) = next.next() else { return };
                 roots.clear();
                 let answer = chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut roots);
-                summary.take_chart(&roots, Some(BAND_MAX_HZ), 1e-6);
+                let all = answer.expect("it is charted");
+                summary.take_chart(&roots, p.friction_coefficient, all, None, Some(BAND_MAX_HZ), 1e-6);
                 let _ = black_box((answer, &summary));
             });
         });

@@ -21,6 +21,7 @@ pub mod input_file;
 pub mod io;
 pub mod node;
 mod notes;
+mod number;
 pub mod offline;
 pub mod plot;
 pub mod reproduce;

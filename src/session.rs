@@ -7,11 +7,12 @@ use std::fmt::Write;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
+use crate::number::Significant;
 use crate::physics::chart::build::ChartOptions;
 use crate::physics::chart::{Chart, Scratch};
 use crate::physics::{
-    ContactState, Ends, MapOptions, Mode, Model, OperatingPoint, SolveError, Solver, Spectrum, StabilityMap, Summary,
-    Traces, Vectors,
+    ContactState, Ends, MapOptions, Mode, Model, NearestEnd, OperatingPoint, Root, SolveError, Solver, Spectrum,
+    StabilityMap, Summary, Traces, Vectors,
 };
 use crate::rig::Rig;
 use crate::settings::{SettingError, Settings};
@@ -88,7 +89,7 @@ pub struct Session {
     solver: Solver,
     traces: Traces,
     scratch: Scratch,
-    charted: Vec<Mode>,
+    charted: Vec<Root>,
     /// Spectra that were worked out beforehand.
     beforehand: Vec<Spectrum>,
     summary: Summary,
@@ -189,10 +190,15 @@ impl Session {
         self.map.as_ref()
     }
 
-    /// The map that holds at `point`.
+    /// The map whose windows hold at `point`.
     pub fn map_at(&self, point: &OperatingPoint) -> Option<&Arc<StabilityMap>> {
         let tolerance = self.settings.map_tolerance;
         self.map.as_ref().filter(|map| map_serves(&self.rig.model, map, point, tolerance))
+    }
+
+    /// The map that numbers modes at `point`.
+    pub fn numbering_at(&self, point: &OperatingPoint) -> Option<&Arc<StabilityMap>> {
+        self.map.as_ref().filter(|map| numbers(&self.rig.model, map, point))
     }
 
     /// The ends of the map's windows in force.
@@ -340,15 +346,14 @@ impl Session {
     ) -> Result<(), String> {
         let charted = self.charted_at(&point);
         if !charted {
-            self.solved_at(&point, map)?;
+            self.solved_at(&point)?;
         }
         let sliding = self.rig.model.contact_state(&point) == ContactState::Sliding;
         let searched = point.friction_coefficient <= self.rig.mu_max;
-        let ends = map.filter(|_| sliding).map(|map| self.ends.as_deref().unwrap_or(&map.ends));
-        let critical = ends.and_then(|ends| ends.critical_friction(&point));
-        let margin = ends.filter(|_| searched).and_then(|ends| ends.margin(&point));
+        let ends = map.filter(|_| sliding && searched).map(|map| self.ends.as_deref().unwrap_or(&map.ends));
+        let nearest = ends.and_then(|ends| ends.nearest(&point));
         self.prediction.reason.clear();
-        let level = self.judge(margin.map(|margin| margin.value));
+        let level = self.judge(nearest.map(|end| end.margin));
         let others = [
             (sliding && !charted && self.chart.is_some()).then_some("not charted here: solved"),
             (sliding && map.is_none()).then_some("margin pending"),
@@ -361,12 +366,10 @@ impl Session {
             }
             prediction.reason.push_str(note);
         }
-        prediction.friction_margin_error = match (critical, margin) {
-            // An unknown bound is not hidden by a known one.
-            (Some(a), Some(b)) if a.error <= b.error || b.error.is_nan() => b.error,
-            (Some(only), _) | (None, Some(only)) => only.error,
-            (None, None) => f64::NAN,
-        };
+        let known = |of: fn(&NearestEnd) -> f64| nearest.as_ref().map_or(f64::NAN, of);
+        prediction.critical_friction = known(|end| end.mu);
+        prediction.friction_margin = known(|end| end.margin);
+        prediction.friction_margin_error = known(|end| end.error);
         prediction.header = header;
         prediction.input_seq = input_seq;
         prediction.level = level;
@@ -374,8 +377,6 @@ impl Session {
         prediction.unstable_modes = summary.unstable_modes;
         prediction.max_growth_rate_per_s = summary.max_growth_rate_per_s.unwrap_or(f64::NAN);
         prediction.worst_frequency_hz = summary.worst_frequency_hz.unwrap_or(f64::NAN);
-        prediction.critical_friction = critical.map_or(f64::NAN, |critical| critical.value);
-        prediction.friction_margin = margin.map_or(f64::NAN, |margin| margin.value);
         publish_modes(&summary.modes, order, &mut prediction.modes);
         Ok(())
     }
@@ -401,37 +402,38 @@ impl Session {
             self.chart = None; // solved from here on, in a replay as well
             return false;
         };
-        if answer.is_err() {
-            return false;
-        }
+        let Ok(all) = answer else { return false };
         self.counters.charted += 1;
         self.counters.roots_beyond_band += self.rig.model.dimension().saturating_sub(self.charted.len()) as u64;
-        self.summary.take_chart(&self.charted, self.rig.band_max_hz, self.rig.instability_threshold);
+        let Rig { band_max_hz, instability_threshold, .. } = *self.rig;
+        let map = self.numbering_at(point).cloned();
+        let mu = point.friction_coefficient;
+        self.summary.take_chart(&self.charted, mu, all, map.as_deref(), band_max_hz, instability_threshold);
         true
     }
 
     /// Takes a dense solve at `point`; the error is the reason of a FAULT.
-    fn solved_at(&mut self, point: &OperatingPoint, map: Option<&StabilityMap>) -> Result<(), String> {
+    fn solved_at(&mut self, point: &OperatingPoint) -> Result<(), String> {
         let at_hand = self.beforehand.iter().position(|spectrum| same(&spectrum.point, point));
         let at_hand = at_hand.map(|k| self.beforehand.swap_remove(k));
         let (rig, solver, summary) = (&self.rig, &mut self.solver, &mut self.summary);
-        let solved = catch_unwind(AssertUnwindSafe(|| -> Result<(), SolveError> {
+        let map = self.map.as_deref().filter(|map| numbers(&rig.model, map, point));
+        let solved = catch_unwind(AssertUnwindSafe(|| -> Result<usize, SolveError> {
             let spectrum = match at_hand {
                 Some(spectrum) => spectrum,
                 None => solver.solve(&rig.model, point, Vectors::Both)?,
             };
-            let ids = match map {
-                Some(map) => map.identify(&spectrum),
-                None => vec![], // in the order of the spectrum
-            };
-            summary.take_spectrum(&spectrum, &ids, rig.band_max_hz, rig.instability_threshold);
-            Ok(())
+            summary.take_spectrum(&spectrum, map, rig.band_max_hz, rig.instability_threshold);
+            Ok(rig.model.zero_terms(point))
         }));
         self.counters.solved += 1;
-        self.counters.zero_terms += self.rig.model.zero_terms(point) as u64;
         self.counters.decoupled_modes += self.rig.model.decoupled_count() as u64;
         match solved {
-            Ok(solved) => solved.map_err(|error| format!("prediction failed: {error}")),
+            Ok(solved) => {
+                let zero_terms = solved.map_err(|error| format!("prediction failed: {error}"))?;
+                self.counters.zero_terms += zero_terms as u64;
+                Ok(())
+            }
             Err(_) => {
                 self.solver = Solver::new(self.rig.model.dimension());
                 Err("prediction failed: internal error in the solver".to_owned())
@@ -439,21 +441,33 @@ impl Session {
         }
     }
 
-    /// The level of a prediction; why goes into its reason.
+    /// The level of a prediction; why goes into its reason. Of several modes past the limit the reason names the one that grows
+    /// fastest, and the limit that decides: where squeal begins, or, once it has begun, where it ends.
     fn judge(&mut self, friction_margin: Option<f64>) -> u8 {
         let (summary, reason) = (&self.summary, &mut self.prediction.reason);
         let mut because = |text: std::fmt::Arguments<'_>| {
             let _ = reason.write_fmt(text); // a String takes everything
         };
-        let ratio = |mode: &Mode| mode.root.damping_ratio();
-        let worst = summary.modes.iter().min_by(|a, b| ratio(a).total_cmp(&ratio(b)));
-        let Settings { squeal_damping_ratio, squeal_hysteresis, warn_margin, .. } = self.settings;
-        let limit = squeal_damping_ratio + if self.squealing { squeal_hysteresis } else { 0.0 };
-        let grows = worst.filter(|mode| ratio(mode) < limit);
-        self.squealing = grows.is_some() || summary.diverges();
-        if let Some(mode) = grows {
-            let (id, hz, ratio) = (mode.id, mode.root.frequency_hz(), ratio(mode));
-            because(format_args!("mode {id} at {hz:.6} Hz: damping ratio {ratio:.6} below {limit}"));
+        let Settings { squeal_damping_ratio: begins, squeal_hysteresis, warn_margin, .. } = self.settings;
+        let ends = begins + squeal_hysteresis;
+        let fastest_below = |limit: f64| {
+            let below = summary.modes.iter().filter(|mode| mode.root.damping_ratio() < limit);
+            below.max_by(|a, b| a.root.growth_rate_per_s().total_cmp(&b.root.growth_rate_per_s()))
+        };
+        let begun = fastest_below(begins);
+        let held = if self.squealing { fastest_below(ends) } else { None };
+        self.squealing = begun.is_some() || held.is_some() || summary.diverges();
+        if let Some(mode) = begun.or(held) {
+            let ratio = Significant(mode.root.damping_ratio(), 3);
+            because(format_args!(
+                "mode {} at {} Hz: damping ratio {ratio}",
+                mode.id,
+                Significant(mode.root.frequency_hz(), 5)
+            ));
+            match begun {
+                Some(_) => because(format_args!(" below {begins}")),
+                None => because(format_args!(", squeal ends at {}", Significant(ends, 3))),
+            }
             return level::SQUEAL;
         }
         if summary.diverges() {
@@ -462,7 +476,7 @@ impl Session {
         }
         match friction_margin.filter(|&margin| margin < warn_margin) {
             Some(margin) => {
-                because(format_args!("friction margin {margin:.6} below {warn_margin}"));
+                because(format_args!("friction margin {} below {warn_margin}", Significant(margin, 3)));
                 level::WARN
             }
             None => level::OK,
@@ -497,6 +511,13 @@ pub fn map_serves(model: &Model, map: &StabilityMap, point: &OperatingPoint, tol
         && point.disc_speed_rad_s.signum() == map.point.disc_speed_rad_s.signum()
         && (!load || near(point.normal_load_n, map.point.normal_load_n))
         && (!speed || near(point.disc_speed_rad_s, map.point.disc_speed_rad_s))
+}
+
+/// Whether modes at `point` are numbered by `map`: it is for the same way of sliding. Its load and speed may be others than
+/// those of `point`: then modes that cross between them may be numbered otherwise than by the map that is being made.
+pub fn numbers(model: &Model, map: &StabilityMap, point: &OperatingPoint) -> bool {
+    model.contact_state(point) == ContactState::Sliding
+        && point.disc_speed_rad_s.signum() == map.point.disc_speed_rad_s.signum()
 }
 
 fn within_dead_band(from: &OperatingPoint, to: &OperatingPoint, settings: &Settings) -> bool {
@@ -539,212 +560,4 @@ fn publish_modes(modes: &[Mode], order: &mut Vec<usize>, out: &mut Vec<wire::Mod
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Case 2 of the paper's 9-degree-of-freedom model: unstable from 0.35592805826058 on.
-    fn session() -> Session {
-        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("an embedded rig"));
-        let settings = Settings::for_rig(&rig);
-        Session::new(rig, settings)
-    }
-
-    fn conditions(seq: u64, load: f64, speed: f64, mu: f64) -> Event {
-        Event::Input(wire::OperatingPoint {
-            header: Header { stamp: Time::from_ns(1_000_000_000 + 1_000_000 * seq as i64), ..Default::default() },
-            seq,
-            normal_load_n: load,
-            disc_speed_rad_s: speed,
-            friction_coefficient: mu,
-        })
-    }
-
-    fn friction(seq: u64, mu: f64) -> Event {
-        conditions(seq, 500.0, 13.0, mu)
-    }
-
-    fn predict(session: &mut Session, event: Event) -> Prediction {
-        let effects = session.step(event).expect("no setting is changed");
-        effects.publish.expect("every input is answered").clone()
-    }
-
-    fn with_map(mut session: Session) -> Session {
-        let point = session.rig.reference;
-        let map = StabilityMap::build(&session.rig.model, &mut session.solver, &point, &map_options(&session.rig));
-        session.step(Event::MapReady(Arc::new(map.expect("the rig can be mapped")))).unwrap();
-        session
-    }
-
-    #[test]
-    fn margin_is_pending_until_the_map_is_there() {
-        let mut session = session();
-        let effects = session.step(friction(0, 0.3)).unwrap();
-        assert!(matches!(effects.want, Some(Want::Map(_))));
-        let pending = predict(&mut session, friction(1, 0.31));
-        assert!(pending.friction_margin.is_nan() && pending.reason == "margin pending");
-        let mut session = with_map(session);
-        let effects = session.step(friction(2, 0.3)).unwrap();
-        assert_eq!(effects.want, None, "the rig knows no load or speed");
-        let ready = predict(&mut session, friction(3, 0.2));
-        assert!((ready.friction_margin - (0.35592805826058 - 0.2)).abs() < 1e-10 && ready.reason.is_empty());
-        assert!((ready.critical_friction - 0.35592805826058).abs() < 1e-10);
-    }
-
-    #[test]
-    fn levels_follow_margin_and_damping_ratio_with_hysteresis() {
-        let mut session = with_map(session());
-        let mut level_at = |seq, mu| predict(&mut session, friction(seq, mu)).level;
-        assert_eq!(level_at(0, 0.30), level::OK);
-        assert_eq!(level_at(1, 0.32), level::WARN, "margin 0.036 is below 0.05");
-        assert_eq!(level_at(2, 0.40), level::SQUEAL);
-        // Near the merging point ζ = -√(c (μ - μc)): between -1e-3 and -5e-4 it depends on where one comes from.
-        let mut fresh = self::session();
-        let between = (0..40_000).map(|k| (k, 0.355928 + 1e-8 * k as f64)).find(|&(k, mu)| {
-            let worst = |p: Prediction| p.modes.iter().map(|mode| mode.damping_ratio).fold(f64::INFINITY, f64::min);
-            (-0.9e-3..-0.6e-3).contains(&worst(predict(&mut fresh, friction(k, mu))))
-        });
-        let (_, mu) = between.expect("growth rates are continuous");
-        assert_eq!(level_at(3, mu), level::SQUEAL, "coming from above");
-        assert_eq!(level_at(4, 0.2), level::OK);
-        assert_eq!(level_at(5, mu), level::WARN, "coming from below");
-    }
-
-    #[test]
-    fn bad_and_stale_inputs_are_faults_without_modes() {
-        let mut session = session();
-        predict(&mut session, friction(10, 0.3));
-        let cases = [
-            (conditions(11, f64::NAN, 13.0, 0.3), "normal_load_n is NaN"),
-            (conditions(12, 500.0, f64::INFINITY, 0.3), "disc_speed_rad_s is inf"),
-            (conditions(13, 2e6, 13.0, 0.3), "normal_load_n is 2000000, expected 0 to 1000000"),
-            (conditions(14, 500.0, 13.0, 2.5), "friction_coefficient is 2.5, expected 0 to 2"),
-            (friction(5, 0.3), "stamp runs backward by 0.009000 s"),
-            (Event::Silence { stamp: Time::from_ns(5_000_000_000) }, "stale: no input for 1 s"),
-        ];
-        for (event, reason) in cases {
-            let fault = predict(&mut session, event);
-            assert_eq!(fault.level, level::FAULT);
-            assert!(fault.reason.contains(reason), "`{}` lacks `{reason}`", fault.reason);
-            assert!(fault.modes.is_empty() && fault.friction_margin.is_nan() && !fault.reused);
-        }
-        assert_eq!(predict(&mut session, friction(15, 0.3)).level, level::OK, "the next good input is predicted");
-    }
-
-    #[test]
-    fn conditions_within_the_dead_band_reuse_the_previous_prediction() {
-        let mut session = with_map(session());
-        let first = predict(&mut session, friction(0, 0.3));
-        let second = predict(&mut session, friction(1, 0.3));
-        assert!(!first.reused && second.reused);
-        assert_eq!(second.input_seq, 1);
-        // As text, for NaN is not equal to itself.
-        assert_eq!(format!("{:?}", second.modes), format!("{:?}", first.modes));
-        assert!(!predict(&mut session, friction(2, 0.3001)).reused, "the default dead-band is exact equality");
-        session.step(Event::Parameter { name: "dead_band_friction".to_owned(), value: 0.01 }).unwrap();
-        assert!(!predict(&mut session, friction(3, 0.3)).reused, "a changed setting is no reason to reuse");
-        assert!(predict(&mut session, friction(4, 0.309)).reused);
-        assert!(
-            !predict(&mut session, friction(5, 0.311)).reused,
-            "measured from what was solved, not from what was reused"
-        );
-        let counters = session.counters();
-        assert_eq!((counters.solved, counters.charted, counters.reused, counters.faults), (4, 0, 2, 0));
-    }
-
-    /// A rig whose contact stiffens with load: between two loads for which the ends of its windows were worked out, the
-    /// margin is off by no more than its bound; where they were, it is exact.
-    #[test]
-    fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
-        use crate::physics::synthetic::{Synthetic, rig};
-        let law = crate::physics::ContactLaw { exponent: 0.4, ..Default::default() };
-        let model = rig(&Synthetic { modes: 24, pairs: 12, damping_ratio: 0.0, contact_law: law, seed: 1 }).unwrap();
-        let like = Rig::load("nine-dof-case-2").expect("embedded");
-        let rig = Arc::new(Rig { model, band_max_hz: None, mu_max: 2.0, ..like });
-        let session = Session::new(rig.clone(), Settings::for_rig(&rig));
-        let mut session = with_map(session);
-        let mut solver = Solver::new(rig.model.dimension());
-        let mut exact_at = |load: f64| {
-            let point = OperatingPoint { normal_load_n: load, ..rig.reference };
-            StabilityMap::build(&rig.model, &mut solver, &point, &map_options(&rig)).unwrap().windows[0].mu_from
-        };
-        let (mut seq, mut largest) = (0, 0.0f64);
-        for load in [498.0, 501.0, 502.0] {
-            let truth = exact_at(load);
-            let mut asked = None;
-            for _ in 0..300 {
-                seq += 1;
-                // The friction coefficient moves a little: nothing is reused.
-                let input = conditions(seq, load, 13.0, 1e-4 * (seq % 10) as f64);
-                let effects = session.step(input).unwrap();
-                let prediction = effects.publish.unwrap();
-                let off = (prediction.critical_friction - truth).abs();
-                assert!(off <= prediction.friction_margin_error + 1e-12, "{load} N: {off} {prediction:?}");
-                if let Some(Want::Ends(point)) = effects.want {
-                    largest = largest.max(off);
-                    assert!(asked.replace(point).is_none(), "{load} N: asked for once");
-                    let map = session.map().cloned().unwrap();
-                    let ends = Ends::carried(&rig.model, &mut session.solver, &map, &point).unwrap().unwrap();
-                    session.step(Event::EndsReady(Arc::new(ends))).unwrap();
-                }
-            }
-            assert!(asked.is_some(), "{load} N");
-            let rests = predict(&mut session, conditions(seq + 1, load, 13.0, 1e-3));
-            assert!(
-                (rests.critical_friction - truth).abs() < 1e-10 && rests.friction_margin_error < 1e-10,
-                "{rests:?}"
-            );
-            seq += 1;
-        }
-        assert!(largest > 1e-10, "worth testing: extrapolation is off by {largest}");
-    }
-
-    /// The same conditions read off the chart and solved: same identities, same level, every value within the bounds.
-    #[test]
-    fn a_chart_predicts_what_a_solve_does() {
-        let (mut solved, mut charted) = (with_map(session()), with_map(session()));
-        let chart = crate::physics::chart::build::build(&charted.rig.model, &chart_options(&charted.rig), &|_| true);
-        charted.step(Event::ChartReady(Arc::new(chart.expect("the rig can be charted")))).unwrap();
-        for seq in 0..400 {
-            let mu = 0.005 * seq as f64 + 1e-4;
-            let (a, b) = (predict(&mut solved, friction(seq, mu)), predict(&mut charted, friction(seq, mu)));
-            assert_eq!((a.level, a.unstable_modes, a.modes.len()), (b.level, b.unstable_modes, b.modes.len()), "{mu}");
-            for (a, b) in a.modes.iter().zip(&b.modes) {
-                assert_eq!(a.id, b.id, "{mu}");
-                let frequency = (a.frequency_hz - b.frequency_hz).abs();
-                assert!(frequency <= a.frequency_error_hz + b.frequency_error_hz, "{mu}: {a:?} {b:?}");
-                let growth = (a.growth_rate_per_s - b.growth_rate_per_s).abs();
-                assert!(growth <= a.growth_rate_error_per_s + b.growth_rate_error_per_s, "{mu}: {a:?} {b:?}");
-                assert!(b.frequency_error_hz < 1e-6 * b.frequency_hz, "a bound that says something: {b:?}");
-            }
-        }
-        assert_eq!((charted.counters().charted, charted.counters().solved), (400, 0));
-        let backwards = predict(&mut charted, conditions(1000, 500.0, -13.0, 0.3));
-        assert!(charted.counters().solved == 1 && backwards.modes.len() == 9, "the other direction is solved");
-        assert!(backwards.reason.contains("not charted here: solved"), "{}", backwards.reason);
-    }
-
-    #[test]
-    fn settings_are_validated() {
-        let mut session = session();
-        let set = |session: &mut Session, name: &str, value| {
-            session.step(Event::Parameter { name: name.to_owned(), value }).map(drop).map_err(|e| e.to_string())
-        };
-        assert!(set(&mut session, "warn_margin", f64::NAN).unwrap_err().contains("`warn_margin` = NaN: expected"));
-        assert!(set(&mut session, "dead_band_load_n", -1.0).unwrap_err().contains("0 to 1000000"));
-        assert!(
-            set(&mut session, "volume", 11.0).unwrap_err().contains("no parameter `volume`; there are warn_margin")
-        );
-        assert_eq!(session.settings().warn_margin, 0.05, "nothing was changed");
-        assert_eq!(set(&mut session, "warn_margin", 0.1), Ok(()));
-    }
-
-    #[test]
-    fn a_contact_that_does_not_slide_is_said_to() {
-        let mut session = with_map(session());
-        let still = predict(&mut session, conditions(0, 500.0, 0.005, 1.0));
-        assert_eq!((still.level, still.unstable_modes), (level::OK, 0));
-        assert!(still.reason.contains("not sliding") && still.friction_margin.is_nan());
-        let open = predict(&mut session, conditions(1, 0.0, 13.0, 1.0));
-        assert!(open.reason.contains("contact open") && open.unstable_modes == 0);
-    }
-}
+mod tests;

@@ -281,9 +281,9 @@ fn everything_that_is_derived_from_a_rig_works_with_residuals() {
             continue;
         }
         let spectrum = solver.solve(&rig.model, &p, Vectors::Right).unwrap();
-        for mode in modes.iter().filter(|mode| mode.root.frequency_hz() <= 390.0) {
-            let nearest = spectrum.roots.iter().map(|root| (root.lambda - mode.root.lambda).norm());
-            let error = nearest.fold(f64::INFINITY, f64::min) / mode.root.lambda.norm();
+        for charted in modes.iter().filter(|root| root.frequency_hz() <= 390.0) {
+            let nearest = spectrum.roots.iter().map(|root| (root.lambda - charted.lambda).norm());
+            let error = nearest.fold(f64::INFINITY, f64::min) / charted.lambda.norm();
             // Near merging points a root has half the digits.
             assert!(error < 1e-5, "{p:?}: {error:e}");
             compared += 1;

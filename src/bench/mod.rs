@@ -18,7 +18,7 @@ use crate::physics::chart::hold_out::hold_out;
 use crate::physics::reference::{self, Refined};
 use crate::physics::synthetic::{Synthetic, Uniform, rig};
 use crate::physics::{
-    Chart, ContactLaw, MapOptions, Mode, Model, OperatingPoint, Root, Solver, Spectrum, StabilityMap, Summary, Traces,
+    Chart, ContactLaw, MapOptions, Model, OperatingPoint, Root, Solver, Spectrum, StabilityMap, Summary, Traces,
     Vectors,
 };
 use lapack::Lapack;
@@ -343,9 +343,8 @@ pub fn measure(
             samples[0].compare(&spectrum, refined, &all(&values.roots, false));
             samples[1].compare(&spectrum, refined, &all(&spectrum.roots, true));
             if on_chart {
-                let roots: Vec<Root> = charted.iter().map(|mode: &Mode| mode.root).collect();
                 samples[2].compare(&spectrum, refined, &bare.iter().map(|&z| (z, None)).collect::<Vec<_>>());
-                samples[3].compare(&spectrum, refined, &all(&roots, true));
+                samples[3].compare(&spectrum, refined, &all(&charted, true));
             }
             let sign = if spectrum.undamped { -1.0 } else { 1.0 };
             for (route, theirs) in [(4, &theirs), (5, &theirs_both)] {
@@ -376,8 +375,8 @@ pub fn measure(
             time(2, begun.elapsed().as_secs_f64());
             charted.clear();
             let begun = Instant::now();
-            chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted)?;
-            summary.take_chart(&charted, Some(plan.band_max_hz), 1e-6);
+            let all = chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted)?;
+            summary.take_chart(&charted, p.friction_coefficient, all, None, Some(plan.band_max_hz), 1e-6);
             std::hint::black_box(&summary);
             time(3, begun.elapsed().as_secs_f64());
         }

@@ -79,12 +79,14 @@ impl Options {
     }
 }
 
-/// The modes at `point`, identified by following them there from friction coefficient 0.
+/// The modes at `point`, numbered by the map that a session uses there.
 fn predict(rig: &Rig, point: &OperatingPoint) -> anyhow::Result<Summary> {
     let mut solver = Solver::new(rig.model.dimension());
     let spectrum = solver.solve(&rig.model, point, Vectors::Right)?;
     let mu = point.friction_coefficient;
-    let path = MapOptions { mu_min: mu.min(0.0), mu_max: mu.max(0.0), windows: false, ..map_options(rig) };
+    let searched = map_options(rig);
+    let path =
+        MapOptions { mu_min: mu.min(searched.mu_min), mu_max: mu.max(searched.mu_max), windows: false, ..searched };
     let map = StabilityMap::build(&rig.model, &mut solver, point, &path)?;
-    Ok(Summary::of_spectrum(&spectrum, &map.identify(&spectrum), rig.band_max_hz, rig.instability_threshold))
+    Ok(Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold))
 }

@@ -113,13 +113,15 @@ struct Sweep {
 /// Every mode of the band at every friction coefficient of the range, and the windows of instability if asked for.
 fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<Sweep> {
     let mut solver = Solver::new(rig.model.dimension());
-    let followed = MapOptions { mu_min: range.from.min(0.0), mu_max: range.to.max(0.0), windows, ..map_options(rig) };
+    // At least over what a session searches, so that modes are numbered as there.
+    let searched = map_options(rig);
+    let (mu_min, mu_max) = (range.from.min(searched.mu_min), range.to.max(searched.mu_max));
+    let followed = MapOptions { mu_min, mu_max, windows, ..searched };
     let map = StabilityMap::build(&rig.model, &mut solver, point, &followed)?;
     let values: Vec<f64> = range.values().collect();
     let modes_at = |solver: &mut Solver, mu: f64| -> anyhow::Result<Vec<Swept>> {
         let spectrum = solver.solve(&rig.model, &point.with_friction(mu), Vectors::Right)?;
-        let ids = map.identify(&spectrum);
-        let summary = Summary::of_spectrum(&spectrum, &ids, rig.band_max_hz, rig.instability_threshold);
+        let summary = Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold);
         Ok(summary.modes.into_iter().map(|mode| (mu, mode)).collect())
     };
     // One thread for a solve, many solves at once: each condition by itself is the same wherever it is solved.
@@ -141,14 +143,17 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
     for part in parts {
         modes.extend(part?);
     }
+    let mut windows = map.windows.clone();
+    windows.retain(|window| window.mu_from <= range.to);
+    windows.iter_mut().for_each(|window| window.mu_to = window.mu_to.filter(|&mu| mu <= range.to));
     let mut beside_ends = vec![];
-    for window in &map.windows {
+    for window in &windows {
         let outside = [Some(window.mu_from - BESIDE), window.mu_to.map(|mu| mu + BESIDE)];
         for mu in outside.into_iter().flatten().filter(|mu| (range.from..=range.to).contains(mu)) {
             beside_ends.extend(modes_at(&mut solver, mu)?);
         }
     }
-    Ok(Sweep { modes, beside_ends, windows: map.windows })
+    Ok(Sweep { modes, beside_ends, windows })
 }
 
 fn to_csv(at: &OperatingPoint, modes: &[Swept]) -> anyhow::Result<String> {

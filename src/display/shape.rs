@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::change::GrowthChange;
 use crate::physics::{OperatingPoint, Solver, StabilityMap, Vectors};
 use crate::rig::{DiscAxis, Rig};
+use crate::session::numbers;
 
 /// A mode's shape; the largest displacement has magnitude 1 and phase 0.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -50,8 +51,8 @@ pub fn shape(
     id: u32,
 ) -> Result<Shape, String> {
     let spectrum = solver.solve(&rig.model, point, Vectors::Right).map_err(|error| error.to_string())?;
-    let index = match map {
-        Some(map) => map.identify(&spectrum).iter().position(|&other| other == Some(id)),
+    let index = match map.filter(|map| numbers(&rig.model, map, point)) {
+        Some(map) => map.ids(&spectrum).iter().position(|&other| other == Some(id)),
         None => Some(id as usize),
     };
     let index = index.filter(|&index| index < spectrum.mode_count).ok_or_else(|| format!("there is no mode {id}"))?;

@@ -12,7 +12,7 @@ use super::whole_file::{WholeFileError, folder_of, write_whole};
 use crate::hex::hex;
 use crate::input_file;
 use crate::physics::Chart;
-use crate::physics::chart::FORMAT;
+use crate::physics::chart::{BUILDER, FORMAT};
 
 /// First line of a file.
 const MAGIC: &[u8] = b"squealcast chart\n";
@@ -40,12 +40,7 @@ impl ChartFile {
     /// The file of the rig with `content_hash`, read from `rig_file`: `<rig>.<hash>.chart` beside it, or in the cache folder where
     /// the rig is embedded or its folder cannot be written to. `None` where there is no place for it.
     pub fn locate(rig_name: &str, rig_file: Option<&Path>, content_hash: &str) -> Option<Self> {
-        let key: [u8; HASH] = Sha256::new()
-            .chain_update(content_hash)
-            .chain_update(FORMAT.to_le_bytes())
-            .chain_update(env!("CARGO_PKG_VERSION"))
-            .finalize()
-            .into();
+        let key = key(content_hash, &BUILDER);
         let short = hex(&key[..8]);
         let name = |stem: &str| format!("{stem}.{short}.chart");
         let beside = rig_file.and_then(|file| {
@@ -108,6 +103,15 @@ impl ChartFile {
     }
 }
 
+/// What a chart is kept by: the content of the rig, and what made it.
+fn key(content_hash: &str, builder: &[&str]) -> [u8; HASH] {
+    let hash = Sha256::new()
+        .chain_update(content_hash)
+        .chain_update(FORMAT.to_le_bytes())
+        .chain_update(env!("CARGO_PKG_VERSION"));
+    builder.iter().fold(hash, |hash, source| hash.chain_update(source)).finalize().into()
+}
+
 /// `$XDG_CACHE_HOME/squealcast`, or `~/.cache/squealcast`.
 fn cache_folder() -> Option<PathBuf> {
     let absolute = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
@@ -122,6 +126,15 @@ mod tests {
     use crate::physics::chart::build::{ChartOptions, build};
     use crate::physics::synthetic::{Synthetic, rig};
     use crate::physics::{OperatingPoint, Traces};
+
+    #[test]
+    fn a_chart_of_another_builder_has_another_key() {
+        let mut older = BUILDER;
+        assert_eq!(key("content", &older), key("content", &BUILDER));
+        older[3] = "fn roots() {}";
+        assert_ne!(key("content", &older), key("content", &BUILDER));
+        assert_ne!(key("content", &BUILDER), key("other", &BUILDER));
+    }
 
     /// What comes back says the same to the last bit; what was damaged or belongs to another rig is refused.
     #[test]
@@ -154,9 +167,7 @@ mod tests {
         let (p, traces) = (at(0.41, 777.0), Traces::new(&model));
         let roots = |chart: &Chart| {
             let mut roots = vec![];
-            chart
-                .evaluate(&p, traces.at(&model, &p), &mut Scratch::default(), &mut roots)
-                .map(|()| format!("{roots:?}"))
+            chart.evaluate(&p, traces.at(&model, &p), &mut Scratch::default(), &mut roots).map(|_| format!("{roots:?}"))
         };
         assert_eq!(roots(&loaded), roots(&chart));
         let other =

@@ -97,7 +97,9 @@ pub struct Node {
     watch: Watch,
     heard_before: Remembered,
     vibration_heard_before: Remembered,
-    last_heard: Instant,
+    /// When the latest input was heard; `None` before the first: nothing is published until then, for nothing has failed.
+    last_heard: Option<Instant>,
+    /// Whether the present silence was published.
     silent: bool,
     /// What was taken out of the channel and is to be done.
     backlog: VecDeque<Incoming>,
@@ -127,7 +129,7 @@ impl Node {
             watch,
             heard_before: Remembered::new(REMEMBERED),
             vibration_heard_before: Remembered::new(VIBRATIONS_REMEMBERED),
-            last_heard: Instant::now(),
+            last_heard: None,
             silent: false,
             backlog: VecDeque::new(),
             inputs_waiting: 0,
@@ -223,10 +225,11 @@ impl Node {
         self.silence_deadline().map_or(self.next_diagnostics, |silence| silence.min(self.next_diagnostics))
     }
 
-    /// Whether an input can be predicted as fast as another thread is woken, with nothing before it. The first after a silence
-    /// wakes the thread that will notice the next.
+    /// Whether an input can be predicted as fast as another thread is woken, with nothing before it. The first of all and the first
+    /// after a silence wake the thread that will notice the next silence.
     fn answers_at_once(&self, input: &wire::OperatingPoint) -> bool {
-        self.backlog.is_empty() && !self.silent && self.session.answers_at_once(&input.point())
+        let heard_lately = self.last_heard.is_some() && !self.silent;
+        self.backlog.is_empty() && heard_lately && self.session.answers_at_once(&input.point())
     }
 
     /// Predicts for an input that never waited.
@@ -269,7 +272,7 @@ impl Node {
     /// Predicts for an input; or, once the inputs behind it were more than can be worked off, passes all but the
     /// newest over.
     fn input(&mut self, heard: Heard<wire::OperatingPoint>) {
-        self.last_heard = Instant::now();
+        self.last_heard = Some(Instant::now());
         self.silent = false;
         self.statistics.heard(heard.bus);
         let started = clock::monotonic_ns();
@@ -356,8 +359,8 @@ impl Node {
             return;
         }
         let question = Question::new(prediction, point);
-        let map = self.session.map_at(&point).cloned();
-        let ends = map.as_ref().and_then(|_| self.session.ends().cloned());
+        let map = self.session.numbering_at(&point).cloned();
+        let ends = self.session.map_at(&point).and_then(|_| self.session.ends().cloned());
         if !self.mapper.want_sensitivity(question, map, ends) {
             self.next_sensitivity = now; // busy: the next prediction will do as well
         }
@@ -386,9 +389,10 @@ impl Node {
         }
     }
 
+    /// When the silence since the latest input is too long; `None` before the first and where that was published.
     fn silence_deadline(&self) -> Option<Instant> {
         let timeout = Duration::try_from_secs_f64(self.session.settings().silence_timeout_s).ok()?;
-        if self.silent { None } else { self.last_heard.checked_add(timeout) }
+        self.last_heard.filter(|_| !self.silent)?.checked_add(timeout)
     }
 
     fn silence(&mut self) {
@@ -532,6 +536,7 @@ impl Remembered {
 
 #[cfg(test)]
 mod tests {
+    use super::status::Status;
     use super::*;
 
     #[test]
@@ -635,5 +640,76 @@ mod tests {
         watch.take_samples(&mut samples);
         all.append(&mut samples);
         assert!(all.iter().map(|sample| sample.input_seq).eq(0..seq), "{} of {seq} answered in order", all.len());
+    }
+
+    /// Before the first input nothing is published; afterwards a silence is published once, as a FAULT, and the next input ends it.
+    #[test]
+    fn silence_is_a_fault_once_after_the_first_input_and_none_before() {
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let (sender, receiver) = channel();
+        let watch = Watch::default();
+        let settings = Settings { silence_timeout_s: 0.02, ..Settings::for_rig(&rig) };
+        let mut node = Node::new(rig, settings, Outputs::default(), sender.clone(), watch.clone());
+        node.next_diagnostics = Instant::now();
+        let thread = std::thread::spawn(move || node.run(&receiver));
+        let (mut samples, mut all) = (vec![], vec![]);
+        watch.take_samples(&mut samples);
+        let mut wait_for = |count: usize| -> Vec<(Status, u64)> {
+            let begun = Instant::now();
+            while all.len() < count {
+                assert!(begun.elapsed() < Duration::from_secs(60), "{all:?}");
+                watch.take_samples(&mut samples);
+                all.extend(samples.drain(..).map(|sample| (sample.status, sample.input_seq)));
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            all.clone()
+        };
+        let input = |seq: u64| {
+            let header = Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() };
+            let point = wire::OperatingPoint {
+                header,
+                seq,
+                normal_load_n: 500.0,
+                disc_speed_rad_s: 13.0,
+                friction_coefficient: 0.2,
+            };
+            sender.send(Incoming::Input(Heard::now(Bus::Shm, point))).expect("it runs");
+        };
+        // Many times the limit of silence.
+        std::thread::sleep(Duration::from_millis(200));
+        input(7);
+        assert_eq!(wait_for(2), [(Status::Ok, 7), (Status::NoData, 7)], "the input is the first that is published");
+        std::thread::sleep(Duration::from_millis(100));
+        input(8);
+        let found = wait_for(4);
+        assert_eq!(found[2..], [(Status::Ok, 8), (Status::NoData, 8)], "one FAULT for each silence");
+        sender.send(Incoming::Stop).expect("it runs");
+        thread.join().expect("it ended");
+    }
+
+    /// Of inputs that are older than half a second all but the newest are passed over.
+    #[test]
+    fn old_inputs_are_passed_over_but_for_the_newest() {
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let (sender, receiver) = channel();
+        let mut old = Heard::now(Bus::Shm, wire::OperatingPoint::default());
+        while clock::monotonic_ns().saturating_sub(old.at.monotonic_ns) <= LATEST.as_nanos() as u64 {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        for seq in 0..3 {
+            old.message = wire::OperatingPoint {
+                seq,
+                normal_load_n: 500.0,
+                disc_speed_rad_s: 13.0,
+                friction_coefficient: 0.2,
+                ..Default::default()
+            };
+            sender.send(Incoming::Input(old.clone())).expect("room");
+        }
+        sender.send(Incoming::Stop).expect("room");
+        let watch = Watch::default();
+        Node::new(rig.clone(), Settings::for_rig(&rig), Outputs::default(), sender, watch.clone()).run(&receiver);
+        let seen = watch.snapshot();
+        assert_eq!((seen.passed_over, seen.prediction.expect("one").input_seq), (2, 2));
     }
 }

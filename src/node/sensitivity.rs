@@ -23,7 +23,7 @@ impl Question {
     }
 }
 
-/// Answers it by a dense solve; identities and windows are those of `map` and `ends`.
+/// Answers it by a dense solve; `map` numbers the modes, windows end at `ends`.
 ///
 /// # Errors
 /// Why there is no answer, in words.
@@ -37,7 +37,7 @@ pub fn answer(
     let point = &question.point;
     let spectrum = solver.solve(&rig.model, point, Vectors::Right).map_err(|error| error.to_string())?;
     let ids = match map {
-        Some(map) => map.identify(&spectrum),
+        Some(map) => map.ids(&spectrum),
         None => (0..spectrum.roots.len() as u32).map(Some).collect(),
     };
     let id = |k: usize| ids[k].unwrap_or(k as u32);
@@ -59,7 +59,8 @@ pub fn answer(
         nearest_window_end_derivatives: Derivatives::UNKNOWN,
         ..Default::default()
     };
-    if let Some((end, mu)) = ends.and_then(|ends| ends.nearest(point)) {
+    let nearest = ends.and_then(|ends| ends.nearest(point).map(|nearest| (ends, nearest)));
+    if let Some((end, mu)) = nearest.and_then(|(ends, nearest)| Some((ends.end(&nearest)?, nearest.mu))) {
         message.nearest_window_end = mu;
         message.nearest_window_end_derivatives = end_derivatives(rig, end);
     }

@@ -324,8 +324,8 @@ mod tests {
         let map = StabilityMap::build(&rig.model, &mut solver, &rig.reference, &map_options(&rig)).expect("a map");
         let at = |mu: f64| {
             let point = rig.reference.with_friction(mu);
-            let margin = map.ends.margin(&point).expect("it has windows");
-            let prediction = Prediction { friction_margin: margin.value, ..Prediction::default() };
+            let margin = map.ends.nearest(&point).expect("it has windows").margin;
+            let prediction = Prediction { friction_margin: margin, ..Prediction::default() };
             NextSqueal::new(&prediction, &point, &map, &map.ends).expect("a next one")
         };
         let [first, second] = &map.windows[..] else { panic!("{:?}", map.windows) };

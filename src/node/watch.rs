@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::status::{Assessment, Inputs, Status};
 use crate::io::clock;
-use crate::physics::{Ends, StabilityMap};
+use crate::physics::{Ends, NextWindow, StabilityMap};
 use crate::session::Counters;
 use crate::wire::{OperatingPoint, Prediction, Vibration};
 
@@ -42,6 +42,14 @@ impl Snapshot {
         let map = self.map.as_deref();
         let windows = map.map(|map| (map, self.ends.as_deref().unwrap_or(&map.ends)));
         Assessment::new(status, prediction, self.input.as_ref(), windows)
+    }
+
+    /// The window of instability that the margin of the prediction is measured to; `None` where there is no margin.
+    pub fn next_window(&self) -> Option<NextWindow<'_>> {
+        let prediction = self.prediction.as_ref().filter(|prediction| !prediction.friction_margin.is_nan())?;
+        let input = self.input.as_ref().filter(|input| input.seq == prediction.input_seq)?;
+        let map = self.map.as_deref()?;
+        map.next_window(self.ends.as_deref().unwrap_or(&map.ends), &input.point())
     }
 }
 

@@ -47,6 +47,8 @@ pub struct Window {
     pub mu_to: Option<f64>,
     /// Frequency where it begins, Hz; 0 for a divergence.
     pub frequency_hz: f64,
+    /// Frequency where it ends, Hz; `None` where it is still open at the end of the range.
+    pub frequency_to_hz: Option<f64>,
     /// How it comes about.
     pub kind: WindowKind,
 }
@@ -221,12 +223,19 @@ pub(super) fn windows(
         for stretch in list.into_iter().filter(|s| s.judged && s.growth > options.instability_threshold) {
             let (mu_from, start) = polish.end(kind, &ids, stretch.first, stretch.first.checked_sub(1))?;
             let after = Some(stretch.last + 1).filter(|&k| k < map.nodes.len());
-            let mu_to = match after {
-                Some(_) => Some(polish.end(kind, &ids, stretch.last, after)?.0),
+            let to = match after {
+                Some(_) => Some(polish.end(kind, &ids, stretch.last, after)?),
                 None => None,
             };
-            let frequency_hz = if kind == WindowKind::Divergence { 0.0 } else { start };
-            windows.push(Window { mode_ids: ids.clone(), mu_from, mu_to, frequency_hz, kind });
+            let frequency = |hz: f64| if kind == WindowKind::Divergence { 0.0 } else { hz };
+            windows.push(Window {
+                mode_ids: ids.clone(),
+                mu_from,
+                mu_to: to.map(|(mu, _)| mu),
+                frequency_hz: frequency(start),
+                frequency_to_hz: to.map(|(_, hz)| frequency(hz)),
+                kind,
+            });
         }
     }
     windows.extend(polish.damped_divergence()?);
@@ -329,9 +338,16 @@ impl Polish<'_> {
                 if count > before {
                     open.push(windows.len());
                     let kind = WindowKind::Divergence;
-                    windows.push(Window { mode_ids: vec![], mu_from: mu, mu_to: None, frequency_hz: 0.0, kind });
+                    windows.push(Window {
+                        mode_ids: vec![],
+                        mu_from: mu,
+                        mu_to: None,
+                        frequency_hz: 0.0,
+                        frequency_to_hz: None,
+                        kind,
+                    });
                 } else if let Some(index) = open.pop() {
-                    windows[index].mu_to = Some(mu);
+                    (windows[index].mu_to, windows[index].frequency_to_hz) = (Some(mu), Some(0.0));
                 }
             }
             before = count;
@@ -429,7 +445,8 @@ fn bisect((mut a, mut b): (f64, f64), mut holds: impl FnMut(f64) -> Result<bool,
 mod tests {
     use faer::mat;
 
-    use super::super::model::{ContactLaw, Law, Term};
+    use super::super::model::{ContactLaw, CustomLaw, Law, Term};
+    use super::super::operating_point::OperatingPoint;
     use super::super::test_models::{REFERENCE, hulten, nine_dof, random_rig};
     use super::*;
 
@@ -516,6 +533,70 @@ mod tests {
             None,
         );
         assert!(starts(&veering.unwrap(), 2.0).is_empty());
+    }
+
+    /// A damped mode whose growth rate is `a - b (μ - m)²`: it grows for `|μ - m| < √(a/b)`, between two of the points that are
+    /// solved first, at which it decays.
+    #[test]
+    fn narrow_windows_of_damped_modes_are_found() {
+        let (a, b, m) = (1e-4, 1.0, 0.71875);
+        let law = Law::Custom(CustomLaw {
+            text: "a - b (mu - m)^2".into(),
+            evaluate: std::sync::Arc::new(move |p: &OperatingPoint| {
+                -2.0 * (a - b * (p.friction_coefficient - m).powi(2))
+            }),
+            depends_on_load: false,
+            depends_on_speed: false,
+            depends_on_friction: true,
+        });
+        let stiffness = vec![Term { matrix: mat![[4.0]], law: Law::Constant }];
+        let damping = vec![Term { matrix: mat![[1.0]], law }];
+        let model = Model::new(1, stiffness, damping, ContactLaw::default(), None).expect("the model is well formed");
+        let found = map(&model, 2.0).windows;
+        let [window] = found.as_slice() else { panic!("{found:?}") };
+        assert_eq!((window.kind, window.mode_ids.as_slice()), (WindowKind::ZeroGrowth, &[0][..]));
+        let half: f64 = (a / b).sqrt();
+        assert!((window.mu_from - (m - half)).abs() < 1e-10 && (window.mu_to.unwrap() - (m + half)).abs() < 1e-10);
+        // ω = 2 rad/s at the ends, where nothing damps.
+        for hz in [window.frequency_hz, window.frequency_to_hz.unwrap()] {
+            assert!((hz - 2.0 / std::f64::consts::TAU).abs() < 1e-9, "{window:?}");
+        }
+    }
+
+    /// Two damped modes that flutter for `(μ - m)² < w² - 4 c²`: at `λ = iω` the equation is `ω² = 4`, `c ω = √(w² - (μ - m)²)`.
+    #[test]
+    fn damping_narrows_a_window_as_by_hand() {
+        let (m, w, c) = (0.7, 1e-3, 4e-4);
+        let undamped = crossing(m, w);
+        let terms = undamped.stiffness.iter().map(|known| known.term.clone()).collect();
+        let damping = vec![Term { matrix: mat![[c, 0.0], [0.0, c]], law: Law::Constant }];
+        let model = Model::new(2, terms, damping, ContactLaw::default(), None).expect("the model is well formed");
+        let found = map(&model, 2.0).windows;
+        let [window] = found.as_slice() else { panic!("{found:?}") };
+        // The threshold of instability does not move the ends, which are where the growth rate is zero.
+        let half = (w * w - 4.0 * c * c).sqrt();
+        assert!(
+            (window.mu_from - (m - half)).abs() < 1e-9 && (window.mu_to.unwrap() - (m + half)).abs() < 1e-9,
+            "{window:?}"
+        );
+    }
+
+    /// Of a pair, the lower identity belongs to the growing mode, and to the lower frequency once they have parted.
+    #[test]
+    fn a_pair_that_parts_keeps_its_identities_in_order() {
+        let map = map(&crossing(0.7, 1e-2), 2.0);
+        let (mut coupled, mut parted) = (0, 0);
+        for node in &map.nodes {
+            let [lower, upper] = [0, 1].map(|id| node.spectrum.roots[node.find(id).expect("both are followed")].lambda);
+            if lower.re != 0.0 {
+                assert!(lower.re > 0.0 && upper.re < 0.0, "mu {}: {lower} {upper}", node.mu());
+                coupled += 1;
+            } else {
+                assert!(lower.im < upper.im, "mu {}: {lower} {upper}", node.mu());
+                parted += usize::from(node.mu() > 0.7);
+            }
+        }
+        assert!(coupled > 0 && parted > 5, "{coupled} {parted}");
     }
 
     /// `k = 1 - μ`: diverges from `μ = 1`, damped or not.

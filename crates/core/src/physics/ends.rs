@@ -66,6 +66,23 @@ pub struct Ends {
     pub windows: Vec<(End, Option<End>)>,
 }
 
+/// The end of a window of instability that is nearest to a friction coefficient.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NearestEnd {
+    /// Which window of the map it belongs to.
+    pub window: usize,
+    /// Whether the window begins here, or ends here.
+    pub is_start: bool,
+    /// Whether the friction coefficient lies in a window, this one or another.
+    pub inside: bool,
+    /// The friction coefficient of the end.
+    pub mu: f64,
+    /// Distance from the present friction coefficient to the end: negative inside a window, positive outside.
+    pub margin: f64,
+    /// Bound of the error of `mu` and `margin`; NaN where none is known.
+    pub error: f64,
+}
+
 /// A value with a bound of its error; NaN where none is known.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounded {
@@ -149,38 +166,33 @@ impl Ends {
         })
     }
 
-    /// The smallest friction coefficient at which an instability begins.
-    pub fn critical_friction(&self, point: &OperatingPoint) -> Option<Bounded> {
-        self.at(point).map(|(from, _)| from).min_by(|a, b| a.value.total_cmp(&b.value))
-    }
-
-    /// Distance of the friction coefficient of `point` from the nearest end of the union of the windows, negative
-    /// inside; `None` without windows. An open end (beyond the searched range) is no end.
-    pub fn margin(&self, point: &OperatingPoint) -> Option<Bounded> {
+    /// The end of the union of the windows that is nearest to the friction coefficient of `point`, at its load and speed;
+    /// `None` without windows. An open end (beyond the searched range) is no end, and neither is one that another window
+    /// covers.
+    pub fn nearest(&self, point: &OperatingPoint) -> Option<NearestEnd> {
         let mu = point.friction_coefficient;
         let windows = self.at(point);
         let upper = |to: Option<Bounded>| to.map_or(f64::INFINITY, |to| to.value);
-        let ends = windows.clone().enumerate().flat_map(|(k, (from, to))| {
-            // An end that another window covers is none of the union.
-            let mut others = windows.clone().enumerate().filter(move |&(j, _)| j != k).map(|(_, other)| other);
+        let ends = windows.clone().enumerate().flat_map(|(window, (from, to))| {
+            let mut others = windows.clone().enumerate().filter(move |&(j, _)| j != window).map(|(_, other)| other);
             let covered_from = others.clone().any(|(a, b)| a.value < from.value && from.value <= upper(b));
             let covered_to = to.is_some_and(|to| others.any(|(a, b)| a.value <= to.value && to.value < upper(b)));
-            [Some(from).filter(|_| !covered_from), to.filter(|_| !covered_to)]
+            let start = Some((window, true, from)).filter(|_| !covered_from);
+            [start, to.filter(|_| !covered_to).map(|to| (window, false, to))]
         });
-        let nearest = ends.flatten().min_by(|a, b| (a.value - mu).abs().total_cmp(&(b.value - mu).abs()))?;
+        let distance = |end: &(usize, bool, Bounded)| (end.2.value - mu).abs();
+        let (window, is_start, end) = ends.flatten().min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
         let inside = windows.clone().any(|(from, to)| from.value <= mu && mu <= upper(to));
-        let distance = (nearest.value - mu).abs();
-        Some(Bounded { value: if inside { -distance } else { distance }, error: nearest.error })
+        let distance = (end.value - mu).abs();
+        let margin = if inside { -distance } else { distance };
+        Some(NearestEnd { window, is_start, inside, mu: end.value, margin, error: end.error })
     }
 
-    /// The end nearest to the friction coefficient of `point`, of those that are not edges of the searched range, and
-    /// where it is at its load and speed.
-    pub fn nearest(&self, point: &OperatingPoint) -> Option<(&End, f64)> {
-        let both = self.windows.iter().zip(self.at(point));
-        let ends = both.flat_map(|((from, to), (a, b))| [Some((from, a.value)), to.as_ref().zip(b.map(|b| b.value))]);
-        let distance = |mu: f64| (mu - point.friction_coefficient).abs();
-        let moving = ends.flatten().filter(|(end, _)| end.condition != Condition::Edge);
-        moving.min_by(|a, b| distance(a.1).total_cmp(&distance(b.1)))
+    /// The end that `nearest` speaks of, unless it is the edge of the searched range.
+    pub fn end(&self, nearest: &NearestEnd) -> Option<&End> {
+        let (from, to) = self.windows.get(nearest.window)?;
+        let end = if nearest.is_start { Some(from) } else { to.as_ref() };
+        end.filter(|end| end.condition != Condition::Edge)
     }
 
     /// Every number that a prediction can depend on, as bits.
@@ -348,21 +360,59 @@ mod tests {
     }
 
     #[test]
-    fn margin_is_to_the_union() {
+    fn the_margin_is_the_distance_to_the_nearest_end_of_the_union() {
         let end = |mu| End { condition: Condition::Edge, mu, error: 0.0, slope: [0.0; 4], curvature: [[0.0; 2]; 2] };
         let ends = |windows: &[(f64, Option<f64>)]| Ends {
             point: REFERENCE,
             windows: windows.iter().map(|&(from, to)| (end(from), to.map(end))).collect(),
         };
-        assert_eq!(ends(&[]).margin(&REFERENCE), None);
+        assert_eq!(ends(&[]).nearest(&REFERENCE), None);
         let overlapping = ends(&[(0.2, Some(0.5)), (0.4, Some(0.7)), (1.5, None)]);
         let touching = ends(&[(0.2, Some(0.5)), (0.5, Some(0.7)), (1.5, None), (1.6, None)]);
-        for (mu, expected) in [(0.1, 0.1), (0.45, -0.25), (0.6, -0.1), (0.9, 0.2), (1.75, -0.25)] {
+        // Friction coefficient, the nearest end, the margin to it.
+        let expected = [(0.1, 0.2, 0.1), (0.44, 0.2, -0.24), (0.6, 0.7, -0.1), (0.9, 0.7, 0.2), (1.75, 1.5, -0.25)];
+        for (mu, end, margin) in expected {
             for ends in [&overlapping, &touching] {
-                let found = ends.margin(&REFERENCE.with_friction(mu)).unwrap().value;
-                assert!((found - expected).abs() < 1e-15, "{mu}: {found} is not {expected}");
+                let found = ends.nearest(&REFERENCE.with_friction(mu)).unwrap();
+                assert!(found.mu == end && (found.margin - margin).abs() < 1e-15, "{mu}: {found:?}");
+                assert_eq!((found.inside, found.is_start), (margin < 0.0, end == 0.2 || end == 1.5), "{mu}: {found:?}");
             }
         }
+    }
+
+    /// An end that moves with the load has a bound up to [`REACH`] from where it is known, and none beyond; one that does not
+    /// move has it anywhere.
+    #[test]
+    fn beyond_its_reach_an_end_has_no_bound() {
+        let end = |slope: f64| End {
+            condition: Condition::Discriminant(0, 1),
+            mu: 0.5,
+            error: 1e-12,
+            slope: [slope, 0.0, 0.0, 0.0],
+            curvature: [[0.0; 2]; 2],
+        };
+        for (slope, load, known) in [(1e-4, 1.019, true), (1e-4, 1.021, false), (1e-4, 0.979, false), (0.0, 2.0, true)]
+        {
+            let ends = Ends { point: REFERENCE, windows: vec![(end(slope), None)] };
+            let point = OperatingPoint { normal_load_n: load * REFERENCE.normal_load_n, ..REFERENCE };
+            let found = ends.nearest(&point).unwrap();
+            assert!((found.mu - (0.5 + slope * (load - 1.0) * REFERENCE.normal_load_n)).abs() < 1e-15);
+            assert_eq!(found.error == 1e-12, known, "{load}: {found:?}");
+            assert!(known || found.error.is_nan(), "{load}: {found:?}");
+        }
+    }
+
+    /// At a merging point the bound of an end holds against thirty digits, and is that of rounding, not zero.
+    #[test]
+    fn the_bound_of_an_end_holds_where_modes_merge() {
+        let map = map(&nine_dof(2.0, 2.0, 5.0), &REFERENCE);
+        let nearest = map.ends.nearest(&REFERENCE.with_friction(0.3)).unwrap();
+        // The reference has 14 digits.
+        assert!((nearest.mu - 0.35592805826058).abs() <= nearest.error + 1e-14, "{nearest:?}");
+        assert!(nearest.error > f64::EPSILON && nearest.error < 1e-11, "{nearest:?}");
+        let next = map.next_window(&map.ends, &REFERENCE.with_friction(0.3)).unwrap();
+        assert_eq!((next.end, next.window), (nearest, &map.windows[0]));
+        assert_eq!(next.frequency_hz, map.windows[0].frequency_hz);
     }
 
     /// Ends carried to another load and speed are those that a map made there finds, to 1e-10; extrapolated ones are off

@@ -4,8 +4,9 @@
 use faer::c64;
 
 use super::critical::{self, Window};
-use super::ends::Ends;
+use super::ends::{Ends, NearestEnd};
 use super::model::Model;
+use super::numbering::Numbering;
 use super::operating_point::OperatingPoint;
 use super::solver::Solver;
 use super::spectrum::{SolveError, Spectrum, Vectors};
@@ -13,8 +14,6 @@ use super::tracking::{Continuation, continue_roots, tracked};
 
 /// Intervals the range of friction coefficients is cut into before refinement.
 const FIRST_INTERVALS: usize = 32;
-/// The same where no windows are looked for.
-const FIRST_INTERVALS_OF_IDENTITIES: usize = 4;
 /// Times the range may be halved: the resolution is `range / 2^20`.
 const HALVINGS: i32 = 20;
 /// More nodes than this are not made; the map then says that it is not complete.
@@ -31,7 +30,7 @@ pub struct MapOptions {
     pub band_max_hz: Option<f64>,
     /// A root is unstable when `σ` exceeds this times `|λ|`.
     pub instability_threshold: f64,
-    /// Whether to look for windows; without it only identities are followed, which takes fewer solves.
+    /// Whether to find the windows and their ends; without, modes are numbered alike in fewer solves.
     pub windows: bool,
 }
 
@@ -72,6 +71,9 @@ pub struct StabilityMap {
     pub point: OperatingPoint,
     /// Solved points, ascending in friction coefficient.
     pub nodes: Vec<Node>,
+    pub(super) numbering: Numbering,
+    /// Modes above are followed but not judged, Hz.
+    pub(super) band_max_hz: Option<f64>,
     /// Windows of instability, ascending in their lower end; empty unless asked for.
     pub windows: Vec<Window>,
     /// Their ends, and how these move with load and speed.
@@ -80,6 +82,17 @@ pub struct StabilityMap {
     pub resolution: f64,
     /// False where the refinement was cut short by the number of nodes.
     pub complete: bool,
+}
+
+/// What squeals next, or squeals: the window of instability whose end is nearest to the present friction coefficient.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NextWindow<'a> {
+    /// The window: the identities of its modes (a merging pair or a single mode) and how it comes about.
+    pub window: &'a Window,
+    /// Frequency at the nearest end, at the load and speed of the map, Hz; 0 for a divergence.
+    pub frequency_hz: f64,
+    /// The nearest end: its friction coefficient, the margin to it and the bound of their error.
+    pub end: NearestEnd,
 }
 
 impl StabilityMap {
@@ -102,9 +115,8 @@ impl StabilityMap {
             result.map_err(|source| MapError::Solve { mu, source })
         };
         let resolution = (mu_max - mu_min) * 0.5f64.powi(HALVINGS);
-        let intervals = if options.windows { FIRST_INTERVALS } else { FIRST_INTERVALS_OF_IDENTITIES };
         let mut ahead: Vec<Spectrum> =
-            first_grid(mu_min, mu_max, intervals).into_iter().rev().map(&mut solve).collect::<Result<_, _>>()?;
+            first_grid(mu_min, mu_max, FIRST_INTERVALS).into_iter().rev().map(&mut solve).collect::<Result<_, _>>()?;
         let mut spectra = Vec::with_capacity(ahead.len());
         let mut links: Vec<Continuation> = vec![];
         let mut complete = true;
@@ -112,7 +124,7 @@ impl StabilityMap {
         while let (Some(left), Some(right)) = (spectra.last(), ahead.last()) {
             let (from, to) = (left.point.friction_coefficient, right.point.friction_coefficient);
             let link = continue_roots(left, right);
-            let resolved = link.clear && (!options.windows || critical::is_resolved(left, right, &link, options));
+            let resolved = link.clear && critical::is_resolved(left, right, &link, options);
             let full = spectra.len() + ahead.len() >= MAX_NODES;
             if resolved || to - from <= resolution || full {
                 complete &= resolved || !full;
@@ -124,7 +136,9 @@ impl StabilityMap {
         }
         let nodes = identify_all(spectra, &links);
         let ends = Ends { point: *point, windows: vec![] };
-        let mut map = Self { point: *point, nodes, windows: vec![], ends, resolution, complete };
+        let (numbering, band_max_hz) = (Numbering::new(&nodes), options.band_max_hz);
+        let mut map =
+            Self { point: *point, nodes, numbering, band_max_hz, windows: vec![], ends, resolution, complete };
         if options.windows {
             map.windows = critical::windows(model, solver, &map, options)?;
             map.ends = Ends::of_map(model, solver, &map)?;
@@ -132,8 +146,9 @@ impl StabilityMap {
         Ok(map)
     }
 
-    /// Identities of the roots of `spectrum`, solved at this map's load and speed or close to them.
-    pub fn identify(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
+    /// Identities of the roots of `spectrum` by their shapes, solved at this map's load and speed or close to them: what looks for
+    /// the ends of windows follows a pair by. Modes that are shown are numbered by [`StabilityMap::ids`].
+    pub(super) fn identify(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
         let mu = spectrum.point.friction_coefficient;
         let after = self.nodes.partition_point(|node| node.mu() < mu);
         let nearest = match (after.checked_sub(1).and_then(|k| self.nodes.get(k)), self.nodes.get(after)) {
@@ -144,6 +159,15 @@ impl StabilityMap {
             Some(node) if node.spectrum.undamped == spectrum.undamped => continued_ids(node, spectrum),
             _ => (0..spectrum.roots.len() as u32).map(Some).collect(),
         }
+    }
+
+    /// The window of instability that the friction coefficient of `point` lies in or is nearest to, seen from its nearest end;
+    /// `ends` are the ends of this map's windows, at this map's load and speed or carried from there. `None` without windows.
+    pub fn next_window(&self, ends: &Ends, point: &OperatingPoint) -> Option<NextWindow<'_>> {
+        let end = ends.nearest(point)?;
+        let window = self.windows.get(end.window)?;
+        let frequency_hz = if end.is_start { window.frequency_hz } else { window.frequency_to_hz.unwrap_or(f64::NAN) };
+        Some(NextWindow { window, frequency_hz, end })
     }
 
     /// The smallest friction coefficient at which an instability begins.

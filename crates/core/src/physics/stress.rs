@@ -515,8 +515,7 @@ pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> 
     let map = StabilityMap::build(model, &mut solver, at, &options).map_err(text)?;
     let mut solve = |mu: f64| solver.solve(model, &at.with_friction(mu), Vectors::Right).map_err(text);
     let mut here = solve(0.0)?;
-    let mut ids: Vec<u32> =
-        map.identify(&here).into_iter().take(tracked(&here)).map(Option::unwrap_or_default).collect();
+    let mut ids: Vec<u32> = map.ids(&here).into_iter().take(tracked(&here)).map(Option::unwrap_or_default).collect();
     let (mut compared, mut halvings) = (0, 0);
     for step in 1..=steps {
         let target = mu_max * step as f64 / steps as f64;
@@ -536,7 +535,7 @@ pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> 
             };
             (here, ids) = (next, carried);
         }
-        let found = map.identify(&here);
+        let found = map.ids(&here);
         for k in 0..ids.len() {
             let partner = mirror(&here, k);
             let same = |j: usize| found[k] == Some(ids[j]);

@@ -1,6 +1,8 @@
 //! What a spectrum says about the modes of a rig's band.
 
+use super::numbering::{Census, Followed};
 use super::spectrum::{Root, Spectrum};
+use super::stability_map::StabilityMap;
 
 /// A mode with its identity.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,14 +26,21 @@ pub struct Summary {
     pub worst_frequency_hz: Option<f64>,
     /// Growth rates of the roots that do not oscillate, 1/s, descending.
     pub nonoscillatory_growth_per_s: Vec<f64>,
+    /// Room to number modes in.
+    followed: Vec<Followed>,
 }
 
 impl Summary {
-    /// Summarises `spectrum`, whose roots have identities `ids`, for modes up to `band_max_hz`; a root is unstable
-    /// when `σ > threshold · |λ|`.
-    pub fn of_spectrum(spectrum: &Spectrum, ids: &[Option<u32>], band_max_hz: Option<f64>, threshold: f64) -> Self {
+    /// Summarises `spectrum` for modes up to `band_max_hz`, with the identities that `map` gives them; without a map they are
+    /// numbered in the order of their frequencies. A root is unstable when `σ > threshold · |λ|`.
+    pub fn of_spectrum(
+        spectrum: &Spectrum,
+        map: Option<&StabilityMap>,
+        band_max_hz: Option<f64>,
+        threshold: f64,
+    ) -> Self {
         let mut summary = Self::default();
-        summary.take_spectrum(spectrum, ids, band_max_hz, threshold);
+        summary.take_spectrum(spectrum, map, band_max_hz, threshold);
         summary
     }
 
@@ -39,13 +48,12 @@ impl Summary {
     pub fn take_spectrum(
         &mut self,
         spectrum: &Spectrum,
-        ids: &[Option<u32>],
+        map: Option<&StabilityMap>,
         band_max_hz: Option<f64>,
         threshold: f64,
     ) {
-        let id = |k: usize| ids.get(k).copied().flatten().unwrap_or(k as u32);
         self.modes.clear();
-        self.modes.extend(spectrum.modes().iter().enumerate().map(|(k, root)| Mode { id: id(k), root: *root }));
+        self.modes.extend(spectrum.modes().iter().map(|&root| Mode { id: 0, root }));
         let statics = spectrum.roots[spectrum.mode_count..].iter().copied();
         self.nonoscillatory_growth_per_s.clear();
         self.nonoscillatory_growth_per_s.extend(statics.clone().map(|root| root.lambda.re));
@@ -53,19 +61,37 @@ impl Summary {
             self.nonoscillatory_growth_per_s.extend(statics.clone().map(|root| 0.0 - root.lambda.re));
         }
         self.judge(statics, band_max_hz, threshold);
+        self.number(map, spectrum.point.friction_coefficient, Census::of(spectrum));
     }
 
-    /// Becomes the summary of roots read off a chart, in any order, in the memory it has.
-    pub fn take_chart(&mut self, charted: &[Mode], band_max_hz: Option<f64>, threshold: f64) {
+    /// Becomes the summary of roots read off a chart at friction coefficient `mu`, in any order, in the memory it has.
+    pub fn take_chart(
+        &mut self,
+        charted: &[Root],
+        mu: f64,
+        all: Census,
+        map: Option<&StabilityMap>,
+        band_max_hz: Option<f64>,
+        threshold: f64,
+    ) {
         self.modes.clear();
-        self.modes.extend(charted.iter().filter(|mode| mode.root.oscillates()).copied());
+        self.modes.extend(charted.iter().filter(|root| root.oscillates()).map(|&root| Mode { id: 0, root }));
         sort_almost_sorted(&mut self.modes);
-        let statics = charted.iter().map(|mode| mode.root).filter(|root| !root.oscillates());
+        let statics = charted.iter().copied().filter(|root| !root.oscillates());
         // Only those of undamped models are charted, each for both signs.
         self.nonoscillatory_growth_per_s.clear();
         self.nonoscillatory_growth_per_s
             .extend(statics.clone().flat_map(|root| [root.lambda.re, 0.0 - root.lambda.re]));
         self.judge(statics, band_max_hz, threshold);
+        self.number(map, mu, all);
+    }
+
+    /// Gives the modes their identities.
+    fn number(&mut self, map: Option<&StabilityMap>, mu: f64, all: Census) {
+        match map {
+            Some(map) => map.number(mu, all, &mut self.modes, &mut self.followed),
+            None => self.modes.iter_mut().enumerate().for_each(|(k, mode)| mode.id = k as u32),
+        }
     }
 
     /// Keeps the modes of the band and says how they and the static roots do.
@@ -88,7 +114,7 @@ impl Summary {
 /// Sorts modes by insertion, which for those of a chart, almost sorted as they come, takes a step or two each; where it takes
 /// more, they are sorted anew.
 fn sort_almost_sorted(modes: &mut [Mode]) {
-    let order = |a: &Mode, b: &Mode| super::spectrum::order(&a.root, &b.root).then(a.id.cmp(&b.id));
+    let order = |a: &Mode, b: &Mode| super::spectrum::order(&a.root, &b.root);
     let mut steps = 8 * modes.len();
     for k in 1..modes.len() {
         let mut at = k;

@@ -226,7 +226,10 @@ pub fn full_windows(
     let (mut moved, mut error) = (f64::INFINITY, f64::INFINITY);
     // 1/4, 3/4, 1/8, ...
     let mut checks = (2..).map(|index| options.mu_max * radical_inverse(index, 2));
-    for _ in 0..MOST_ROUNDS {
+    let (rounds, limit) = (MOST_ROUNDS, CHECKED);
+    #[cfg(test)]
+    let (rounds, limit) = tests::spoilt(rounds, limit);
+    for _ in 0..rounds {
         for mu in std::mem::take(&mut next) {
             basis.add(&sample(mu, basis.columns.ncols())?);
             sampled.push(mu);
@@ -252,12 +255,11 @@ pub fn full_windows(
                 basis.add(&found);
                 sampled.push(mu);
             }
-            if error <= CHECKED {
+            if error <= limit {
                 return Ok(map.windows);
             }
         }
     }
-    let (rounds, limit) = (MOST_ROUNDS, CHECKED);
     Err(if moved < STILL {
         CompareError::NotHeld { error, rounds, limit }
     } else {
@@ -404,6 +406,33 @@ mod tests {
         assert!(own < 1e-9 && other > 1e-6, "{own:e} {other:e}");
     }
 
+    /// The rounds and the limit while something is spoilt.
+    pub(super) fn spoilt(rounds: usize, limit: f64) -> (usize, f64) {
+        use crate::spoil::{Spoil, spoilt};
+        if spoilt(Spoil::Rounds) {
+            (1, limit)
+        } else if spoilt(Spoil::Held) {
+            (6, 0.0)
+        } else {
+            (rounds, limit)
+        }
+    }
+
+    #[test]
+    fn windows_that_still_move_and_projections_that_are_off_are_errors() {
+        use crate::spoil::{Spoil, with};
+        let model = touching(42, 0.0, ContactLaw::default());
+        let mut solver = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
+        let band = 700.0;
+        let band_max_hz = Some(band / std::f64::consts::TAU);
+        let options = MapOptions { mu_min: 0.0, mu_max: 1.0, band_max_hz, instability_threshold: 1e-6, windows: true };
+        let mut windows = || full_windows(&model, &mut solver, &point(0.0), band, &options, &mut |_| {});
+        let moving = with(Spoil::Rounds, &mut windows);
+        assert!(matches!(moving, Err(CompareError::NotStill { rounds: 1, .. })), "{moving:?}");
+        let off = with(Spoil::Held, &mut windows);
+        assert!(matches!(off, Err(CompareError::NotHeld { rounds: 6, error, .. }) if error > 0.0), "{off:?}");
+    }
+
     #[test]
     fn ends_far_from_what_was_sampled_are_next() {
         assert_eq!(farthest(&[0.1, 0.3, 0.31, 0.5, 0.9], &[0.0, 0.5, 1.0]), [0.3, 0.1, 0.9]);
@@ -438,6 +467,7 @@ mod tests {
             mu_from,
             mu_to: None,
             frequency_hz,
+            frequency_to_hz: None,
             kind: WindowKind::Coalescence,
         };
         let full = [window(0.2, 500.0), window(0.4, 1700.0)];

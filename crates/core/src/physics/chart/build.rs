@@ -18,8 +18,6 @@ use crate::physics::model::{Model, Traces};
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::Solver;
 use crate::physics::spectrum::{SolveError, Spectrum};
-use crate::physics::stability_map::{MapOptions, StabilityMap};
-use crate::physics::tracking::tracked;
 
 /// What to chart, and how well.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -290,8 +288,8 @@ impl Builder<'_> {
         let start = (0..units.len()).min_by(|&a, &b| off(a).total_cmp(&off(b))).unwrap_or(0);
         let all: Vec<&Sample> = fitted.iter().collect();
         let Some(roots) = follow(&all, &units, start) else { return Outcome::Split(longest) };
-        let mut branches = Branches {
-            ids: (0..all[start].z.len() as u32).collect(),
+        let branches = Branches {
+            count: all[start].z.len(),
             rounding: all.iter().map(|sample| sample.rounding).fold(0.0, f64::max),
             samples: all,
             units,
@@ -306,31 +304,11 @@ impl Builder<'_> {
             Ok(settled) => settled,
             Err(axis) => return Outcome::Split(axis),
         };
-        // Identities last: they take solves of their own.
-        let Some(ids) = self.identify(&mut solvers[0], &fitted[start].spectrum, solves) else {
-            return Outcome::Split(longest);
-        };
-        branches.ids = ids;
         let leaf = match self.assemble(&branches, settled, low, high) {
             Ok(leaf) => leaf,
             Err(axis) => return Outcome::Split(axis),
         };
         if self.check(&leaf, held_out) { Outcome::Converged(leaf) } else { Outcome::Split(longest) }
-    }
-
-    /// Identities of the tracked roots of a spectrum, as [`StabilityMap`] gives them at its load and speed.
-    fn identify(&self, solver: &mut Solver, spectrum: &Spectrum, solves: &mut usize) -> Option<Vec<u32>> {
-        let mu = spectrum.point.friction_coefficient;
-        let options = MapOptions {
-            mu_min: mu.min(0.0),
-            mu_max: mu.max(0.0),
-            band_max_hz: self.options.band_max_hz,
-            instability_threshold: 1e-6,
-            windows: false,
-        };
-        let map = StabilityMap::build(self.sampler.model, solver, &spectrum.point, &options).ok()?;
-        *solves += map.nodes.len();
-        map.identify(spectrum).into_iter().take(tracked(spectrum)).collect()
     }
 
     /// Compares a leaf with dense solves that took no part in its fit; errors seen above a bound refuse it.
@@ -367,6 +345,7 @@ mod tests {
     use faer::Mat;
 
     use super::*;
+    use crate::physics::chart::NotCharted;
     use crate::physics::chart::hold_out::{HoldOut, hold_out};
     use crate::physics::model::{ContactLaw, Law, Term};
     use crate::physics::spectrum::Vectors;
@@ -447,7 +426,7 @@ mod tests {
                 growing += usize::from(grows);
                 if chart.evaluate(&p, traces.at(&model, &p), &mut scratch, &mut modes).is_ok() {
                     charted += 1;
-                    let found = modes.iter().any(|mode| !mode.root.oscillates() && mode.root.lambda.re > 0.0);
+                    let found = modes.iter().any(|root| !root.oscillates() && root.lambda.re > 0.0);
                     assert_eq!(found, grows, "{p:?}, damping {damping}: {modes:?}");
                     assert!(!(grows && damping > 0.0), "{p:?}: charted where a static root grows");
                 }
@@ -456,6 +435,65 @@ mod tests {
                 growing > 100 && charted >= if damping > 0.0 { 200 } else { 490 },
                 "{growing} grow, {charted} charted"
             );
+        }
+    }
+
+    /// A coefficient that is off, and a root that is gone, show in the traces: the chart has no answer then.
+    #[test]
+    fn a_wrong_coefficient_and_a_lost_root_are_told_by_the_traces() {
+        let model = nine_dof(2.0, 2.0, 5.0);
+        let options = options((0.0, 500.0, 13.0), (2.0, 501.0, 14.0), None);
+        let chart = build(&model, &options, &|_| true).expect("the chart can be built");
+        let (traces, mut scratch) = (Traces::new(&model), Scratch::default());
+        let p = options.low.with_friction(0.7);
+        let mut evaluate = |chart: &Chart| {
+            let mut roots = vec![];
+            let answer = chart.evaluate(&p, traces.at(&model, &p), &mut scratch, &mut roots);
+            assert!(answer.is_ok() || roots.is_empty(), "nothing of a wrong answer is given");
+            answer.map(|_| roots.len())
+        };
+        assert_eq!(evaluate(&chart), Ok(9));
+        let (mut wrong, mut lost) = (chart.clone(), chart.clone());
+        for leaf in &mut wrong.leaves {
+            // The constant of the mean of the first cluster.
+            leaf.functions.coefficients[leaf.clusters[0].channel] *= 1.0 + 1e-6;
+        }
+        lost.leaves.iter_mut().for_each(|leaf| drop(leaf.clusters.pop()));
+        for chart in [wrong, lost] {
+            let Err(NotCharted::Incomplete { difference, limit }) = evaluate(&chart) else { panic!("it is answered") };
+            assert!(difference > limit, "{difference:e} {limit:e}");
+        }
+    }
+
+    /// A static root of a damped model that comes closer to zero than it moves may pass it in between.
+    #[test]
+    fn a_static_root_may_grow_between_the_points() {
+        // `λ² + 3 λ + k = 0`: the slower root decays by nearly k / 3.
+        let term = |value: f64, law| Term { matrix: faer::mat![[value]], law };
+        let stiffness = vec![term(1.0, Law::FrictionStiffness)];
+        let model = Model::new(1, stiffness, vec![term(3.0, Law::Constant)], ContactLaw::default(), None).unwrap();
+        let mut solver = Solver::new(1);
+        let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.0 };
+        let mut at = |k: f64| solver.solve(&model, &p.with_friction(k), Vectors::Right).expect("it solves");
+        let mut may = |values: &[f64]| may_diverge(values.iter().map(|&k| at(k)).collect::<Vec<_>>().iter());
+        assert!(!may(&[0.9, 1.0]) && !may(&[1.0, 1.0]), "far from zero");
+        assert!(may(&[0.3, 1.0]), "it moved by more than it is away");
+        assert!(may(&[1.0, -0.1]), "it grows at one of the points");
+    }
+
+    /// The number of threads changes nothing.
+    #[test]
+    fn any_number_of_threads_gives_the_same_chart() {
+        let contact_law = ContactLaw { exponent: 0.3, ..Default::default() };
+        let model = rig(&Synthetic { modes: 10, pairs: 12, damping_ratio: 0.0, contact_law, seed: 2 }).unwrap();
+        let options = options((0.0, 50.0, 1.0), (1.0, 2000.0, 60.0), Some(5000.0));
+        let words = |threads: usize| {
+            let options = ChartOptions { threads, ..options };
+            build(&model, &options, &|_| true).expect("the chart can be built").words()
+        };
+        let one = words(1);
+        for threads in [2, 3, 5, 8] {
+            assert!(words(threads) == one, "{threads} threads");
         }
     }
 

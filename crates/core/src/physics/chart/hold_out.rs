@@ -8,8 +8,7 @@ use super::{Chart, NotCharted, Scratch};
 use crate::physics::model::{Model, Traces};
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::{ROUNDING, Solver};
-use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
-use crate::physics::summary::Mode;
+use crate::physics::spectrum::{Root, SolveError, Spectrum, Vectors};
 use crate::physics::synthetic::Uniform;
 use crate::physics::tracking::tracked;
 
@@ -37,7 +36,7 @@ pub struct HoldOut {
 }
 
 /// A condition of the box, each value uniform.
-fn draw(options: &ChartOptions, uniform: &mut Uniform) -> OperatingPoint {
+pub(crate) fn draw(options: &ChartOptions, uniform: &mut Uniform) -> OperatingPoint {
     let mut between = |low: f64, high: f64| low + 0.5 * (uniform.draw() + 1.0) * (high - low);
     let ChartOptions { low, high, .. } = options;
     OperatingPoint {
@@ -70,7 +69,7 @@ pub fn hold_out(
         match chart.evaluate(&p, traces.at(model, &p), &mut scratch, &mut modes) {
             Err(NotCharted::NotConverged | NotCharted::Outside) => found.not_converged += 1,
             Err(NotCharted::Incomplete { .. }) => found.incomplete += 1,
-            Ok(()) => {
+            Ok(_) => {
                 found.charted += 1;
                 found.compare(&modes, &solver.solve(model, &p, Vectors::Both)?, &mut errors);
             }
@@ -83,7 +82,7 @@ pub fn hold_out(
 }
 
 impl HoldOut {
-    fn compare(&mut self, modes: &[Mode], spectrum: &Spectrum, errors: &mut Vec<f64>) {
+    fn compare(&mut self, modes: &[Root], spectrum: &Spectrum, errors: &mut Vec<f64>) {
         let dense: Vec<c64> = spectrum.roots[..tracked(spectrum)].iter().map(|root| root.square).collect();
         let partners = partners(modes, spectrum);
         let mut charted: Vec<Option<c64>> = vec![None; dense.len()];
@@ -92,7 +91,7 @@ impl HoldOut {
                 self.violations += 1;
                 continue;
             };
-            charted[k] = Some(mode.root.square);
+            charted[k] = Some(mode.square);
             self.violations += usize::from(!within(share));
             self.largest_share = self.largest_share.max(share);
         }
@@ -103,12 +102,12 @@ impl HoldOut {
             let nearest = (0..dense.len()).filter(|&j| j != k).min_by(|a, b| gap(a).total_cmp(&gap(b)));
             match nearest.filter(|j| gap(j) < MERGING * size) {
                 None => {
-                    errors.push((mode.root.square - root).norm() / size);
-                    self.largest_bound = self.largest_bound.max(mode.root.error.square / size);
+                    errors.push((mode.square - root).norm() / size);
+                    self.largest_bound = self.largest_bound.max(mode.error.square / size);
                 }
                 Some(j) => {
                     if let Some(other) = charted[j] {
-                        let off = 0.5 * (mode.root.square + other - root - dense[j]).norm() / size;
+                        let off = 0.5 * (mode.square + other - root - dense[j]).norm() / size;
                         self.largest_mean_error = self.largest_mean_error.max(off);
                     }
                 }
@@ -118,11 +117,10 @@ impl HoldOut {
 }
 
 /// The dense root nearest to each charted one, each taken once, and how far off it is as a share of the bounds of both.
-fn partners(modes: &[Mode], spectrum: &Spectrum) -> Vec<Option<(usize, f64)>> {
+fn partners(modes: &[Root], spectrum: &Spectrum) -> Vec<Option<(usize, f64)>> {
     let rounding = ROUNDING * f64::EPSILON * spectrum.matrix_norm;
     let mut left: Vec<usize> = (0..tracked(spectrum)).collect();
-    let partner = |mode: &Mode| {
-        let root = &mode.root;
+    let partner = |root: &Root| {
         let off = |k: usize| (spectrum.roots[k].square - root.square).norm();
         let at = (0..left.len()).min_by(|&a, &b| off(left[a]).total_cmp(&off(left[b])))?;
         let nearest = left.swap_remove(at);
@@ -140,6 +138,6 @@ fn within(share: f64) -> bool {
 }
 
 /// Whether every charted root has a dense root within the bounds of both, each dense root taken once.
-pub(super) fn within_bounds(modes: &[Mode], spectrum: &Spectrum) -> bool {
+pub(super) fn within_bounds(modes: &[Root], spectrum: &Spectrum) -> bool {
     partners(modes, spectrum).iter().all(|partner| partner.is_some_and(|(_, share)| within(share)))
 }

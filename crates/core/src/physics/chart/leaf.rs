@@ -25,17 +25,14 @@ pub struct Branches<'a> {
     pub half: [f64; MAX_AXES],
     /// `[sample][branch]`.
     pub roots: Vec<Vec<usize>>,
-    pub ids: Vec<u32>,
+    /// Number of followed roots.
+    pub count: usize,
     /// Rounding error of a well-conditioned root.
     pub rounding: f64,
     pub undamped: bool,
 }
 
 impl Branches<'_> {
-    fn count(&self) -> usize {
-        self.ids.len()
-    }
-
     fn z(&self, sample: usize, branch: usize) -> c64 {
         self.samples[sample].z[self.roots[sample][branch]]
     }
@@ -67,7 +64,7 @@ impl Builder<'_> {
         let limit = self.options.band_max_hz.map_or(f64::INFINITY, |hz| hz * std::f64::consts::TAU);
         let in_band = |branch: usize| (0..branches.samples.len()).any(|k| omega(branches.z(k, branch)) <= limit);
         let mut settled: Vec<(Vec<usize>, Expansion)> = vec![];
-        let mut open: Vec<Vec<usize>> = (0..branches.count()).filter(|&k| in_band(k)).map(|k| vec![k]).collect();
+        let mut open: Vec<Vec<usize>> = (0..branches.count).filter(|&k| in_band(k)).map(|k| vec![k]).collect();
         while let Some(members) = open.pop() {
             let expansion = self.expand(branches, fit, &members);
             let Some(axis) = expansion.failing else {
@@ -78,7 +75,7 @@ impl Builder<'_> {
                 return Err(axis);
             }
             // Whatever comes closest to a member joins, with all it was already clustered with.
-            let nearest = (0..branches.count())
+            let nearest = (0..branches.count)
                 .filter(|k| !members.contains(k))
                 .map(|k| (closeness(branches, &members, k), k))
                 .min_by(|a, b| a.0.total_cmp(&b.0));
@@ -247,15 +244,13 @@ impl Builder<'_> {
         let mut beside: Vec<(usize, Option<usize>, Vec<f64>)> =
             remainders.into_iter().map(|coefficients| (degree, None, coefficients)).collect();
         let mut functions = vec![];
-        let mut clusters = vec![];
+        let (mut clusters, mut lowest) = (vec![], vec![]);
         for (k, ((members, expansion), share)) in settled.into_iter().zip(shares).enumerate() {
-            let mut ids: Vec<u32> = members.iter().map(|&k| branches.ids[k]).collect();
-            ids.sort_unstable();
-            let ascending = is_ascending(branches, &members);
+            lowest.push(members.iter().copied().min());
             let Expansion { channels, errors, degree, .. } = expansion;
             functions.push((degree, k, channels));
             beside.extend(share.map(|(degree, channel)| (degree, Some(k), channel)));
-            clusters.push(Cluster { ids, channel: 0, errors, share: None, ascending });
+            clusters.push(Cluster { channel: 0, errors, share: None });
         }
         // Channels of high degree first: those that take part in a degree stand together.
         functions.sort_by_key(|(degree, ..)| std::cmp::Reverse(*degree));
@@ -271,11 +266,15 @@ impl Builder<'_> {
             }
         }
         let beside: Vec<_> = beside.into_iter().map(|(degree, _, channel)| (degree, channel)).collect();
-        clusters.sort_by_key(|cluster: &Cluster| cluster.ids[0]);
+        // Nearly in the order of their frequencies, so that the roots are quickly sorted.
+        let mut clusters: Vec<_> = lowest.into_iter().zip(clusters).collect();
+        clusters.sort_by_key(|(lowest, _)| *lowest);
+        let clusters = clusters.into_iter().map(|(_, cluster)| cluster).collect();
         Ok(Leaf {
             low: *low,
             high: *high,
             clusters,
+            tracked: branches.count,
             functions: Channels::new(&self.chart.basis, &columns),
             beside: Channels::new(&self.chart.basis, &beside),
             remainder_errors,
@@ -328,21 +327,6 @@ fn allow(z: &[c64], mean: c64, tolerance: f64, allowed: &mut [f64]) {
             *allowed = allowed.min(tolerance * size * product / weight);
         }
     }
-}
-
-/// Of a pair: whether the lower identity has the lower frequency where it is apart.
-fn is_ascending(branches: &Branches<'_>, members: &[usize]) -> bool {
-    let [a, b] = *members else { return true };
-    let (lower, upper) = if branches.ids[a] < branches.ids[b] { (a, b) } else { (b, a) };
-    let order = |node: usize| {
-        let (lower, upper) = (branches.z(node, lower), branches.z(node, upper));
-        match (branches.undamped, lower.im == 0.0) {
-            (true, true) => (lower.re - upper.re).signum(),
-            (true, false) => 0.0,
-            (false, _) => (upper.im - lower.im).signum(),
-        }
-    };
-    (0..branches.samples.len()).map(order).sum::<f64>() >= 0.0
 }
 
 /// How close branch `k` comes to any of `members` or to its mirror image, relative to its size.

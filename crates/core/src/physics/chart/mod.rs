@@ -19,15 +19,15 @@ mod words;
 use faer::c64;
 
 use super::model::Exact;
+use super::numbering::Census;
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, magnitude, square_root};
-use super::summary::Mode;
 use channels::Channels;
 use chebyshev::Basis;
 use cluster::MAX_SIZE;
 
 pub(crate) use samples::radical_inverse;
-pub use words::FORMAT;
+pub use words::{BUILDER, FORMAT};
 
 /// A condition that a chart depends on; its coordinate inside a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,16 +105,18 @@ enum Branch {
 /// Some roots of a leaf.
 #[derive(Clone, Debug)]
 struct Cluster {
-    /// Identities, ascending.
-    ids: Vec<u32>,
     /// Where its channels begin among the functions.
     channel: usize,
     /// Bound of the error of each symmetric function.
     errors: Vec<f64>,
     /// Where, beside the functions, the pad's share of a root that is alone is expanded, to [`leaf::SHARE_TOLERANCE`].
     share: Option<usize>,
-    /// Of a pair that is apart: whether the lower identity has the lower frequency.
-    ascending: bool,
+}
+
+impl Cluster {
+    fn size(&self) -> usize {
+        self.errors.len()
+    }
 }
 
 /// A box on which everything converged.
@@ -123,6 +125,8 @@ struct Leaf {
     low: [f64; MAX_AXES],
     high: [f64; MAX_AXES],
     clusters: Vec<Cluster>,
+    /// Number of roots that are followed, charted or not: the same all over the box.
+    tracked: usize,
     /// The symmetric functions of the clusters.
     functions: Channels,
     /// What else a prediction needs: what the charted roots leave of the traces, in the first two channels, and shares of the
@@ -228,7 +232,8 @@ impl Chart {
     }
 
     /// The charted roots at `p`, appended to `out` in no particular order, with bounds of their residuals, with shares of the
-    /// pad where they are charted, and checked against what is `known` there (see [`Traces`](super::Traces)).
+    /// pad where they are charted, and checked against what is `known` there (see [`Traces`](super::Traces)); and what there is
+    /// besides them. A chart gives no identities: [`StabilityMap`](super::StabilityMap) does.
     ///
     /// # Errors
     /// [`NotCharted`]; `out` is then as it was.
@@ -237,8 +242,8 @@ impl Chart {
         p: &OperatingPoint,
         known: Exact,
         scratch: &mut Scratch,
-        out: &mut Vec<Mode>,
-    ) -> Result<(), NotCharted> {
+        out: &mut Vec<Root>,
+    ) -> Result<Census, NotCharted> {
         let leaf = self.expand(p, scratch)?;
         leaf.beside.evaluate(&self.basis, &scratch.basis, &mut scratch.beside);
         let (values, beside) = (&scratch.functions, &scratch.beside);
@@ -247,12 +252,11 @@ impl Chart {
         let mut limit = [0.0; 2];
         let mut roots = [(c64::ZERO, 0.0); MAX_SIZE];
         for cluster in &leaf.clusters {
-            let size = cluster.ids.len();
+            let size = cluster.size();
             let functions = self.functions(cluster, values);
             cluster::roots(&functions[..size], &cluster.errors, &mut roots);
-            self.sort_pair(cluster, &mut roots);
             let gap = if size == 2 { magnitude(roots[0].0 - roots[1].0) } else { f64::INFINITY };
-            for (&id, &(z, error)) in cluster.ids.iter().zip(&roots[..size]) {
+            for &(z, error) in &roots[..size] {
                 let mut root = self.charted(z, error, size <= 2 && z.im == 0.0 && 2.0 * error < gap);
                 root.residual = root.residual_bound(known.norms);
                 root.pad_participation = cluster.share.map_or(f64::NAN, |share| beside[share].clamp(0.0, 1.0));
@@ -261,7 +265,7 @@ impl Chart {
                 found[1] += weight * (z * z).re;
                 limit[0] += weight * error;
                 limit[1] += weight * 2.0 * magnitude(z) * error;
-                out.push(Mode { id, root });
+                out.push(root);
             }
         }
         for moment in 0..2 {
@@ -273,7 +277,8 @@ impl Chart {
                 return Err(NotCharted::Incomplete { difference, limit });
             }
         }
-        Ok(())
+        let statics = if self.undamped { out[before..].iter().filter(|root| !root.oscillates()).count() } else { 0 };
+        Ok(Census { undamped: self.undamped, tracked: leaf.tracked, statics })
     }
 
     /// Whether `p` is in a box that converged.
@@ -313,7 +318,7 @@ impl Chart {
     pub fn values(&self, p: &OperatingPoint, scratch: &mut Scratch, out: &mut Vec<c64>) -> Result<(), NotCharted> {
         let leaf = self.expand(p, scratch)?;
         for cluster in &leaf.clusters {
-            let size = cluster.ids.len();
+            let size = cluster.size();
             let functions = self.functions(cluster, &scratch.functions);
             if size == 1 {
                 out.push(functions[0]);
@@ -327,7 +332,7 @@ impl Chart {
     /// The symmetric functions of a cluster out of the channels of its leaf.
     fn functions(&self, cluster: &Cluster, channels: &[f64]) -> [c64; MAX_SIZE] {
         let mut functions = [c64::ZERO; MAX_SIZE];
-        for (m, function) in functions[..cluster.ids.len()].iter_mut().enumerate() {
+        for (m, function) in functions[..cluster.size()].iter_mut().enumerate() {
             *function = if self.undamped {
                 c64::new(channels[cluster.channel + m], 0.0)
             } else {
@@ -359,24 +364,5 @@ impl Chart {
             (z, z * z, RootError::from_lambda(z, error))
         };
         Root { lambda, square, residual: f64::NAN, pad_participation: f64::NAN, error }
-    }
-
-    /// Puts the roots of a pair in the order of its identities: the growing one first while it is coupled, by
-    /// frequency while it is apart.
-    fn sort_pair(&self, cluster: &Cluster, roots: &mut [(c64, f64); MAX_SIZE]) {
-        if cluster.ids.len() != 2 {
-            return;
-        }
-        let (a, b) = (roots[0].0, roots[1].0);
-        let in_order = if self.undamped && a.im != 0.0 {
-            a.im > 0.0 // Im λ² = 2 σ ω
-        } else if self.undamped {
-            (a.re > b.re) == cluster.ascending // λ² = -ω²
-        } else {
-            (a.im < b.im) == cluster.ascending
-        };
-        if !in_order {
-            roots.swap(0, 1);
-        }
     }
 }

@@ -5,7 +5,27 @@ use super::cluster::MAX_SIZE;
 use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
 /// Changes whenever the words, or what a build makes of a model, mean something else than before.
-pub const FORMAT: u64 = 5;
+pub const FORMAT: u64 = 6;
+
+/// The sources that say what a build makes of a model: whoever keeps charts keeps them by these too, so that a chart of an older
+/// builder is never taken for one of this.
+pub const BUILDER: [&str; 15] = [
+    include_str!("build.rs"),
+    include_str!("channels.rs"),
+    include_str!("chebyshev.rs"),
+    include_str!("cluster.rs"),
+    include_str!("derivatives.rs"),
+    include_str!("leaf.rs"),
+    include_str!("mod.rs"),
+    include_str!("samples.rs"),
+    include_str!("words.rs"),
+    include_str!("../decoupled.rs"),
+    include_str!("../dense_eigen.rs"),
+    include_str!("../flexible_contact.rs"),
+    include_str!("../model.rs"),
+    include_str!("../solver.rs"),
+    include_str!("../tracking.rs"),
+];
 
 const AXES: [Axis; 4] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed];
 
@@ -32,11 +52,10 @@ impl Chart {
             for channels in [&leaf.functions, &leaf.beside] {
                 words.extend(channels.widths.iter().map(|&width| width as u64));
             }
-            words.push(leaf.clusters.len() as u64);
+            words.extend([leaf.tracked as u64, leaf.clusters.len() as u64]);
             for cluster in &leaf.clusters {
                 let share = cluster.share.map_or(0, |share| share as u64 + 1);
-                words.extend([cluster.ids.len() as u64, cluster.channel as u64, share, u64::from(cluster.ascending)]);
-                words.extend(cluster.ids.iter().map(|&id| u64::from(id)));
+                words.extend([cluster.size() as u64, cluster.channel as u64, share]);
                 words.extend(cluster.errors.iter().map(|error| error.to_bits()));
             }
             let coefficients = leaf.functions.coefficients.iter().chain(&leaf.beside.coefficients);
@@ -125,10 +144,11 @@ impl Reader<'_> {
         if beside[0] < REMAINDERS {
             return None;
         }
+        let tracked = self.count(usize::MAX)?;
         let count = self.count(self.0.len())?;
         let clusters = (0..count).map(|_| self.cluster(functions[0], beside[0], undamped)).collect::<Option<_>>()?;
         let (functions, beside) = (self.channels(basis, functions)?, self.channels(basis, beside)?);
-        Some(Leaf { low, high, clusters, functions, beside, remainder_errors })
+        Some(Leaf { low, high, clusters, tracked, functions, beside, remainder_errors })
     }
 
     fn widths(&mut self, basis: &Basis) -> Option<Vec<usize>> {
@@ -150,10 +170,8 @@ impl Reader<'_> {
         let size = self.count(MAX_SIZE)?;
         let channel = self.count(functions)?;
         let share = self.count(beside)?.checked_sub(1);
-        let ascending = self.next()? != 0;
-        let ids = (0..size).map(|_| u32::try_from(self.next()?).ok()).collect::<Option<_>>()?;
         let errors = (0..size).map(|_| self.number()).collect::<Option<_>>()?;
         let parts = if undamped { 1 } else { 2 };
-        (size > 0 && channel + size * parts <= functions).then_some(Cluster { ids, channel, errors, share, ascending })
+        (size > 0 && channel + size * parts <= functions).then_some(Cluster { channel, errors, share })
     }
 }

@@ -1,0 +1,374 @@
+//! Identities of modes: the one place where they are given, to modes that were solved and to modes read off a chart alike.
+//!
+//! A [`StabilityMap`] follows every root by its shape from friction coefficient 0, where identities ascend in frequency. Between
+//! two of its nodes the followed roots are interpolated; a mode then takes the identity of the interpolated root that has
+//! its rank in frequency. Where two frequencies are close but growth rates are not, ranks mean little: neighbours exchange their
+//! identities if the difference of the two roots points against that of the two interpolated ones, whatever both are off by
+//! together. Only values decide, so that it does not matter where a mode comes from.
+
+use faer::c64;
+
+use super::chart::build::ChartOptions;
+use super::chart::hold_out::draw;
+use super::chart::{Chart, Scratch};
+use super::model::{Model, Traces};
+use super::solver::Solver;
+use super::spectrum::{Root, Spectrum, Vectors, square_root};
+use super::stability_map::{MapError, MapOptions, Node, StabilityMap};
+use super::summary::{Mode, Summary};
+use super::synthetic::Uniform;
+use super::tracking::tracked;
+
+/// Two roots closer than this, relative, are one as far as a chart can tell: they keep the order of the interpolated ones.
+const TOGETHER: f64 = 1e-7;
+/// An interpolated root may stray from a straight line by this share of the distance to its nearest neighbour.
+const STRAY: f64 = 0.25;
+/// Followed roots that stay above the highest mode by this factor have nothing to do with it.
+const ABOVE: f64 = 1.2;
+/// Identities from here on are of modes that no node of the map has.
+const UNKNOWN: u32 = 1_000_000;
+
+/// A followed root between two neighbouring nodes: its index at each, and whether a cubic through values and slopes is used
+/// rather than a straight line, which never crosses a neighbour that it does not cross at the nodes.
+#[derive(Clone, Copy, Debug)]
+struct Path {
+    id: u32,
+    left: Option<u32>,
+    right: Option<u32>,
+    curved: bool,
+    /// The lower of its frequencies at the two, rad/s.
+    lowest: f64,
+}
+
+/// The followed roots between any two neighbouring nodes of a map.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Numbering {
+    spans: Vec<Vec<Path>>,
+}
+
+/// A followed root at a friction coefficient.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Followed {
+    id: u32,
+    /// `λ²` of an undamped model, `λ` of a damped one.
+    z: c64,
+    /// What it is ranked by.
+    rank: f64,
+    growth: f64,
+}
+
+/// What is known of all roots at a point besides the modes to be numbered.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Census {
+    /// Whether no damping takes part.
+    pub undamped: bool,
+    /// Number of roots that are followed, in the band or not.
+    pub tracked: usize,
+    /// How many of these do not oscillate.
+    pub statics: usize,
+}
+
+impl Census {
+    /// Of a spectrum.
+    pub fn of(spectrum: &Spectrum) -> Self {
+        let tracked = tracked(spectrum);
+        Self { undamped: spectrum.undamped, tracked, statics: tracked - spectrum.mode_count }
+    }
+}
+
+impl Numbering {
+    /// Of the nodes of a map.
+    pub(super) fn new(nodes: &[Node]) -> Self {
+        let gaps: Vec<Vec<f64>> = nodes.iter().map(|node| gaps(&node.spectrum)).collect();
+        let span = |k: usize| {
+            let (left, right) = (&nodes[k], nodes.get(k + 1).unwrap_or(&nodes[k]));
+            let mut at_right: Vec<Option<u32>> = vec![];
+            for (j, id) in right.ids.iter().enumerate().filter_map(|(j, id)| Some((j, (*id)? as usize))) {
+                at_right.resize(at_right.len().max(id + 1), None);
+                at_right[id] = Some(j as u32);
+            }
+            let mut paths: Vec<Path> = vec![];
+            let omega = |node: &Node, k: u32| node.spectrum.roots[k as usize].lambda.im;
+            for (i, id) in left.ids.iter().enumerate().filter_map(|(i, id)| Some((i as u32, (*id)?))) {
+                let there = at_right.get_mut(id as usize).and_then(Option::take);
+                let gap = |j: u32| gaps[k][i as usize].min(gaps[(k + 1).min(nodes.len() - 1)][j as usize]);
+                let curved = there.is_some_and(|j| is_curved(left, i as usize, right, j as usize, gap(j)));
+                let lowest = there.map_or(f64::INFINITY, |j| omega(right, j)).min(omega(left, i));
+                paths.push(Path { id, left: Some(i), right: there, curved, lowest });
+            }
+            for (id, j) in at_right.iter().enumerate().filter_map(|(id, &j)| Some((id as u32, j?))) {
+                paths.push(Path { id, left: None, right: Some(j), curved: false, lowest: omega(right, j) });
+            }
+            paths
+        };
+        let spans = if nodes.len() == 1 { 1 } else { nodes.len().saturating_sub(1) };
+        Self { spans: (0..spans).map(span).collect() }
+    }
+
+    /// The followed roots at friction coefficient `mu`, in the order of their rank, those of the node that has `tracked` of them;
+    /// beyond the nodes those of the last. Such as stay above `highest`, rad/s, are only counted: the number of all.
+    fn at(&self, nodes: &[Node], mu: f64, tracked: usize, highest: f64, out: &mut Vec<Followed>) -> usize {
+        out.clear();
+        let after = nodes.partition_point(|node| node.mu() < mu);
+        let k = after.saturating_sub(1).min(self.spans.len().saturating_sub(1));
+        let (Some(left), Some(right)) = (nodes.get(k), nodes.get(k + 1).or(nodes.last())) else { return 0 };
+        let step = right.mu() - left.mu();
+        let share = if step > 0.0 { ((mu - left.mu()) / step).clamp(0.0, 1.0) } else { 0.0 };
+        let undamped = left.spectrum.undamped;
+        let count = |node: &Node| node.ids.iter().flatten().count();
+        let from_left = match (count(left) == tracked, count(right) == tracked) {
+            (true, false) => true,
+            (false, true) => false,
+            _ => share <= 0.5,
+        };
+        let paths = self.spans.get(k).map_or(&[][..], Vec::as_slice);
+        let mut count = 0;
+        for path in paths {
+            if path.lowest > highest && path.left.is_some() && path.right.is_some() {
+                count += 1;
+                continue;
+            }
+            let z = match (path.left, path.right) {
+                (Some(i), Some(j)) => {
+                    between(&left.spectrum, i as usize, &right.spectrum, j as usize, step, share, path.curved)
+                }
+                (Some(i), None) if from_left => value(&left.spectrum, i as usize),
+                (None, Some(j)) if !from_left => value(&right.spectrum, j as usize),
+                _ => continue,
+            };
+            let lambda = if undamped { square_root(z) } else { z };
+            let rank = if lambda.im > 0.0 { lambda.im } else { -lambda.re.abs() };
+            count += 1;
+            out.push(Followed { id: path.id, z, rank, growth: lambda.re });
+        }
+        out.sort_unstable_by(|a, b| {
+            a.rank.total_cmp(&b.rank).then(b.growth.total_cmp(&a.growth)).then(a.id.cmp(&b.id))
+        });
+        count
+    }
+}
+
+impl StabilityMap {
+    /// Gives `modes`, the lowest of those at friction coefficient `mu`, none left out and ordered as in a [`Spectrum`], their
+    /// identities. `followed` is room to work in.
+    pub fn number(&self, mu: f64, census: Census, modes: &mut [Mode], followed: &mut Vec<Followed>) {
+        let comparable = self.nodes.first().is_some_and(|node| node.spectrum.undamped == census.undamped);
+        if !comparable {
+            modes.iter_mut().enumerate().for_each(|(k, mode)| mode.id = k as u32);
+            return;
+        }
+        let highest = modes.last().map_or(0.0, |mode| mode.root.lambda.im);
+        let all = self.numbering.at(&self.nodes, mu, census.tracked, ABOVE * highest, followed);
+        // Modes vanish, by ceasing to oscillate, at the lower end: they are counted from the upper one.
+        let missing = census.tracked as isize - all as isize;
+        let place = |k: usize| usize::try_from((k + census.statics) as isize - missing).ok();
+        let at = |k: usize| place(k).filter(|&place| place < followed.len());
+        for (k, mode) in modes.iter_mut().enumerate() {
+            mode.id = at(k).map_or(UNKNOWN + k as u32, |place| followed[place].id);
+        }
+        let (Some(first), Some(place)) =
+            (modes.iter().position(|mode| mode.id < UNKNOWN), (0..modes.len()).find_map(at))
+        else {
+            return;
+        };
+        let count = (modes.len() - first).min(followed.len() - place);
+        let (modes, followed) = (&mut modes[first..first + count], &mut followed[place..place + count]);
+        let z = |root: &Root| if census.undamped { root.square } else { root.lambda };
+        for _ in 0..count {
+            let mut settled = true;
+            for k in 1..count {
+                let (here, there) = (z(&modes[k - 1].root), z(&modes[k].root));
+                let (off, expected) = (there - here, followed[k].z - followed[k - 1].z);
+                let against = (off * expected.conj()).re < 0.0;
+                let apart = off.norm() > TOGETHER * there.norm();
+                if against && apart && self.in_band(&modes[k - 1].root) == self.in_band(&modes[k].root) {
+                    followed.swap(k - 1, k);
+                    settled = false;
+                }
+            }
+            if settled {
+                break;
+            }
+        }
+        modes.iter_mut().zip(followed).for_each(|(mode, followed)| mode.id = followed.id);
+    }
+
+    /// Identities of the roots of `spectrum`, solved at this map's load and speed or close to them; `None` for roots that are not
+    /// followed.
+    pub fn ids(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
+        let mut modes: Vec<Mode> = spectrum.modes().iter().map(|&root| Mode { id: 0, root }).collect();
+        let mut followed = vec![];
+        let census = Census::of(spectrum);
+        self.number(spectrum.point.friction_coefficient, census, &mut modes, &mut followed);
+        let mut ids: Vec<Option<u32>> = modes.iter().map(|mode| Some(mode.id)).collect();
+        // Static roots of an undamped model have the lowest ranks.
+        let statics = followed.iter().take(census.statics).map(|followed| Some(followed.id));
+        ids.extend(statics);
+        ids.resize(spectrum.roots.len(), None);
+        ids
+    }
+
+    fn in_band(&self, root: &Root) -> bool {
+        self.band_max_hz.is_none_or(|max_hz| root.frequency_hz() <= max_hz)
+    }
+}
+
+/// What is interpolated.
+fn value(spectrum: &Spectrum, k: usize) -> c64 {
+    let root = &spectrum.roots[k];
+    if spectrum.undamped { root.square } else { root.lambda }
+}
+
+/// Its slope along the friction coefficient.
+fn slope(spectrum: &Spectrum, k: usize) -> c64 {
+    let of_square = spectrum.friction_sensitivity[k];
+    if spectrum.undamped { of_square } else { of_square / (2.0 * spectrum.roots[k].lambda) }
+}
+
+fn between(left: &Spectrum, i: usize, right: &Spectrum, j: usize, step: f64, share: f64, curved: bool) -> c64 {
+    let (from, to) = (value(left, i), value(right, j));
+    let line = from + share * (to - from);
+    if !curved {
+        return line;
+    }
+    let rest = 1.0 - share;
+    let bend = |spectrum: &Spectrum, k: usize| step * slope(spectrum, k) - (to - from);
+    line + share * rest * (rest * bend(left, i) - share * bend(right, j))
+}
+
+/// Whether a cubic through both ends stays close enough to the straight line.
+fn is_curved(left: &Node, i: usize, right: &Node, j: usize, gap: f64) -> bool {
+    let (step, left, right) = (right.mu() - left.mu(), &left.spectrum, &right.spectrum);
+    let along = value(right, j) - value(left, i);
+    let bend = |spectrum: &Spectrum, k: usize| (step * slope(spectrum, k) - along).norm();
+    // The largest value of s (1 - s)² is 4/27.
+    let stray = 4.0 / 27.0 * (bend(left, i) + bend(right, j));
+    stray <= STRAY * gap
+}
+
+/// The distance of each followed root to its nearest neighbour.
+fn gaps(spectrum: &Spectrum) -> Vec<f64> {
+    let count = tracked(spectrum);
+    let gap = |k: usize| {
+        let others = (0..count).filter(|&j| j != k);
+        others.map(|j| (value(spectrum, j) - value(spectrum, k)).norm()).fold(f64::INFINITY, f64::min)
+    };
+    (0..count).map(gap).collect()
+}
+
+/// What came of numbering modes that were read off a chart and solved.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Agreement {
+    /// Conditions that the chart answered.
+    pub charted: usize,
+    /// Conditions that it did not answer.
+    pub solved: usize,
+    /// Modes that were compared.
+    pub modes: usize,
+    /// Modes that have no solved mode of the same identity within the error bounds of both.
+    pub different: usize,
+    /// Solved modes that their shapes number otherwise, leaving out those closer to another than 1e-3, relative.
+    pub by_shape: usize,
+}
+
+/// Compares the identities of charted modes with those of solved ones at random conditions of the box of `charted`: at each of
+/// `places` loads and speeds, which have a map of their own, at `each` friction coefficients.
+///
+/// # Errors
+/// [`MapError`] where a solve fails.
+pub fn compare(
+    model: &Model,
+    mapped: &MapOptions,
+    charted: &ChartOptions,
+    chart: &Chart,
+    [places, each]: [usize; 2],
+    seed: u64,
+) -> Result<Agreement, MapError> {
+    let (traces, mut solver, mut scratch) = (Traces::new(model), Solver::new(model.dimension()), Scratch::default());
+    let (mut uniform, mut roots, mut found) = (Uniform::new(seed), vec![], Agreement::default());
+    let (mut on_chart, mut dense) = (Summary::default(), Summary::default());
+    let (band, threshold) = (mapped.band_max_hz, mapped.instability_threshold);
+    for _ in 0..places {
+        let at = draw(charted, &mut uniform);
+        let map = StabilityMap::build(model, &mut solver, &at, mapped)?;
+        for _ in 0..each {
+            let p = at.with_friction(draw(charted, &mut uniform).friction_coefficient);
+            roots.clear();
+            let Ok(all) = chart.evaluate(&p, traces.at(model, &p), &mut scratch, &mut roots) else {
+                found.solved += 1;
+                continue;
+            };
+            let mu = p.friction_coefficient;
+            let spectrum = solver.solve(model, &p, Vectors::Both).map_err(|source| MapError::Solve { mu, source })?;
+            on_chart.take_chart(&roots, mu, all, Some(&map), band, threshold);
+            dense.take_spectrum(&spectrum, Some(&map), band, threshold);
+            found.charted += 1;
+            found.modes += dense.modes.len();
+            found.different += dense.modes.len().abs_diff(on_chart.modes.len());
+            for mode in &on_chart.modes {
+                let same = dense.modes.iter().find(|other| other.id == mode.id);
+                let agrees = |other: &Mode| {
+                    let limit = mode.root.error.square + other.root.error.square;
+                    (mode.root.square - other.root.square).norm() <= limit
+                };
+                found.different += usize::from(!same.is_some_and(agrees));
+            }
+            let (by_shape, ids) = (map.identify(&spectrum), map.ids(&spectrum));
+            let gaps = gaps(&spectrum);
+            let distinct = |k: &usize| gaps[*k] > 1e-3 * value(&spectrum, *k).norm();
+            found.by_shape += (0..dense.modes.len()).filter(distinct).filter(|&k| by_shape[k] != ids[k]).count();
+        }
+    }
+    Ok(found)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::chart::build::build;
+    use super::super::model::ContactLaw;
+    use super::super::operating_point::OperatingPoint;
+    use super::super::synthetic::{Synthetic, rig};
+    use super::*;
+
+    /// Rigs without damping, with contact that stiffens with the load, and damped: whatever the box of the chart, a charted mode has
+    /// the identity of the solved one, and nearly always the one its shape says.
+    #[test]
+    fn charted_modes_have_the_identities_of_solved_ones() {
+        let mapped = MapOptions {
+            mu_min: 0.0,
+            mu_max: 1.0,
+            band_max_hz: Some(5e3),
+            instability_threshold: 1e-6,
+            windows: false,
+        };
+        let mut all = Agreement::default();
+        for seed in 0..9 {
+            let kind = seed as usize % 3;
+            let contact_law = ContactLaw { exponent: [0.0, 0.3, 0.3][kind], ..Default::default() };
+            let damping_ratio = [0.0, 0.0, 2e-3][kind];
+            let model = rig(&Synthetic { modes: 14, pairs: 24, damping_ratio, contact_law, seed }).unwrap();
+            let point = |friction_coefficient: f64, normal_load_n: f64, disc_speed_rad_s: f64| OperatingPoint {
+                normal_load_n,
+                disc_speed_rad_s,
+                friction_coefficient,
+            };
+            let charted = ChartOptions {
+                low: point(0.07 * kind as f64, 400.0, 10.0),
+                high: point(1.0, [401.0, 700.0, 450.0][kind], [11.0, 11.0, 12.0][kind]),
+                band_max_hz: Some(5e3),
+                tolerance: 1e-8,
+                smallest_share: 1e-3,
+                max_solves: 3000,
+                threads: 1,
+            };
+            let chart = build(&model, &charted, &|_| true).unwrap();
+            let places = [1, 5, 5][kind];
+            let found = compare(&model, &mapped, &charted, &chart, [places, 200 / places], seed).unwrap();
+            assert_eq!(found.different, 0, "seed {seed}: {found:?}");
+            assert!(found.charted > 150, "seed {seed}: {found:?}");
+            all.modes += found.modes;
+            all.by_shape += found.by_shape;
+        }
+        assert!(all.modes > 10_000 && 500 * all.by_shape < all.modes, "{all:?}");
+    }
+}
