@@ -279,6 +279,9 @@ fn shifted(
     progress: &mut dyn FnMut(Progress),
 ) -> Result<(Found, f64), ReductionError> {
     let n = pencil.dimension();
+    // The one that a test loses comes on top.
+    #[cfg(test)]
+    let count = count + usize::from(crate::spoil::spoilt(crate::spoil::Spoil::Mode));
     let (factor, shift) = factor_from(pencil, first)?;
     progress(Progress::Factored { shift });
     let square = |theta: f64| 1.0 / theta - shift;
