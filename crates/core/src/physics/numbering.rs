@@ -265,7 +265,7 @@ pub struct Agreement {
     pub solved: usize,
     /// Modes that were compared.
     pub modes: usize,
-    /// Modes that have no solved mode of the same identity within the error bounds of both.
+    /// Modes that another solved mode is nearer to than the one of the same identity, which is not within the bounds of both either.
     pub different: usize,
     /// Solved modes that their shapes number otherwise, leaving out those closer to another than 1e-3, relative.
     pub by_shape: usize,
@@ -307,10 +307,10 @@ pub fn compare(
             found.different += dense.modes.len().abs_diff(on_chart.modes.len());
             for mode in &on_chart.modes {
                 let same = dense.modes.iter().find(|other| other.id == mode.id);
-                let agrees = |other: &Mode| {
-                    let limit = mode.root.error.square + other.root.error.square;
-                    (mode.root.square - other.root.square).norm() <= limit
-                };
+                let off = |other: &Mode| (mode.root.square - other.root.square).norm();
+                let nearest = dense.modes.iter().map(off).fold(f64::INFINITY, f64::min);
+                let limit = |other: &Mode| mode.root.error.square + other.root.error.square;
+                let agrees = |other: &Mode| off(other) <= nearest || off(other) <= limit(other);
                 found.different += usize::from(!same.is_some_and(agrees));
             }
             let (by_shape, ids) = (map.identify(&spectrum), map.ids(&spectrum));
