@@ -101,7 +101,7 @@ impl Status {
 pub struct NextSqueal {
     /// The pair that merges, or the mode that begins to grow; none for a static divergence.
     pub ids: Vec<u32>,
-    /// Frequency where the window begins, Hz; 0 for a static divergence.
+    /// Frequency at the end, Hz; 0 for a static divergence.
     pub frequency_hz: f64,
     /// Friction coefficient of the end.
     pub mu: f64,
@@ -117,20 +117,14 @@ impl NextSqueal {
     /// The end that the margin of `prediction`, made at `point`, is measured to; `map` and `ends` were in force then.
     pub fn new(prediction: &Prediction, point: &Point, map: &StabilityMap, ends: &Ends) -> Option<Self> {
         let margin = Some(prediction.friction_margin).filter(|margin| margin.is_finite())?;
-        // Outside, a window begins above or ends below by the margin; inside, the reverse.
-        let (begins, finishes) = (point.friction_coefficient + margin, point.friction_coefficient - margin);
-        let found = map.windows.iter().zip(ends.at(point)).flat_map(|(window, (from, to))| {
-            let end = |mu: f64, value: f64| (window, mu, (value - mu).abs());
-            [Some(end(begins, from.value)), to.map(|to| end(finishes, to.value))]
-        });
-        let (window, mu, _) = found.flatten().min_by(|a, b| a.2.total_cmp(&b.2))?;
+        let next = map.next_window(ends, point)?;
         Some(Self {
-            ids: window.mode_ids.clone(),
-            frequency_hz: window.frequency_hz,
-            mu,
+            ids: next.window.mode_ids.clone(),
+            frequency_hz: next.frequency_hz,
+            mu: next.end.mu,
             margin,
             error: prediction.friction_margin_error,
-            inside: margin < 0.0,
+            inside: next.end.inside,
         })
     }
 
