@@ -23,6 +23,8 @@ use super::tracking::tracked;
 const TOGETHER: f64 = 1e-7;
 /// An interpolated root may stray from a straight line by this share of the distance to its nearest neighbour.
 const STRAY: f64 = 0.25;
+/// Modes that may exchange their identities are at most so many ranks apart.
+const REACH: usize = 3;
 /// Followed roots that stay above the highest mode by this factor have nothing to do with it.
 const ABOVE: f64 = 1.2;
 /// Identities from here on are of modes that no node of the map has.
@@ -176,13 +178,16 @@ impl StabilityMap {
         let z = |root: &Root| if census.undamped { root.square } else { root.lambda };
         for _ in 0..count {
             let mut settled = true;
-            for k in 1..count {
-                let (here, there) = (z(&modes[k - 1].root), z(&modes[k].root));
-                let (off, expected) = (there - here, followed[k].z - followed[k - 1].z);
+            // Not only neighbours: the two of a flutter pair have one frequency, and another mode may stand between them and their
+            // identities.
+            for (k, apart_by) in (1..=REACH).flat_map(|by| (by..count).map(move |k| (k, by))) {
+                let before = k - apart_by;
+                let (here, there) = (z(&modes[before].root), z(&modes[k].root));
+                let (off, expected) = (there - here, followed[k].z - followed[before].z);
                 let against = (off * expected.conj()).re < 0.0;
                 let apart = off.norm() > TOGETHER * there.norm();
-                if against && apart && self.in_band(&modes[k - 1].root) == self.in_band(&modes[k].root) {
-                    followed.swap(k - 1, k);
+                if against && apart && self.in_band(&modes[before].root) == self.in_band(&modes[k].root) {
+                    followed.swap(before, k);
                     settled = false;
                 }
             }
