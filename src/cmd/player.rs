@@ -13,6 +13,9 @@ use crate::wire::schema::Topic;
 /// Readers are awaited until no further one has come for so long.
 const SETTLED: Duration = Duration::from_millis(500);
 
+/// Readers of a topic that rig or node hears over ROS 2 which are the replay's own: one for reliable publishers and one for others.
+const OWN_READERS: usize = 2;
+
 /// What a recording is played to.
 pub struct Player {
     shm: Option<Shm>,
@@ -63,11 +66,11 @@ impl Player {
             Topic::Sensitivity => shm.sensitivities.readers(),
             Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0, // no shared-memory form
         });
-        // Rig and node hear each other here: one reader of what they hear is their own.
+        // Rig and node hear each other here.
         let ros2 = self.ros2.as_ref().map_or(0, |(rig, node)| match topic {
-            Topic::OperatingPoint => rig.readers().saturating_sub(1),
-            Topic::Vibration => rig.vibration_readers().saturating_sub(1),
-            Topic::Prediction => node.readers(topic).saturating_sub(1),
+            Topic::OperatingPoint => rig.readers().saturating_sub(OWN_READERS),
+            Topic::Vibration => rig.vibration_readers().saturating_sub(OWN_READERS),
+            Topic::Prediction => node.readers(topic).saturating_sub(OWN_READERS),
             Topic::Sensitivity | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => node.readers(topic),
         });
         shm + ros2
