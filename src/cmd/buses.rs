@@ -50,7 +50,7 @@ impl BusOptions {
     pub fn sources(&self, ros2: Option<&Ros2Options>) -> InputSources {
         let topic = ros2.map(|ros2| {
             let name = ros2.args.node_name(NODE_NAME);
-            ros2.args.topic(topic::OPERATING_POINT, &ros2.args.namespace(&name, "/"), &name)
+            ros2.args.topic(topic::relative(topic::OPERATING_POINT), &ros2.args.namespace(&name, "/"), &name)
         });
         let service = self.shm().map(|shm| format!("{}{}", shm.service_prefix, OperatingPointForm::SERVICE));
         let start = (topic.is_some() || service.is_some()).then(|| {
