@@ -11,7 +11,6 @@ mod ahead;
 pub mod bench;
 pub mod certificate;
 pub mod cmd;
-mod digits;
 pub mod display;
 pub mod export;
 pub mod full_model;

@@ -25,6 +25,16 @@ impl fmt::Display for Significant {
     }
 }
 
+/// [`Significant`] as a string.
+pub fn significant(value: f64, digits: usize) -> String {
+    Significant(value, digits).to_string()
+}
+
+/// As [`significant`], and 0 for a value within the bound `error` of its own error: its digits are rounding noise.
+pub fn above_error(value: f64, error: f64, digits: usize) -> String {
+    if value.abs() <= error { "0".to_owned() } else { significant(value, digits) }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -35,5 +45,13 @@ mod tests {
         for (value, digits, text) in cases {
             assert_eq!(Significant(value, digits).to_string(), text);
         }
+    }
+
+    #[test]
+    fn rounding_noise_is_zero_and_what_exceeds_its_bound_is_not() {
+        assert_eq!(above_error(-1.7e-13, 2e-12, 5), "0");
+        assert_eq!(above_error(-0.25, 2e-12, 5), "-0.25000");
+        assert_eq!(above_error(1e-13, f64::NAN, 5), "1.00e-13", "without a bound every digit stands");
+        assert_eq!(above_error(f64::NAN, 1.0, 5), "-");
     }
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-pub use crate::digits::significant;
+pub use crate::number::significant;
 use crate::physics::{OperatingPoint, StabilityMap, Summary};
 use crate::rig::Rig;
 

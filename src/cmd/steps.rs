@@ -9,6 +9,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use crate::io::clock::monotonic_ns;
 use crate::io::memory::resident_bytes;
 use crate::reduction::{FullProgress, GIB};
+use crate::terminal::printable;
 
 /// A plain line is written each time such a fraction of a step is done.
 const PLAIN_PARTS: usize = 4;
@@ -64,7 +65,7 @@ impl Steps {
     pub fn say(&mut self, text: &str) {
         let seconds = monotonic_ns().saturating_sub(self.started_ns) as f64 / 1e9;
         let memory = resident_bytes().map_or("      ?".to_owned(), |bytes| format!("{:7.2}", bytes as f64 / GIB));
-        let line = format!("[{seconds:7.1} s {memory} GiB] {text}");
+        let line = format!("[{seconds:7.1} s {memory} GiB] {}", printable(text));
         match &mut self.shown {
             Shown::Bars(bars) => drop(bars.println(line)),
             Shown::Lines(out) => drop(writeln!(out, "{line}").and_then(|()| out.flush())),

@@ -6,7 +6,7 @@ use std::fmt::Write;
 use serde::Serialize;
 
 use super::watch::{UnstableMode, fastest_modes};
-use crate::digits::significant;
+use crate::number::significant;
 use crate::physics::{Ends, OperatingPoint as Point, StabilityMap};
 use crate::wire::{OperatingPoint, Prediction, level};
 

@@ -6,9 +6,9 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
 use super::Frame;
-use crate::digits::{above_error, significant};
 use crate::node::Snapshot;
 use crate::node::status::{Assessment, Status};
+use crate::number::{above_error, significant};
 use crate::wire::Mode;
 
 /// Rows that the table of modes keeps, its border and its header included, however much there is to say above it.
