@@ -21,7 +21,7 @@ fn rig() -> Option<(TempDir, String)> {
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
     let data = shared.join("data/brake4669");
     if !MATRICES.iter().all(|name| data.join(name).exists()) {
-        eprintln!("skipped: no matrices in {} (set SQUEALCAST_SHARED)", data.display());
+        program::aloud(&format!("skipped: no matrices in {} (set SQUEALCAST_SHARED)", data.display()));
         return None;
     }
     let folder = tempfile::tempdir().expect("a temporary folder");

@@ -427,7 +427,7 @@ fn a_travelling_wave_travels_the_right_way() {
 /// Tests that time something are for a quiet machine: with `SQUEALCAST_MEASURE=1`.
 fn measures() -> bool {
     if !measuring() {
-        eprintln!("skipped: it measures times; SQUEALCAST_MEASURE=1 runs it");
+        program::aloud("skipped: it measures times; SQUEALCAST_MEASURE=1 runs it");
     }
     measuring()
 }

@@ -41,11 +41,6 @@ fn succeeds(program: &str, args: &[&str]) -> bool {
     status.is_ok_and(|status| status.success())
 }
 
-/// A line that the test runner does not swallow.
-fn say(line: &str) {
-    let _ = writeln!(io::stderr(), "{line}");
-}
-
 /// A mounted file system, unmounted when dropped.
 struct Mounted {
     folder: PathBuf,
@@ -58,7 +53,7 @@ impl Mounted {
         let folder = folder.to_owned();
         let mounted = succeeds("mount", &[args, &[&text(&folder)]].concat());
         if !mounted {
-            say("skipped: this machine does not mount file systems for tests");
+            program::aloud("skipped: this machine does not mount file systems for tests");
         }
         mounted.then_some(Self { folder })
     }
@@ -97,7 +92,7 @@ impl Disk {
         let attached = Command::new("losetup").args(["--find", "--show", &text(&image)]).output();
         let attached = attached.ok().filter(|output| made && output.status.success());
         let Some(attached) = attached else {
-            say("skipped: no mkfs.ext4, no python3 or no block device for a file");
+            program::aloud("skipped: no mkfs.ext4, no python3 or no block device for a file");
             return None;
         };
         Some(Self { folder, device: String::from_utf8(attached.stdout).unwrap().trim().to_owned() })
@@ -417,9 +412,11 @@ fn a_power_failure_leaves_every_file_whole_or_not_there() {
         // Two seconds between fdatasyncs, a flush every half second before them; three for a machine that does much else.
         assert!(most < Duration::from_secs(3 + 3), "{writer:?} lost {most:?}");
         if writer == Writer::Recorder {
-            say(&format!("{cuts} power cuts of a recording: lost {median:.2?} at the median, {most:.2?} at most"));
+            program::aloud(&format!(
+                "{cuts} power cuts of a recording: lost {median:.2?} at the median, {most:.2?} at most"
+            ));
         } else {
-            say(&format!("{cuts} power cuts of {writer:?}: every file whole"));
+            program::aloud(&format!("{cuts} power cuts of {writer:?}: every file whole"));
         }
     }
 }

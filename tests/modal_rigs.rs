@@ -500,9 +500,7 @@ fn wrong_universal_files_are_refused_with_line_and_value() {
 #[test]
 fn files_of_pyuff_give_the_same_rig_as_npz() {
     let python = python();
-    let has = Command::new(&python).args(["-c", "import numpy, pyuff"]).output();
-    if !has.is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: {} has no pyuff (tests/peers/setup.sh installs it)", python.display());
+    if !program::python_has(&python, "numpy, pyuff") {
         return;
     }
     let folder = tempfile::tempdir().unwrap();

@@ -1,5 +1,6 @@
 //! Recordings end to end: what was recorded is read back, whatever happened to the process, the disk or the file.
 
+mod program;
 mod records;
 
 use std::{
@@ -304,12 +305,8 @@ fn sample_file(plain: bool) -> Vec<u8> {
 
 /// Runs a script of `tests/peers` with the Python that has the peers; `None`, and a line saying so, where it has not.
 fn peer(script: &str, arguments: &[&Path]) -> Option<String> {
-    let installed = concat!(env!("CARGO_MANIFEST_DIR"), "/target/peers/bin/python");
-    let default = if Path::new(installed).exists() { installed } else { "python3" };
-    let python = std::env::var("SQUEALCAST_PEERS_PYTHON").unwrap_or_else(|_| default.to_owned());
-    let imports = Command::new(&python).args(["-c", "import mcap.reader, mcap_ros2.decoder, rosbags.rosbag2"]).output();
-    if !imports.is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: {python} has no mcap, mcap-ros2-support and rosbags");
+    let python = program::python();
+    if !program::python_has(&python, "mcap.reader, mcap_ros2.decoder, rosbags.rosbag2") {
         return None;
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers").join(script);

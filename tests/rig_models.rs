@@ -221,7 +221,7 @@ fn brake() -> Option<Vec<RigFile>> {
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
     let directory = shared.join("data/brake4669");
     if !directory.join("M.mtx").exists() {
-        eprintln!("skipped: no matrices at {}", directory.display());
+        program::aloud(&format!("skipped: no matrices at {}", directory.display()));
         return None;
     }
     let mut files = vec![file("brake4669.toml", std::fs::read(launch("brake4669.toml")).unwrap())];

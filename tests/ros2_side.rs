@@ -613,8 +613,7 @@ fn forged_datagrams_from_elsewhere_do_not_reach_a_node_on_loopback() {
         return;
     }
     let Some(elsewhere) = Namespace::new() else {
-        eprintln!("skipped: it needs the right to make a network namespace");
-        return;
+        return program::skipped("making a network namespace takes rights that this process lacks");
     };
     let forge = |node: &Node| {
         let test = "forged_datagrams_from_elsewhere_do_not_reach_a_node_on_loopback";

@@ -14,9 +14,7 @@ use serde_json::Value;
 #[test]
 fn scipy_predicts_the_same() {
     let python = python();
-    let has = Command::new(&python).args(["-c", "import numpy, scipy"]).output();
-    if !has.is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: {} has no numpy and scipy (tests/peers/setup.sh installs them)", python.display());
+    if !program::python_has(&python, "numpy, scipy") {
         return;
     }
     let folder = tempfile::tempdir().expect("a temporary folder");

@@ -78,8 +78,7 @@ fn its_files_agree_with_each_other() {
 #[test]
 fn another_program_reads_the_mesh() {
     let python = python();
-    if !Command::new(&python).args(["-c", "import meshio"]).output().is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: {} has no meshio (tests/peers/setup.sh installs it)", python.display());
+    if !program::python_has(&python, "meshio") {
         return;
     }
     let temp = tempfile::tempdir().unwrap();

@@ -1,7 +1,7 @@
 //! The real binary as a test runs it: folders of its own, exit code, both outputs.
 #![allow(dead_code)] // each test binary uses its part
 
-use std::io::Cursor;
+use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::{OnceLock, mpsc};
@@ -19,6 +19,30 @@ pub const PATIENCE: Duration = Duration::from_secs(120);
 /// Whether times are judged: `SQUEALCAST_MEASURE` is set on a quiet machine.
 pub fn measuring() -> bool {
     std::env::var_os("SQUEALCAST_MEASURE").is_some()
+}
+
+/// Writes a line to standard error that the test runner does not capture.
+pub fn aloud(line: &str) {
+    // Nobody reads it where standard error is closed: no reason to fail.
+    drop(writeln!(std::io::stderr(), "{line}"));
+}
+
+/// Says that a test is skipped for want of a peer; with `SQUEALCAST_PEERS` every peer is required, and it fails.
+#[track_caller]
+pub fn skipped(why: &str) {
+    assert!(std::env::var_os("SQUEALCAST_PEERS").is_none(), "SQUEALCAST_PEERS is set, but {why}");
+    aloud(&format!("skipped: {why}"));
+}
+
+/// Whether `python` has these modules; where it has not, the test is [`skipped`].
+#[track_caller]
+pub fn python_has(python: &Path, modules: &str) -> bool {
+    let found = Command::new(python).args(["-c", &format!("import {modules}")]).output();
+    let has = found.is_ok_and(|output| output.status.success());
+    if !has {
+        skipped(&format!("{} has no {modules} (tests/peers/setup.sh installs them)", python.display()));
+    }
+    has
 }
 
 /// Asserts that something took no longer than promised; on a machine that is not quiet it only says how long it took.

@@ -1,6 +1,7 @@
-//! The node at the speed of the bus, over shared memory, beside a bare round trip over the same bus. It measures times:
-//! `SQUEALCAST_MEASURE=1 cargo test --release --test bus_speed -- --nocapture`.
+//! The node at the speed of the bus, over shared memory, beside a bare round trip over the same bus. For a quiet machine:
+//! `cargo bench --bench bus_speed`.
 
+#[path = "../tests/bus/mod.rs"]
 mod bus;
 
 use std::sync::Arc;
@@ -152,12 +153,7 @@ impl Drop for Building {
 
 /// At 1 kHz, alternating in blocks with a bare round trip over the same bus, alone and while a chart is built; then 10 kHz
 /// for a minute, while a chart is built.
-#[test]
-fn speed_of_the_bus() {
-    if std::env::var_os("SQUEALCAST_MEASURE").is_none() {
-        eprintln!("skipped: it measures times; SQUEALCAST_MEASURE=1 runs it");
-        return;
-    }
+fn main() {
     let rig = rig_of_160_modes();
     let first = {
         // Nothing is cached, nothing is charted.
