@@ -1,20 +1,23 @@
-//! From full models to reduced ones: modes of substructures and of systems, and projections on them.
+//! Model reduction: real modes of substructures and systems, and projection of full models on a basis.
 //!
-//! Dense, for substructures written out in a rig file: the symmetric problem
+//! Dense, for substructures whose matrices are written in a rig file, the symmetric problem
 //!
 //! ```text
 //! K φ = ω² M φ,   M = L Lᵀ,   (L⁻¹ K L⁻ᵀ) y = ω² y,   φ = L⁻ᵀ y,   Φᵀ M Φ = I
 //! ```
 //!
-//! by [`free_interface_modes`]; [`whiten`] makes `M = I` of a whole system without leaving anything out. Sparse, for
-//! systems of finite-element matrices: [`normal_modes`] by nested dissection, a supernodal `L Lᵀ` and shift-invert block
-//! Lanczos with thick restart, the count of modes proven by the inertia of `K - σ M`; [`project_sparse`] takes each term
-//! to the basis; [`Analysed::residual`] finds what the modes left out still do at the contact; [`keep_modes`] does both
-//! for all parts of a model.
-//! A [`FullModel`] is what all of it starts from; [`FullSolver`] finds the roots of the full model itself, to compare
-//! with and to make a [`parametric_basis`] of, on which it keeps them.
+//! is solved by [`free_interface_modes`]. [`whiten`] transforms a whole system to `M = I` without truncation.
 //!
-//! [`compare_roots`] and [`full_windows`] say how far a reduced model is from it.
+//! Sparse, for finite-element matrices: [`normal_modes`] finds the lowest modes by nested dissection, a supernodal
+//! Cholesky factor `L Lᵀ`, and shift-invert block Lanczos with thick restart. The inertia of `K - σ M` proves that no
+//! mode was missed. [`project_sparse`] projects a term on the basis. [`Analysed::residual`] computes residual
+//! flexibility and inertia, the quasi-static response of the truncated modes at the contact. [`keep_modes`] does both
+//! for all parts of a model.
+//!
+//! A [`FullModel`] is the input to all of this. [`FullSolver`] finds complex eigenvalues of the full model itself, as a
+//! reference for comparisons and as samples for a [`parametric_basis`].
+//!
+//! [`compare_roots`] and [`full_windows`] measure the error of a reduced model.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
@@ -58,12 +61,13 @@ pub use residual::{InertiaBy, Residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 pub use substructures::{Kept, Substructure, keep_modes};
 
-/// Two mirrored entries of a symmetric matrix may differ by this times the largest entry: what printing with 13 digits
-/// leaves. Such matrices are taken as the mean of both triangles.
+/// Largest difference of two mirrored entries of a symmetric matrix, relative to its largest entry; it allows for
+/// matrices printed with 13 digits. Such matrices are replaced by the mean of both triangles.
 pub const SYMMETRY_TOLERANCE: f64 = 1e-12;
 
-/// A pivot of the mass matrix must exceed this times its own diagonal entry.
+/// A Cholesky pivot of the mass matrix must exceed this times the diagonal entry of its row.
 pub const DEFINITE_TOLERANCE: f64 = 1e-13;
 
-/// `ω²` may fall below zero by this times the largest `ω²`: rounding of a rigid-body motion, taken as 0.
+/// Largest negative `ω²`, relative to the largest `ω²`. Values in this range are rounding errors of rigid-body modes
+/// and count as 0.
 pub const SEMIDEFINITE_TOLERANCE: f64 = 1e-10;
