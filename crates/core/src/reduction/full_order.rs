@@ -1,21 +1,22 @@
-//! Complex eigenvalues of a full model, `(λ² M + λ C + K) x = 0`, `C` and `K` of any symmetry.
+//! Complex eigenvalues of a full model: roots of `(λ² M + λ C + K) x = 0` with `C` and `K` of any symmetry.
 //!
-//! Around a shift `s = iω` the problem is inverted, and Krylov-Schur (`krylov_schur`) finds the largest eigenvalues of the
-//! inverse: the roots nearest to the shift, and how far from it all of them are found. Undamped, in `κ = -λ²`:
+//! A shift-and-invert Krylov-Schur iteration (`krylov_schur`) finds the roots nearest to a shift `s = iω`. It also
+//! gives the radius within which every root has converged. An undamped model is solved in `κ = -λ²` with a real
+//! operator of size `n`:
 //!
 //! ```text
 //! x -> (K - ω² M)⁻¹ M x,   θ = 1/(κ - ω²)
 //! ```
 //!
-//! real and of size `n`; damped, in `λ`, complex and of size `2n`:
+//! A damped model is solved in `λ` with the linearised complex operator of size `2n`:
 //!
 //! ```text
 //! (x, y) -> x' = -Q(s)⁻¹ (M y + (C + s M) x),  y' = x + s x',   θ = 1/(λ - s),   Q(s) = s² M + s C + K
 //! ```
 //!
-//! The inverse comes from symmetric factors of the parts and the low rank of their contact (`contact_solver`); where there
-//! are other terms, from a sparse LU. Shifts are placed where the band is not yet covered. A root that two discs cover
-//! must have been found around both shifts.
+//! The inverse is applied with symmetric factors of the parts plus a low-rank correction for their contact
+//! (`contact_solver`). Models with other terms use a sparse LU. Each new shift is placed in the lowest part of the band
+//! that no disc covers yet. A root inside two discs must have been found around both shifts.
 //!
 //! Source: Saad, "Numerical methods for large eigenvalue problems" (2011), chapters 6 and 8; Tisseur, Meerbergen, "The
 //! quadratic eigenvalue problem", SIAM Review 43 (2001) 235-286.
@@ -31,25 +32,26 @@ use super::full_problem::{Problem, unit};
 use super::krylov_schur::{BLOCK, capacity, most_found};
 use crate::physics::{self, OperatingPoint, Vectors};
 
-/// Roots that are sought around each shift.
+/// Number of roots sought around each shift.
 pub(super) const WANTED: usize = 48;
-/// Residual a solve may have, relative to the size of its parts.
+/// Largest residual of a linear solve at a shift, relative to `|Q| |x| + |b|`.
 const SOLVE_LIMIT: f64 = 1e-13;
-/// Growth rates that are to be covered at least, relative to the band's highest angular frequency.
+/// Smallest magnitude of growth rate that the discs must cover, relative to the highest angular frequency of the band.
 const GROWTH: f64 = 0.02;
-/// Shifts after which the band is given up.
+/// Largest number of shifts for one band.
 const MOST_SHIFTS: usize = 200;
-/// Shifts whose factors are kept for other operating points.
+/// Largest number of shifts whose factors are kept for later operating points.
 const MOST_KEPT: usize = 4;
-/// Copies of a block that a step of the iteration holds: of the basis, its products with matrices in two layouts, both ways
-/// of complex numbers, before and after the factors, in either order.
+/// Number of blocks a Krylov step holds in memory besides the basis: matrix products in two memory layouts, complex
+/// numbers split into real and imaginary columns and joined again, and permuted copies around the factors. Used to
+/// estimate memory before factorising.
 const WORKING: usize = 12;
-/// Vectors of `n` complex numbers that residuals are found with.
+/// Number of complex vectors of length `n` held while residuals are computed.
 const CHECKING: usize = 64;
 /// Below this many degrees of freedom a dense solve is faster.
 const DENSE_BELOW: usize = 240;
 
-/// Which vectors of the roots are wanted.
+/// Which eigenvectors to compute.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FullVectors {
     None,
@@ -66,53 +68,56 @@ pub struct FullRoot {
     pub residual: f64,
 }
 
-/// The roots of a band and where they were looked for.
+/// The roots of a frequency band and the discs that were searched.
 #[derive(Clone, Debug)]
 pub struct FullSpectrum {
     /// Ascending in frequency.
     pub roots: Vec<FullRoot>,
-    /// `n×roots`: right vectors, norm 1; no columns unless asked for.
+    /// Right eigenvectors, `n×roots`, 2-norm 1; no columns unless requested.
     pub right: Mat<c64>,
-    /// `n×roots`: left vectors, norm 1; no columns unless asked for.
+    /// Left eigenvectors, `n×roots`, 2-norm 1; no columns unless requested.
     pub left: Mat<c64>,
-    /// Ascending; together they cover the imaginary axis from 0 to the end of the band. None of a small model, whose
-    /// roots are all known.
+    /// Discs in ascending order of their shifts. Together they cover the imaginary axis from 0 to the end of the band.
+    /// Empty for a small model solved densely, which yields all roots.
     pub discs: Vec<CoveredDisc>,
-    /// At every frequency of the band growth rates up to this magnitude were covered, 1/s.
+    /// Magnitude of growth rate, 1/s, up to which every root was found at every frequency of the band.
     pub covered_growth_per_s: f64,
 }
 
-/// What a full solve is doing.
+/// Progress of a full solve.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FullProgress {
-    /// Ordered and analysed: the bytes that will be needed at least, beside what was held before.
+    /// The model is ordered and symbolically analysed. `bytes` is a lower estimate of the memory needed in addition to
+    /// what was held before.
     Analysed { bytes: usize },
-    /// Factored at this shift, rad/s.
+    /// The matrix at this shift, rad/s, is factorised.
     Factored { shift_rad_s: f64 },
-    /// Vectors built so far around the shift, and roots converged of those wanted.
+    /// Krylov vectors built so far around the shift, and how many of the wanted roots have converged.
     Iterated { shift_rad_s: f64, vectors: usize, converged: usize, wanted: usize },
-    /// A disc with so many roots.
+    /// A disc is complete and contains `roots` roots.
     Covered { disc: CoveredDisc, roots: usize },
 }
 
-/// Solves one full model at many operating points: orders and analyses once, and keeps factors, which do not depend on
-/// the operating point, from one to the next.
+/// Solver for one full model at many operating points. The model is ordered and analysed once. Factors do not depend on
+/// the operating point and are kept between solves.
 pub struct FullSolver<'a> {
     what: String,
     model: &'a FullModel,
-    /// `None` where a sparse LU is needed.
+    /// Parts joined by contact only; `None` for other models, which need a sparse LU.
     parts: Option<Parts<'a>>,
     kept: Vec<Shifted>,
     memory_limit_bytes: Option<usize>,
-    /// Bytes that are held for something else for good.
+    /// Bytes that the caller holds permanently, see [`FullSolver::held_elsewhere`].
     elsewhere_bytes: usize,
-    /// Factors that there is room for.
+    /// Number of factors that fit in memory.
     most_kept: usize,
 }
 
 impl<'a> FullSolver<'a> {
-    /// `what` is how errors name the model; `memory_limit_bytes` is what may be taken beside what is held, compared with the
-    /// need before the work starts.
+    /// Orders and analyses `model`.
+    ///
+    /// `what` names the model in errors. `memory_limit_bytes` limits the memory taken in addition to what is already
+    /// held; the estimated need is compared with it before the work starts.
     ///
     /// # Errors
     /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `Memory`, `Factorisation`.
@@ -132,12 +137,13 @@ impl<'a> FullSolver<'a> {
         Ok(solver)
     }
 
-    /// Counts so many bytes, taken since the solver was made, as held from now on.
+    /// Counts `bytes`, allocated by the caller since the solver was made, towards the memory limit from now on.
     pub fn held_elsewhere(&mut self, bytes: usize) {
         self.elsewhere_bytes = bytes;
     }
 
-    /// Bytes that solves need beside what was held before: one factor, `roots` of them in the band.
+    /// Estimated bytes a solve needs in addition to what was held before, with one factor in memory and `roots` roots
+    /// in the band.
     pub fn bytes(&self, vectors: FullVectors, roots: usize) -> usize {
         let PartBytes { held, factors, factoring } = self.factor_bytes();
         held + factors + factoring.max(self.vector_bytes(vectors, roots))
@@ -147,14 +153,20 @@ impl<'a> FullSolver<'a> {
         let n = self.model.dimension();
         match &self.parts {
             Some(parts) => parts.bytes(),
-            // Columns of a sparse LU fill up unforeseeably: as many entries as a tenth of all places, at most.
+            // The fill of a sparse LU is not known in advance: 400 entries a column are assumed, at most a tenth of a
+            // full matrix.
             None => PartBytes { held: 0, factors: size_of::<c64>() * (n * n / 10).min(400 * n), factoring: 0 },
         }
     }
 
-    /// Bytes of the vectors that a solve holds at most: a basis for the roots wanted and those found, one way round, then, with
-    /// the roots found, a basis for as many the other way round, then residuals; and roots of all discs, every one of which
-    /// brings half as many as are wanted at least.
+    /// Bytes of the vectors held at the peak of a solve with `roots` roots in the band: the largest of three phases,
+    /// plus the eigenvectors kept for all discs.
+    ///
+    /// 1. Right vectors: a Krylov basis and the vectors found.
+    /// 2. Left vectors, if wanted: the right vectors found, a basis for as many left ones, and the left vectors found.
+    /// 3. Residuals: right and left vectors and the products with the matrices.
+    ///
+    /// Every disc is assumed to contribute at least half of the roots wanted around a shift.
     fn vector_bytes(&self, vectors: FullVectors, roots: usize) -> usize {
         let (n, complex) = (self.model.dimension(), size_of::<c64>());
         // Real of `n`, or complex of `2n`.
@@ -171,8 +183,11 @@ impl<'a> FullSolver<'a> {
         (WORKING * BLOCK * each + forward.max(backward)).max(checked) + found
     }
 
-    /// Makes room for solves of `roots` in the band while `beside` bytes are held for something else, and for `other` bytes at
-    /// other times, with one factor; as many factors are kept as there is room for. The bytes that are needed.
+    /// Checks the memory limit for solves with `roots` roots in the band, drops factors that no longer fit, and returns
+    /// the bytes needed with one factor.
+    ///
+    /// `beside` bytes are held by the caller during a solve; `other` bytes are needed between solves. As many factors
+    /// are kept as the limit allows.
     ///
     /// # Errors
     /// [`ReductionError::Memory`].
@@ -200,8 +215,9 @@ impl<'a> FullSolver<'a> {
         Ok(bytes)
     }
 
-    /// How many roots the parts have up to `band_rad_s` with their contact open; it closed, there are no more without friction.
-    /// As many as are sought around a shift where the model has no such parts.
+    /// Number of natural frequencies of the separate parts (contact open) up to `band_rad_s`. Without friction it is an
+    /// upper bound for the closed contact too, because contact stiffness only raises frequencies. For models without
+    /// separate parts it is the number of roots sought around a shift.
     ///
     /// # Errors
     /// [`ReductionError::Factorisation`].
@@ -209,10 +225,11 @@ impl<'a> FullSolver<'a> {
         self.parts.as_ref().map_or(Ok(WANTED), |parts| parts.count_below(band_rad_s * band_rad_s))
     }
 
-    /// Factors `K + sigma M` of the parts, if the model has them; the factors are kept with those at shifts.
+    /// Factorises `K + sigma M` of the parts, if the model has separate parts. The factors are kept together with those
+    /// at shifts.
     ///
     /// # Errors
-    /// [`ReductionError`]: `Factorisation`, also where that is not positive definite.
+    /// [`ReductionError`]: `Factorisation`, also if `K + sigma M` is not positive definite.
     pub(super) fn factor_at(&mut self, sigma: f64) -> Result<(), ReductionError> {
         let Some(parts) = &self.parts else { return Ok(()) };
         let index = Self::keep(&mut self.kept, self.most_kept, parts, -sigma)?.0;
@@ -223,17 +240,17 @@ impl<'a> FullSolver<'a> {
         Err(ReductionError::Factorisation { what: self.what.clone(), reason })
     }
 
-    /// The factors that [`Self::factor_at`] made last.
+    /// The factors of `K + sigma M` made by [`Self::factor_at`], if they are still kept.
     pub(super) fn factors_at(&self, sigma: f64) -> Option<&Shifted> {
         self.kept.iter().find(|shifted| shifted.square == -sigma)
     }
 
-    /// Whether the model is of parts that touch, and nothing else.
+    /// Whether the model consists of parts joined by contact only, without further terms.
     pub(super) fn has_parts(&self) -> bool {
         self.parts.is_some()
     }
 
-    /// Where in `kept` the factors of `K - square M` are, and whether they were made for it.
+    /// Index in `kept` of the factors of `K - square M`, and whether they were newly made.
     fn keep(
         kept: &mut Vec<Shifted>,
         most: usize,
@@ -250,8 +267,8 @@ impl<'a> FullSolver<'a> {
         Ok((kept.len() - 1, true))
     }
 
-    /// Every root with a frequency from 0 to `band_rad_s` at `p`, as far as discs around shifts on the imaginary axis
-    /// cover it.
+    /// Finds every root at `p` with a frequency from 0 to `band_rad_s` and a growth rate within the discs, see
+    /// [`FullSpectrum::covered_growth_per_s`]. Small models are solved densely and yield all roots of the band.
     ///
     /// # Errors
     /// [`ReductionError`]: `Factorisation`, `NotConverged`, `NotCovered`, `MissedRoot`, `Residual`.
@@ -296,7 +313,8 @@ impl<'a> FullSolver<'a> {
         Ok(assemble(&found, band_rad_s))
     }
 
-    /// Where in `kept` the factors at the shift are: `ω` itself or, where it is too near to a root, a little above.
+    /// Index in `kept` of the factors at the shift: `ω` itself or, if solves there are inaccurate because a root is too
+    /// near, slightly above.
     fn factored(
         kept: &mut Vec<Shifted>,
         parts: &Parts<'_>,
@@ -323,7 +341,7 @@ impl<'a> FullSolver<'a> {
         Err(ReductionError::Factorisation { what: problem.what.to_owned(), reason })
     }
 
-    /// All roots by a dense solve.
+    /// All roots of the band by a dense solve.
     fn dense(&self, p: &OperatingPoint, band_rad_s: f64, vectors: FullVectors) -> Result<FullSpectrum, ReductionError> {
         let n = self.model.dimension();
         let failed = |reason: String| ReductionError::Factorisation { what: self.what.clone(), reason };
@@ -406,7 +424,7 @@ pub(super) mod tests {
         let mut solver = FullSolver::new("system", &model, None, &mut |_| {}).unwrap();
         let p = point(0.3);
         let found = solver.roots(&p, 8000.0, FullVectors::Both, &mut |_| {}).unwrap();
-        // Flutter pairs share their imaginary part but for damping: compared as sets.
+        // Flutter pairs have nearly equal imaginary parts, so their order is undefined: compare as sets.
         assert_eq!(found.roots.len(), expected.len());
         for lambda in expected {
             let nearest = found.roots.iter().map(|root| (root.lambda - lambda).norm()).fold(f64::INFINITY, f64::min);
@@ -416,7 +434,7 @@ pub(super) mod tests {
         vectors_belong(&model, &p, &found);
     }
 
-    /// Takes a root that it shares with the one before from the first disc that has one.
+    /// Removes one root that lies in two neighbouring discs from the second of them.
     pub(super) fn lose_a_root(found: &mut [Found]) {
         for k in 1..found.len() {
             let (before, disc) = (found[k - 1].disc, found[k].disc);
@@ -429,7 +447,8 @@ pub(super) mod tests {
         panic!("no two discs share a root");
     }
 
-    /// A root that one of two discs lost is an error that names both, and so is a band that the allowed shifts do not cover.
+    /// A root missing from one of two overlapping discs is an error that names both shifts. A band that the allowed
+    /// number of shifts does not cover is an error too.
     #[test]
     fn a_lost_root_and_a_gap_are_errors() {
         use crate::spoil::{Spoil, with};
@@ -447,7 +466,8 @@ pub(super) mod tests {
         OperatingPoint { normal_load_n: 600.0, disc_speed_rad_s: 7.0, friction_coefficient }
     }
 
-    /// Right and left vectors make the full matrices singular, to the rounding of their norm.
+    /// Checks that right and left vectors satisfy the full eigenvalue problem to rounding, relative to the norm of
+    /// `Q(λ)`.
     fn vectors_belong(model: &FullModel, p: &OperatingPoint, found: &FullSpectrum) {
         let [mass, damping, stiffness] = model.matrices_at(p).unwrap().map(|matrix| matrix.to_dense());
         let n = model.dimension();
@@ -462,8 +482,8 @@ pub(super) mod tests {
         }
     }
 
-    /// Two chains, each of `3·nodes` rows in three directions with springs of its own along them, that touch at every
-    /// seventh node.
+    /// Two chains of `nodes` nodes with three degrees of freedom each and different springs per direction, in contact
+    /// at every seventh node.
     pub(in crate::reduction) fn touching(nodes: usize, damping: f64, law: ContactLaw) -> FullModel {
         let part = |name: &str, spring: f64, first: f64| {
             let (mut mass, mut stiffness) = (vec![], vec![]);
@@ -476,7 +496,7 @@ pub(super) mod tests {
                     if node > 0 {
                         stiffness.extend([(i, i - 3, -k), (i - 3, i, -k)]);
                     }
-                    // Directions are joined weakly.
+                    // Weak coupling between directions.
                     let j = 3 * node + (axis + 1) % 3;
                     stiffness.extend([(i, i, 0.05 * k), (j, j, 0.05 * k), (i, j, -0.05 * k), (j, i, -0.05 * k)]);
                 }
@@ -504,7 +524,7 @@ pub(super) mod tests {
         }
     }
 
-    /// Against a dense solve of the same matrices: undamped and with every kind of contact damping.
+    /// Roots agree with a dense solve of the same matrices, undamped and with every kind of contact damping.
     #[test]
     fn touching_parts_against_a_dense_solve() {
         let law = ContactLaw { exponent: 0.5, reference_n: 500.0, slope_s_per_m: -0.01, lateral_damping: true };
@@ -530,12 +550,12 @@ pub(super) mod tests {
                     .map(|(index, lambda)| (index, (lambda * lambda - root.lambda * root.lambda).norm()))
                     .min_by(|a, b| a.1.total_cmp(&b.1))
                     .unwrap();
-                // Rounding of the dense solve: ε times the largest square, 1e7, times conditions of a few hundred.
+                // Error of the dense solve: ε times the largest `|λ²|`, 1e7, times condition numbers of a few hundred.
                 assert!(off < 1e-6, "{} off by {off:e}", root.lambda);
                 left.swap_remove(index);
             }
             vectors_belong(&model, &p, &found);
-            // Apart from each other, and other conditions with the same factors.
+            // Open contact, and another operating point with the same factors.
             let open = OperatingPoint { normal_load_n: 0.0, ..p };
             assert!(solver.roots(&open, band, FullVectors::None, &mut |_| {}).unwrap().roots.len() > 60);
             let factors = solver.kept.len();
