@@ -1,29 +1,30 @@
-//! What part of a band the discs around shifts cover, whether they agree where two do, and the roots taken from each.
+//! Coverage of a frequency band by discs around shifts, consistency of overlapping discs, and assembly of the spectrum.
 
 use faer::{Mat, MatRef, c64};
 
 use super::ReductionError;
 use super::full_order::{FullRoot, FullSpectrum};
 
-/// Half the chord of a disc that counts as covered, relative to its radius: its half width there is 0.31 of it.
+/// Half the stretch of the imaginary axis that a disc counts as covering, relative to its radius. At the ends of that
+/// stretch the half width of the disc is 0.31 of its radius.
 const CHORD: f64 = 0.95;
-/// Distance, relative to `|λ|`, at which two roots found are the same: ten times the square root of the residual of a
-/// pair, for where roots merge.
+/// Largest distance, relative to `|λ|`, of two computed values of the same root: ten times the square root of the
+/// residual limit of an eigenpair, because merging roots are only that accurate.
 pub(super) const SAME: f64 = 1e-5;
 
-/// A disc around a shift in which every root has converged.
+/// Disc around a shift within which every root has converged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CoveredDisc {
-    /// Its centre: `λ = iω`, or `-λ² = ω²`, by `ω` in rad/s.
+    /// Angular frequency `ω` of the shift, rad/s. The centre is `λ = iω`, or `-λ² = ω²` if `squared`.
     pub shift_rad_s: f64,
-    /// Its radius: of `λ` in 1/s, or of `λ²` in 1/s².
+    /// Radius in the `λ` plane, 1/s, or in the `λ²` plane, 1/s², if `squared`.
     pub radius: f64,
-    /// It is a disc of `λ²`, of an undamped model.
+    /// The disc lies in the `λ²` plane, as for undamped models.
     pub squared: bool,
 }
 
 impl CoveredDisc {
-    /// The stretch of the imaginary axis that it covers, rad/s.
+    /// Covered stretch of the imaginary axis, rad/s.
     pub fn stretch_rad_s(&self) -> [f64; 2] {
         let (omega, half) = (self.shift_rad_s, CHORD * self.radius);
         if self.squared {
@@ -34,7 +35,7 @@ impl CoveredDisc {
         [(omega - half).max(0.0), omega + half]
     }
 
-    /// The growth rate up to which, either way, it covers this frequency, 1/s.
+    /// Largest magnitude of growth rate covered at the frequency `omega`, rad/s; 1/s.
     pub fn growth_per_s(&self, omega: f64) -> f64 {
         if self.radius == f64::INFINITY {
             return f64::INFINITY;
@@ -48,7 +49,7 @@ impl CoveredDisc {
         (self.radius * self.radius - off * off).sqrt()
     }
 
-    /// Whether it covers a stretch, and there growth rates up to `growth`.
+    /// Whether the disc covers the stretch `[from, to]`, rad/s, with growth rates up to `growth`, 1/s, in magnitude.
     pub(super) fn covers(&self, [from, to]: [f64; 2], growth: f64) -> bool {
         let [low, high] = self.stretch_rad_s();
         low <= from && high >= to && self.growth_per_s(from).min(self.growth_per_s(to)) >= growth
@@ -62,7 +63,7 @@ impl CoveredDisc {
     }
 }
 
-/// What was found around one shift.
+/// Roots and vectors found around one shift.
 pub(super) struct Found {
     pub disc: CoveredDisc,
     pub roots: Vec<FullRoot>,
@@ -70,7 +71,7 @@ pub(super) struct Found {
     pub left: Mat<c64>,
 }
 
-/// The lowest stretch of the band that no disc covers.
+/// Lowest uncovered stretch of the band, rad/s; `found` is in ascending order of shifts.
 pub(super) fn first_gap(found: &[Found], band_rad_s: f64) -> Option<[f64; 2]> {
     let mut covered = 0.0;
     for [low, high] in found.iter().map(|found| found.disc.stretch_rad_s()) {
@@ -85,7 +86,10 @@ pub(super) fn first_gap(found: &[Found], band_rad_s: f64) -> Option<[f64; 2]> {
     (covered < band_rad_s).then_some([covered, band_rad_s])
 }
 
-/// That roots which two discs cover were found around both shifts.
+/// Checks that every root inside two neighbouring discs was found around both shifts.
+///
+/// # Errors
+/// [`ReductionError::MissedRoot`].
 pub(super) fn agree(what: &str, found: &[Found]) -> Result<(), ReductionError> {
     for (a, b) in found.iter().zip(found.iter().skip(1)).flat_map(|(a, b)| [(a, b), (b, a)]) {
         let mut free: Vec<c64> = b.roots.iter().map(|root| root.lambda).collect();
@@ -110,14 +114,15 @@ pub(super) fn agree(what: &str, found: &[Found]) -> Result<(), ReductionError> {
     Ok(())
 }
 
-/// Takes every root from the disc whose stretch of the axis it lies in.
+/// Joins the discs into one spectrum. Neighbouring discs are separated at a frequency, and every root is taken from the
+/// disc on its side.
 pub(super) fn assemble(found: &[Found], band_rad_s: f64) -> FullSpectrum {
     let mut chosen: Vec<(FullRoot, usize, usize)> = vec![];
     let (mut from, mut half_width) = (0.0, f64::INFINITY);
     for (index, part) in found.iter().enumerate() {
         let [_, high] = part.disc.stretch_rad_s();
         let to: f64 = match found.get(index + 1) {
-            // The middle of what both cover.
+            // The middle of the overlap.
             Some(next) => {
                 let [low, _] = next.disc.stretch_rad_s();
                 (0.5 * (high.min(next.disc.shift_rad_s) + low.max(part.disc.shift_rad_s))).max(from).min(band_rad_s)
@@ -130,7 +135,7 @@ pub(super) fn assemble(found: &[Found], band_rad_s: f64) -> FullSpectrum {
             if omega < from || omega > to || (omega == to && !last) {
                 continue;
             }
-            // One on the border may have been found just before it too.
+            // A root at the separating frequency may have been taken from the disc below already.
             let again = |other: &(FullRoot, usize, usize)| {
                 other.1 != index && (other.0.lambda - root.lambda).norm() <= SAME * root.lambda.norm()
             };

@@ -1,5 +1,5 @@
-//! A full model at one operating point, and its roots around a shift: products with its matrices, the inverse that Krylov-Schur
-//! takes, residuals of what it finds.
+//! The eigenvalue problem of a full model at one operating point: products with its matrices, the shift-inverted
+//! operator for Krylov-Schur, and residuals of the roots found around a shift.
 
 use faer::linalg::solvers::Solve;
 use faer::sparse::linalg::solvers::Lu;
@@ -15,17 +15,18 @@ use super::sparse::{entries, one_norm, times, times_transposed};
 use super::{ReductionError, SparseMatrix};
 use crate::physics::OperatingPoint;
 
-/// Residual a pair of the inverse may have, relative to its `θ`.
+/// Largest residual of an eigenpair of the inverse, relative to its `θ`.
 const KRYLOV_LIMIT: f64 = 1e-12;
-/// Residual a root may have, relative to the size of its parts. A pair `(θ, x)` of the inverse that leaves `e` leaves `Q(s) e/θ` in the
-/// problem itself: at most [`KRYLOV_LIMIT`] times the parts at the shift, which are those at the root but for the mass, of no more weight
-/// than the stiffness: twice as much. Linearised, both halves of the vector leave as much.
+/// Largest backward error of a root, see [`FullRoot::residual`]. An eigenpair `(θ, x)` of the inverse with residual `e`
+/// has the residual `Q(s) e/θ` in the original problem. That is at most [`KRYLOV_LIMIT`] times the norms at the shift.
+/// They differ from the norms at the root by the mass term only, which weighs no more than the stiffness: a factor of
+/// 2. Linearisation doubles it again, because both halves of the vector contribute.
 const RESIDUAL_LIMIT: f64 = 4.0 * KRYLOV_LIMIT;
-/// Imaginary part, relative to `|λ|`, below which a root does not oscillate.
+/// Imaginary part, relative to `|λ|`, below which a root counts as non-oscillating.
 const REAL: f64 = 1e-9;
-/// `|λ²|`, relative to that of the shift, of a body that floats freely.
+/// `|λ²|`, relative to that of the shift, below which a root is a rigid-body mode and counts as 0.
 const FLOATING: f64 = 1e-10;
-/// Columns that residuals are computed of at once.
+/// Number of columns whose residuals are computed at a time.
 const TOGETHER: usize = 8;
 const ZERO: c64 = c64::new(0.0, 0.0);
 
@@ -37,11 +38,11 @@ pub(super) struct Problem<'a> {
     vectors: FullVectors,
     pub undamped: bool,
     low_rank: LowRank,
-    /// `M`, `C`, `K` as they are, of a system.
+    /// Assembled `M`, `C`, `K`; `None` for a model of parts joined by contact.
     matrices: Option<[SparseMatrix; 3]>,
-    /// 1-norms of `M`, `C`, `K`.
+    /// 1-norms of `M`, `C`, `K`; estimates for a model of parts.
     norms: [f64; 3],
-    /// Growth rates that are to be covered, 1/s.
+    /// Magnitude of growth rate that the discs must cover, 1/s.
     growth_per_s: f64,
 }
 
@@ -57,7 +58,8 @@ impl<'a> Problem<'a> {
         if by_parts {
             let low_rank = model.low_rank(p);
             let largest = |matrix: &dyn Fn(usize) -> f64| (0..model.parts.len()).map(matrix).fold(0.0, f64::max);
-            // Pair by pair, |leftᵀ k right|₁ is at most |k| |left|₁ |right|∞; pairs share few columns.
+            // 1-norm of one contact pair: `|leftᵀ k right|₁ ≤ |k| |left|₁ |right|∞`. The largest pair stands for the
+            // sum, because pairs share few columns.
             let pairs = |weights: &[f64]| {
                 let size = |k: usize| {
                     let left: f64 = low_rank.left[k].iter().map(|(_, weight)| weight.abs()).sum();
@@ -90,10 +92,10 @@ impl<'a> Problem<'a> {
         })
     }
 
-    /// `(a M + b C + c K) X`, or with the transposed matrices.
+    /// `(a M + b C + c K) X`, or `(a M + b C + c K)ᵀ X` if `transposed`.
     fn times(&self, [a, b, c]: [c64; 3], x: MatRef<'_, c64>, transposed: bool) -> Mat<c64> {
         let k = x.ncols();
-        // Real matrices times real and imaginary parts side by side.
+        // Real matrices multiply the real and imaginary parts as separate columns.
         let parts = Mat::from_fn(x.nrows(), 2 * k, |i, j| if j < k { x[(i, j)].re } else { x[(i, j - k)].im });
         let product = |which: usize| match (&self.matrices, which) {
             (Some(matrices), _) if transposed => times_transposed(&matrices[which], parts.as_ref()),
@@ -114,7 +116,7 @@ impl<'a> Problem<'a> {
         sum
     }
 
-    /// `|(λ² M + λ C + K) x|` relative to the size of its parts, of every column.
+    /// Backward error of every column, see [`FullRoot::residual`]; with `transposed` matrices for left vectors.
     fn residuals(&self, lambdas: &[c64], x: MatRef<'_, c64>, transposed: bool) -> Vec<f64> {
         let mut residuals = vec![];
         let one = c64::new(1.0, 0.0);
@@ -135,7 +137,7 @@ impl<'a> Problem<'a> {
         residuals
     }
 
-    /// The residual of one solve at a shift, relative to the size of its parts.
+    /// Backward error of one solve with a random right-hand side at a shift, relative to `|Q| |x| + |b|`.
     pub fn solve_residual(&self, shifted: &Shifted) -> f64 {
         let s = c64::new(0.0, shifted.square.sqrt());
         let b = random::<c64>(self.model.dimension(), 1, 77);
@@ -151,7 +153,7 @@ impl<'a> Problem<'a> {
         shifted.couple(&self.low_rank, weights, transposed)
     }
 
-    /// The roots nearest to a shift of a model of parts.
+    /// The roots nearest to a shift, for a model of parts joined by contact.
     pub fn around_parts(
         &mut self,
         shifted: &Shifted,
@@ -161,7 +163,7 @@ impl<'a> Problem<'a> {
         let (square, omega) = (shifted.square, shifted.square.sqrt());
         if !self.undamped {
             let s = c64::new(0.0, omega);
-            // Either way round is made once.
+            // Solvers with `Q(s)` and with its transpose, each set up once.
             let (forward, backward) = (self.coupled(shifted, s, false), self.coupled(shifted, s, true));
             let solve =
                 |b: MatRef<'_, c64>, transposed: bool| if transposed { backward.solve(b) } else { forward.solve(b) };
@@ -172,7 +174,7 @@ impl<'a> Problem<'a> {
         let inverse = |x: Mat<f64>, transposed: bool| {
             coupled[usize::from(transposed)].solve(self.model.mass_times(x.as_ref()).as_ref())
         };
-        // Both of ±λ have the same vector; those that oscillate are listed once.
+        // `±λ` share a vector. Oscillating roots are listed once, static ones with both signs.
         let lambdas_of = |theta: c64| {
             let kappa = 1.0 / theta + square;
             if kappa.norm() < FLOATING * square {
@@ -189,7 +191,7 @@ impl<'a> Problem<'a> {
         self.around(omega, gap, &inverse, &lambdas_of, progress)
     }
 
-    /// The roots nearest to a shift of a system.
+    /// The roots nearest to a shift, for assembled matrices.
     pub fn around_system(
         &mut self,
         omega: f64,
@@ -221,7 +223,8 @@ impl<'a> Problem<'a> {
         self.linearised(omega, gap, &solve, progress)
     }
 
-    /// The roots nearest to `iω` by the linearised problem, `solve` giving `Q(iω)⁻¹ b` or `Q(iω)⁻ᵀ b`.
+    /// The roots nearest to `iω` by the linearised problem. `solve` returns `Q(iω)⁻¹ b`, or `Q(iω)⁻ᵀ b` if its second
+    /// argument is true.
     fn linearised(
         &self,
         omega: f64,
@@ -231,7 +234,7 @@ impl<'a> Problem<'a> {
     ) -> Result<Found, ReductionError> {
         let n = self.model.dimension();
         let (s, one) = (c64::new(0.0, omega), c64::new(1.0, 0.0));
-        // Velocities are divided by ω, so that both halves of a vector weigh alike.
+        // Velocities are divided by ω, so that both halves of a vector have similar magnitude.
         let inverse = |v: Mat<c64>, transposed: bool| {
             let (x, y) = (v.subrows(0, n), v.subrows(n, n));
             let b = self.times([c64::new(-omega, 0.0), ZERO, ZERO], y, transposed)
@@ -248,8 +251,9 @@ impl<'a> Problem<'a> {
         self.around(omega, gap, &inverse, &lambdas_of, progress)
     }
 
-    /// The roots nearest to `iω`, `lambdas_of` the largest `θ` of `inverse`: real of size `n`, in `κ`, or complex of size
-    /// `2n`, in `λ`. Left vectors are those of the transposed problem.
+    /// The roots nearest to `iω`, from the largest eigenvalues `θ` of `inverse`; `lambdas_of` maps `θ` to roots. The
+    /// operator is real of size `n`, in `κ`, or complex of size `2n`, in `λ`. Left vectors are computed as eigenvectors
+    /// of the transposed problem.
     fn around<T: Number>(
         &self,
         omega: f64,
@@ -289,7 +293,10 @@ impl<'a> Problem<'a> {
         self.finish(disc, found, left, lambdas_of)
     }
 
-    /// Roots with residuals and the vectors that are wanted.
+    /// Roots with their residuals and the requested vectors.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Residual`; `MissedRoot` if a root has no partner among those of the transposed problem.
     fn finish(
         &self,
         disc: CoveredDisc,
@@ -318,7 +325,7 @@ impl<'a> Problem<'a> {
             None => Mat::zeros(n, 0),
             Some(left) => {
                 let mut of_left = listed(&left.theta);
-                // Where roots merge, those of the transposed problem differ by the square root of rounding.
+                // Near merging roots, the roots of the transposed problem differ by the square root of rounding errors.
                 let (mut columns, mut own) = (vec![], vec![]);
                 for lambda in &lambdas {
                     let off = |other: &(c64, usize)| (other.0 - lambda).norm();
@@ -354,7 +361,10 @@ impl<'a> Problem<'a> {
         Ok(Found { disc, roots, right, left })
     }
 
-    /// Residuals, all of them small.
+    /// Residuals of all pairs.
+    ///
+    /// # Errors
+    /// [`ReductionError::Residual`] for the first one above [`RESIDUAL_LIMIT`].
     fn checked(&self, lambdas: &[c64], x: &Mat<c64>, transposed: bool) -> Result<Vec<f64>, ReductionError> {
         let residuals = self.residuals(lambdas, x.as_ref(), transposed);
         match residuals.iter().enumerate().find(|(_, value)| value.is_nan() || **value > RESIDUAL_LIMIT) {
@@ -366,7 +376,7 @@ impl<'a> Problem<'a> {
     }
 }
 
-/// Columns scaled to norm 1.
+/// Scales every column to 2-norm 1.
 pub(super) fn unit(mut vectors: Mat<c64>) -> Mat<c64> {
     for k in 0..vectors.ncols() {
         let norm = vectors.col(k).norm_l2();
