@@ -1,4 +1,5 @@
-//! A parametric basis: tens of vectors on which a full model has the roots it has, over a box of operating points.
+//! A parametric basis: tens of vectors on which a reduced model keeps the roots of the full model over a whole box of
+//! operating points.
 //!
 //! ```text
 //! Q(λ, p) = λ² M + λ C(p) + K(p),   Q x = 0,   yᴴ Q = 0
@@ -6,19 +7,22 @@
 //! |Δλ| ≈ |(V w)-residual|_S⁻¹ |(V z)-residual|_S⁻¹ / |wᴴ Vᵀ Q' V z|,   S = sym K + σ M
 //! ```
 //!
-//! With right and left vectors in the span the error of a root is the product of two small things. Three steps:
+//! With right and left eigenvectors in the span, the error of a root is of second order: the product of the right and
+//! the left residual. The basis is built in three steps:
 //!
-//! 1. Greedy: where the estimate over a training set is worst, the full model is solved and its vectors are added. The
-//!    estimate is scaled by the largest ratio of true error to estimate that the solves have shown.
-//! 2. The vectors found, each at its own weight, are cut to the fewest that hold the tolerance at all training points:
-//!    singular value decomposition in the norm of `S`, in which a part left out counts as it moves the root.
-//! 3. Held-out points: every root of the full model there against those on the basis. A point that fails is added to the
-//!    sampled ones, and other points are held out.
+//! 1. Greedy sampling. The full model is solved at the training point with the largest error estimate, and its vectors
+//!    are added. The estimate is scaled by the largest ratio of true error to estimate observed so far.
+//! 2. Truncation. A singular value decomposition of the sampled vectors, in the norm of `S`, is cut to the fewest
+//!    leading vectors that hold the tolerance at all training points. Each vector is scaled so that an omitted
+//!    component counts by the change of the root that it causes.
+//! 3. Validation. At held-out points all roots of the full model are compared with those of the reduced one. A point
+//!    that fails becomes a sample, and new held-out points are drawn.
 //!
-//! Contact whose stiffness varies with load is a term like any other, and load is sampled like friction. Vectors split into one
-//! for each substructure would hold for any stiffness, but there must be more of them: a tribometer of 5049 degrees of freedom
-//! over friction coefficients of 0 to 1 and loads of 50 to 2000 N, exponent 1/3, tolerance 1e-6, took 69 whole ones (1.4e-7 held
-//! out), 93 split (2.8e-7), from four points each.
+//! Load-dependent contact stiffness is a term like any other, and load is sampled like friction. Splitting every vector
+//! into one per substructure would make the basis valid for any contact stiffness, but needs more vectors. Example: a
+//! tribometer of 5049 degrees of freedom, friction coefficients of 0 to 1, loads of 50 to 2000 N, exponent 1/3,
+//! tolerance 1e-6, four sampled points each. Unsplit vectors: 69, error 1.4e-7 at the held-out points. Split vectors:
+//! 93, error 2.8e-7.
 //!
 //! # Source
 //! Gräbner, Mehrmann, Quraishi, Schröder, von Wagner, "Numerical methods for parametric model reduction in the simulation
@@ -37,93 +41,100 @@ use super::sparse::{SparseMatrix, transposed};
 use super::{FullProgress, FullSolver, FullSpectrum, FullVectors, ReductionError, weighted_sum};
 use crate::physics::{Model, OperatingPoint, Solver, Spectrum, Vectors};
 
-/// Share of the tolerance that training points must hold, so that held-out ones do.
+/// Fraction of the tolerance that the estimate must meet at training points, so that held-out points meet the
+/// tolerance.
 const TRAINING_SHARE: f64 = 0.3;
-/// Vectors are taken from roots a little beyond the band and the growth floor: they may cross it elsewhere in the box.
+/// Vectors are also taken from roots slightly beyond the band and below the growth floor: such roots may enter the
+/// counted region elsewhere in the box.
 const BAND_MARGIN: f64 = 1.02;
 const FLOOR_MARGIN: f64 = 1.5;
-/// A vector whose part outside the span is below this times the square root of the tolerance adds nothing.
+/// A vector is not added if its component outside the span is below this times the square root of the tolerance.
 const NEGLIGIBLE: f64 = 0.01;
-/// Parts of a vector below this, relative to it, are rounding: the root of what a Gram matrix resolves.
+/// Components of a vector below this, relative to its length, are rounding errors: the square root of the resolution of
+/// a Gram matrix.
 const ROUNDED: f64 = 1e-7;
-/// Largest part of the band at which the shift `σ` of `S` lies: it only keeps rigid motions from being free.
+/// Square root of the shift `σ` of `S`, relative to the end of the band. The shift only makes `S` definite where the
+/// model has rigid-body modes.
 const SHIFT: f64 = 0.05;
-/// Columns that are multiplied with `S` at once.
+/// Number of columns multiplied with `S` at a time.
 const TOGETHER: usize = 16;
-/// Roots whose residuals are found at once, and the copies of their columns that there are meanwhile: the vectors, three
-/// products in two layouts, residuals twice, and three while they are solved for.
+/// Number of roots whose residuals are computed at a time, and the number of copies of their columns held meanwhile:
+/// the vectors, three products in two memory layouts, two of the residuals, and three during the solve.
 const ROOTS_TOGETHER: usize = 8;
 const ESTIMATING: usize = 12;
-/// Times that held-out points may fail before it is given up.
+/// Largest number of rounds of validation.
 const MOST_ROUNDS: usize = 4;
 
-/// What is asked of a parametric basis.
+/// Requirements of a parametric basis.
 #[derive(Clone, Debug)]
 pub struct ParametricRequest {
     pub range: OperatingBox,
     pub counted: Counted,
-    /// Largest `|Δλ|/|λ|` of a root that counts.
+    /// Largest `|Δλ|/|λ|` of a counted root.
     pub tolerance: f64,
-    /// Points at which the estimate is computed, beside the corners of the box and its middle.
+    /// Number of training points, at which the error is estimated, in addition to the corners and the middle of the
+    /// box.
     pub training: usize,
-    /// Points held out.
+    /// Number of held-out points for validation.
     pub held_out: usize,
-    /// Points of the full model after which it is given up.
+    /// Largest number of sampled points.
     pub most_samples: usize,
-    /// Vectors after which it is given up.
+    /// Largest number of vectors in the basis.
     pub most_vectors: usize,
 }
 
-/// What is being done.
+/// Progress of the construction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ParametricStep {
-    /// The bytes that will be needed beside what was held before the solver was made.
+    /// Estimated bytes needed in addition to what was held before the solver was made.
     Planned { bytes: usize },
-    /// The full model is being solved.
+    /// Progress of a solve of the full model.
     Solving(FullProgress),
-    /// The estimate has been computed at so many training points.
+    /// The error has been estimated at `done` of `of` training points.
     Estimating { done: usize, of: usize },
-    /// The full model is solved at a point.
+    /// A solve of the full model at a sampled point starts.
     Sampling { point: OperatingPoint, sample: usize },
-    /// It had this many roots that count; the span has this many vectors; the estimate there was so many times too small.
+    /// The sampled point has `roots` counted roots, and the span now has `vectors` vectors. `true_over_estimate` is the
+    /// largest ratio of true error to estimate at this point; NaN without estimates.
     Sampled { roots: usize, vectors: usize, true_over_estimate: f64 },
-    /// The estimate has been computed at all training points; this is the worst, scaled.
+    /// The error has been estimated at all training points. `worst` is the largest scaled estimate of `|Δλ|/|λ|`.
     Estimated { worst: f64, vectors: usize },
-    /// So many vectors leave this error at the training points.
+    /// A basis of `vectors` leading vectors has the error `worst` at the training points.
     Cut { vectors: usize, worst: f64 },
-    /// A held-out point was solved, the `done`th of so many.
+    /// A held-out point, the `done`th of `of`, was solved and compared.
     HeldOut { point: OperatingPoint, worst: f64, done: usize, of: usize },
 }
 
-/// A held-out point and what was found there.
+/// A held-out point and its comparison of full and reduced roots.
 #[derive(Clone, Debug)]
 pub struct HeldOut {
     pub point: OperatingPoint,
     pub comparison: RootMatch,
 }
 
-/// A basis and how good it is.
+/// A parametric basis and its validation.
 #[derive(Clone, Debug)]
 pub struct ParametricBasis {
     pub projected: Projected,
-    /// Where the full model was solved for vectors.
+    /// Points at which the full model was solved for vectors.
     pub sampled: Vec<OperatingPoint>,
     pub held_out: Vec<HeldOut>,
-    /// Largest ratio of true error to estimate that was seen.
+    /// Largest observed ratio of true error to estimate, at least 1.
     pub true_over_estimate: f64,
 }
 
 impl ParametricBasis {
-    /// The largest `|Δλ|/|λ|` at the held-out points; infinite where a root was missed or invented.
+    /// Largest `|Δλ|/|λ|` at the held-out points; infinite if a root was missed or invented.
     pub fn worst(&self) -> f64 {
         self.held_out.iter().map(|held| held.comparison.worst()).fold(0.0, f64::max)
     }
 }
 
-/// Builds a basis of `full`, which `solver` solves.
+/// Builds a parametric basis of `full`; `solver` is a solver of the same model.
 ///
 /// # Errors
-/// [`ReductionError`]: `Range`, `Tolerance` where it could not be held, those of the solves.
+/// [`ReductionError`]: `Range`; `Tolerance` if the tolerance cannot be held within the limits of the request; those of
+/// the solves.
 pub fn parametric_basis(
     full: &FullModel,
     solver: &mut FullSolver<'_>,
@@ -203,7 +214,7 @@ pub fn parametric_basis(
     Err(failed(last, build.span.ncols(), build.sampled.len()))
 }
 
-/// `S = sym K + σ M` at the middle of the box without friction.
+/// The metric `S = sym K + σ M` at the middle of the box, without friction.
 struct Metric<'a> {
     full: &'a FullModel,
     middle: OperatingPoint,
@@ -256,7 +267,7 @@ fn oscillating(spectrum: &Spectrum) -> Vec<c64> {
     spectrum.modes().iter().map(|root| root.lambda).collect()
 }
 
-/// Reduced roots, each with the estimate of its relative error.
+/// Reduced roots, each with the estimate of its relative error `|Δλ|/|λ|`.
 type Estimates = Vec<(c64, f64)>;
 
 struct Building<'a, 'm> {
@@ -264,16 +275,17 @@ struct Building<'a, 'm> {
     solver: &'a mut FullSolver<'m>,
     request: &'a ParametricRequest,
     metric: Metric<'a>,
-    /// `S`, where the model is no two parts that touch.
+    /// Factorises `S` for models that are not just parts joined by contact; `None` for those that are.
     pencil: Option<Pencil<'a>>,
-    /// Roots in the band.
+    /// Estimated number of roots in the band.
     most_roots: usize,
-    /// Orthonormal in `S`.
+    /// `S`-orthonormal vectors, `n×r`.
     span: Mat<f64>,
-    /// Coefficients of the vectors found in `span`, one block for each point; rows of later vectors are 0.
+    /// Coefficients in `span` of the vectors of each sampled point, one block per point. Rows of vectors that joined
+    /// the span later are absent and count as 0.
     snapshots: Vec<Mat<f64>>,
     sampled: Vec<OperatingPoint>,
-    /// All roots in the band at the sampled points.
+    /// All oscillating roots in the band at the sampled points.
     known: Vec<(OperatingPoint, Vec<c64>)>,
     true_over_estimate: f64,
 }
@@ -287,12 +299,12 @@ impl Building<'_, '_> {
         Solver::new(model.dimension()).solve(model, p, vectors).map_err(solve_failed)
     }
 
-    /// Makes room for one more sample; the bytes that are needed in all.
+    /// Checks the memory limit for one more sample; returns the bytes needed in all.
     ///
-    /// A sample brings four columns for every root: real and imaginary parts of right and left vectors. While the full model is
-    /// solved, and while the estimate is, there are the span and the reduced model's basis of it, and one more where that is
-    /// computed. The columns found are there five times when they join the span, which grows by them into another place. The cut
-    /// needs the span, the basis of it, and two candidates.
+    /// A sample adds four columns per root: real and imaginary parts of the right and the left vector. During a solve
+    /// of the full model or an estimate, memory holds the span, the basis of the reduced model and, while the latter is
+    /// computed, a copy. Adding columns takes five copies of them and a second copy of the span, which grows by
+    /// reallocation. The truncation takes the span, the basis of the reduced model and two candidate bases.
     fn make_room(&mut self) -> Result<usize, ReductionError> {
         let column = size_of::<f64>() * self.full.dimension();
         let columns = 4 * self.most_roots;
@@ -303,8 +315,8 @@ impl Building<'_, '_> {
         self.solver.make_room(FullVectors::Both, self.most_roots, beside, other)
     }
 
-    /// Solves the full model at `point` and adds what it finds; `estimates` were the reduced roots there with the
-    /// estimates of their errors.
+    /// Solves the full model at `point` and adds its vectors to the span. `estimates` are the reduced roots at that
+    /// point with their error estimates, if known; they calibrate the estimate.
     fn sample(
         &mut self,
         point: OperatingPoint,
@@ -327,7 +339,7 @@ impl Building<'_, '_> {
         for (reduced, estimate) in estimates.unwrap_or_default() {
             let nearest =
                 counting.iter().map(|root| (root - reduced).norm() / root.norm()).fold(f64::INFINITY, f64::min);
-            // Rounding of dense and sparse solves says nothing of the estimate.
+            // Errors at the level of rounding, and wrong pairs, do not calibrate the estimate.
             if nearest > 1e-11 && nearest < 1e-2 && *estimate > 0.0 {
                 ratio = ratio.max(nearest / estimate);
             }
@@ -349,8 +361,8 @@ impl Building<'_, '_> {
         Ok(())
     }
 
-    /// Real and imaginary parts of right and left vectors, of such size that a part `d` left out of both moves the root by
-    /// about `dᵀ S d` times `|λ|`.
+    /// Real and imaginary parts of right and left vectors, `n×(4·chosen)`. They are scaled so that a component `d`
+    /// omitted from both moves the root by about `dᵀ S d` times `|λ|`.
     fn columns(&self, p: &OperatingPoint, spectrum: &FullSpectrum, chosen: &[usize]) -> Mat<f64> {
         let n = self.full.dimension();
         let mut columns = Mat::<f64>::zeros(n, 4 * chosen.len());
@@ -371,7 +383,8 @@ impl Building<'_, '_> {
                 (0..n).map(|i| (at(&of_root, i, side).conj() * at(&of_mass, i, side)).re).sum::<f64>().sqrt()
             };
             let lengths = [length(0), length(1)];
-            // |y|_M |x|_M / |yᴴ Q' x| is 1/(2|λ|) of a real mode and grows without limit where two roots merge.
+            // `|y|_M |x|_M / |yᴴ Q' x|` is `1/(2|λ|)` for a real mode and unbounded where two roots merge, hence the
+            // cap.
             let condition = (lengths[0] * lengths[1] / (slope.norm() * lambda.norm())).sqrt().min(10.0 / lambda.norm());
             for (side, length) in lengths.into_iter().enumerate() {
                 let scaled = faer::Scale(condition / length) * of_root.subcols(2 * side, 2);
@@ -381,7 +394,7 @@ impl Building<'_, '_> {
         columns
     }
 
-    /// Adds to the span what `columns` have outside of it, and remembers their coefficients.
+    /// Extends the span by the components of `columns` outside it, and stores the coefficients of `columns`.
     fn extend(&mut self, columns: Mat<f64>) -> Result<(), ReductionError> {
         let held = self.span.ncols();
         let mut coefficients = Mat::<f64>::zeros(held, columns.ncols());
@@ -404,7 +417,7 @@ impl Building<'_, '_> {
         let turn = Mat::from_fn(vectors.nrows(), kept.len(), |i, k| vectors[(i, kept[k])] / squares[kept[k]].sqrt());
         let mut added = &rest * &turn;
         drop(rest);
-        // What the Gram matrix rounds away from orthogonality, twice is enough.
+        // The Gram matrix leaves rounding errors of orthogonality; two passes remove them.
         for _ in 0..2 {
             let step = self.span.transpose() * self.metric.times(added.as_ref());
             added -= &self.span * &step;
@@ -422,7 +435,8 @@ impl Building<'_, '_> {
         Ok(())
     }
 
-    /// Adds points until the scaled estimate holds everywhere; the model on the whole span.
+    /// Samples points until the scaled estimate holds at all training points; returns the model projected on the whole
+    /// span.
     fn enrich(
         &mut self,
         training: &[OperatingPoint],
@@ -454,7 +468,7 @@ impl Building<'_, '_> {
         }
     }
 
-    /// The point with the largest estimate, all estimates there, and that one; none without points.
+    /// Point with the largest estimate, all estimates there, and the largest one; `None` without points.
     fn worst_estimate(
         &mut self,
         model: &Model,
@@ -498,7 +512,7 @@ impl Building<'_, '_> {
         Ok(worst)
     }
 
-    /// Every reduced root that counts, with the estimate of its relative error.
+    /// Error estimate of every counted reduced root.
     fn estimates(&self, inverse: &Inverse<'_>, projected: &Projected, spectrum: &Spectrum) -> Estimates {
         let counts = |k: &usize| self.request.counted.counts(spectrum.roots[*k].lambda);
         let wanted: Vec<usize> = (0..spectrum.mode_count).filter(counts).collect();
@@ -509,14 +523,14 @@ impl Building<'_, '_> {
         });
         let estimate = |(j, &k): (usize, &usize)| {
             let lambda = spectrum.roots[k].lambda;
-            // The left vectors of a damped root have yᴴ Q' x = 1, those of an undamped one 2 λ.
+            // Left vectors are normalised to `yᴴ Q' x = 1` for a damped spectrum; for an undamped one `yᴴ Q' x = 2λ`.
             let slope = if spectrum.undamped { 2.0 * lambda.norm() } else { 1.0 };
             (lambda, norms[0][j] * norms[1][j] / (slope * lambda.norm()))
         };
         wanted.iter().enumerate().map(estimate).collect()
     }
 
-    /// `|Q V z|` or, of left vectors, `|Qᴴ V w|` in the norm of `S⁻¹`.
+    /// `S⁻¹`-norms of the residuals `Q V z` or, for left vectors, `Qᴴ V w`, one per root.
     fn residual_norms(
         &self,
         inverse: &Inverse<'_>,
@@ -548,12 +562,13 @@ impl Building<'_, '_> {
         }
         let solved = inverse(residuals.clone());
         let square = |j: usize| residuals.col(j).transpose() * solved.col(j);
-        // What rounded below zero is nothing; what is no number must not pass for nothing in a maximum.
+        // A negative square is a rounding error. NaN becomes infinity, because taking a maximum would ignore NaN.
         let size = |square: f64| if square.is_nan() { f64::INFINITY } else { square.max(0.0).sqrt() };
         (0..roots.len()).map(|j| size(square(2 * j) + square(2 * j + 1))).collect()
     }
 
-    /// The model on the fewest leading singular vectors of the snapshots that hold the tolerance at all training points.
+    /// Projects the model on the fewest leading singular vectors of the snapshots that hold the tolerance at all
+    /// training points; the number is found by bisection.
     fn cut(
         &self,
         wide: &Projected,
@@ -573,7 +588,7 @@ impl Building<'_, '_> {
         }
         let covariance = Mat::from_fn(size, size, |i, j| covariance[(i.max(j), i.min(j))]);
         let (_, vectors) = symmetric_eigen("parametric basis", covariance.as_ref())?;
-        // From the coordinates of the span to those of `wide`.
+        // Change of coordinates from the span to `wide.basis`.
         let turn = self.span.transpose() * self.metric.times(wide.basis.as_ref());
         let mut leading = Mat::from_fn(size, size, |i, k| vectors[(i, size - 1 - k)]);
         turn.partial_piv_lu().solve_in_place(leading.as_mut());
@@ -599,7 +614,7 @@ impl Building<'_, '_> {
         let (mut enough, mut found) = (size, None);
         let counted = self.request.counted;
         let counting = |roots: &Vec<c64>| roots.iter().filter(|lambda| counted.counts(**lambda)).count();
-        // Fewer vectors than roots cannot do.
+        // A basis needs at least as many vectors as counted roots.
         let mut few = self.known.iter().map(|(_, roots)| counting(roots)).max().unwrap_or(0).min(size - 1);
         while enough > few + 1 {
             let middle = (enough + few) / 2;
@@ -680,8 +695,8 @@ mod tests {
         1.0 / (0..n).map(|i| solved[(i, i)]).sum::<c64>().norm()
     }
 
-    /// On fewer vectors than degrees of freedom the roots of the full model, over load, speed and friction, damped and
-    /// unsymmetric; every root that counts is a root of `det Q` within the tolerance, at points held out and at others.
+    /// A damped, unsymmetric model over load, speed and friction: every counted root of the reduced model is a root of
+    /// `det Q` within the tolerance at the held-out points, with fewer vectors than degrees of freedom.
     #[test]
     fn a_basis_holds_its_tolerance_where_it_was_not_sampled() {
         let full = chains(5.0, LAW);
@@ -697,7 +712,8 @@ mod tests {
             let reduced = Solver::new(count).solve(&model, &held.point, Vectors::None).unwrap();
             for lambda in oscillating(&reduced).into_iter().filter(|lambda| request.counted.counts(*lambda)) {
                 let error = newton_step(&full, &held.point, lambda) / lambda.norm();
-                // A root just above the floor is held like any other; Newton's step is first order in the error.
+                // Roots just above the growth floor meet the tolerance too. Newton's step equals the error to first
+                // order.
                 assert!(error <= 1.1e-6, "{:?} {lambda}: {error:e}", held.point);
             }
         }
@@ -709,7 +725,7 @@ mod tests {
         let few = ParametricRequest { most_vectors: 9, ..request(1e-6) };
         let told = parametric_basis(&full, &mut solver(&full), &few, &mut |_| {}).map(|_| ()).unwrap_err().to_string();
         assert!(told.contains("at most 9 vectors") && told.contains("limit 1.0e-6"), "{told}");
-        // Below what a dense solve resolves.
+        // A tolerance below the rounding of a dense solve.
         let rarely = ParametricRequest { most_samples: 2, ..request(1e-16) };
         let told =
             parametric_basis(&full, &mut solver(&full), &rarely, &mut |_| {}).map(|_| ()).unwrap_err().to_string();
