@@ -1,10 +1,14 @@
-//! A reduced model against the full one: roots at operating points, windows of instability over the friction coefficient.
+//! Comparison of a reduced model with the full one: roots at operating points, and windows of instability over the
+//! friction coefficient.
 //!
-//! Roots are paired off, nearest first. A full root that grows and whose partner does not is *missed*; a reduced one that
-//! grows and whose partner does not is *invented*. The windows of the full model are those of its projection on its own
-//! right and left vectors at a few friction coefficients, to which ends of the windows are added, a few at a time, until all
-//! stay where they are: near a merging point `λ` has half the digits, the ends of windows have all of them. What no sample saw
-//! would be missed in silence, so that the projection is then held against the full model between the samples.
+//! Roots are paired one to one, nearest first. An unstable full root whose partner is stable or absent is *missed*. An
+//! unstable reduced root whose partner is stable or absent is *invented*.
+//!
+//! Windows of the full model are computed from a projection of it. The basis consists of right and left vectors at a
+//! few friction coefficients. Vectors at window ends are added, a few at a time, until all ends stay fixed. Window ends
+//! then have full accuracy, although `λ` itself has only half the digits near a merging point. Finally the projection
+//! is checked against the full model at friction coefficients between the samples, because a mode absent from every
+//! sample would otherwise go unnoticed.
 
 use faer::{Mat, c64};
 
@@ -17,25 +21,26 @@ use crate::physics::{
     MapError, MapOptions, Model, ModelError, OperatingPoint, SolveError, Solver, StabilityMap, Vectors, Window,
 };
 
-/// What of a vector the others do not hold, relative to its length, below which it adds nothing: right and left vectors
-/// together leave its square to the roots.
+/// Length, relative to the vector, of its component outside the basis below which it is not added. With right and left
+/// vectors in the basis the error of a root is of the order of the square of this.
 const NEW: f64 = 1e-6;
-/// Roots that are damped more than this cannot become unstable by anything that their vectors would show.
+/// Damping ratio above which a root is assumed unable to become unstable; its vectors are not added.
 const DAMPED: f64 = 0.05;
-/// Ends of windows of the full model that move by less than this are found.
+/// Change of the friction coefficient of a window end below which it is converged.
 const STILL: f64 = 1e-8;
-/// Ends of windows at which vectors are added in a round.
+/// Number of window ends at which vectors are added per round.
 const ADDED: usize = 3;
-/// Rounds of adding them.
+/// Largest number of rounds.
 const MOST_ROUNDS: usize = 16;
-/// Friction coefficients at which the projection is held against the full model once the ends of windows are still.
+/// Number of friction coefficients at which the projection is checked against the full model once the window ends have
+/// converged.
 const CHECKS: usize = 2;
-/// Relative error of a root of the projection there, up to which it has seen everything.
+/// Largest relative error of a root in that check.
 const CHECKED: f64 = 1e-6;
-/// Roots of full and reduced model further apart than this, relative to `|λ|`, are no pair.
+/// Largest distance of paired roots, relative to `|λ|`.
 const PAIRED: f64 = 0.2;
 
-/// Why nothing could be compared.
+/// Error of a comparison.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CompareError {
     #[error("full model: {0}")]
@@ -55,44 +60,44 @@ pub enum CompareError {
     NotHeld { error: f64, rounds: usize, limit: f64 },
 }
 
-/// What is judged.
+/// Scope and threshold of a comparison.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Judged {
     /// Highest frequency, rad/s.
     pub band_rad_s: f64,
-    /// A root is unstable when `σ` exceeds this times `|λ|`.
+    /// A root is unstable if its growth rate `σ` exceeds this times `|λ|`.
     pub instability_threshold: f64,
-    /// Roots that decay faster than this are not compared, 1/s.
+    /// Full roots that decay faster than this are not compared, 1/s.
     pub decay_per_s: f64,
 }
 
-/// Roots of both models at one operating point.
+/// Comparison of the roots of both models at one operating point.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Comparison {
-    /// Full root and reduced root, ascending in frequency.
+    /// Pairs of full root and reduced root, in the order of the full roots.
     pub pairs: Vec<(c64, c64)>,
-    /// Unstable roots of the full model that the reduced one does not have.
+    /// Unstable roots of the full model without an unstable partner.
     pub missed: Vec<c64>,
-    /// Unstable roots of the reduced model that the full one does not have.
+    /// Unstable roots of the reduced model without an unstable partner.
     pub invented: Vec<c64>,
-    /// Roots of the full model in the band without any partner.
+    /// Number of full roots within the scope that have no partner.
     pub unpaired: usize,
 }
 
 impl Comparison {
-    /// The largest `|Δf| / f`; 0 without oscillating pairs.
+    /// Largest relative frequency error `|Δf| / f`; 0 without oscillating pairs.
     pub fn frequency_error(&self) -> f64 {
         let of =
             |(full, reduced): &(c64, c64)| if full.im > 0.0 { (full.im - reduced.im).abs() / full.im } else { 0.0 };
         self.pairs.iter().map(of).fold(0.0, f64::max)
     }
 
-    /// The largest `|Δσ|`, 1/s.
+    /// Largest error of a growth rate `|Δσ|`, 1/s.
     pub fn growth_error_per_s(&self) -> f64 {
         self.pairs.iter().map(|(full, reduced)| (full.re - reduced.re).abs()).fold(0.0, f64::max)
     }
 
-    /// The largest `|Δλ| / |λ|`.
+    /// Largest relative error of a root `|Δλ| / |λ|`.
     pub fn relative_error(&self) -> f64 {
         let of = |(full, reduced): &(c64, c64)| (full - reduced).norm() / full.norm().max(f64::MIN_POSITIVE);
         self.pairs.iter().map(of).fold(0.0, f64::max)
@@ -127,7 +132,7 @@ pub fn compare_roots(full: &[c64], reduced: &[c64], judged: &Judged) -> Comparis
         }
     }
     for (j, &lambda) in reduced.iter().enumerate() {
-        // One just above the band may belong to a full root that was not looked for.
+        // A reduced root just above the band may belong to a full root that was not computed.
         let partner = of_full.iter().position(|partner| *partner == Some(j)).map(|i| full[i]);
         if unstable(lambda) && !partner.is_some_and(unstable) && (partner.is_some() || lambda.im <= judged.band_rad_s) {
             comparison.invented.push(lambda);
@@ -136,7 +141,7 @@ pub fn compare_roots(full: &[c64], reduced: &[c64], judged: &Judged) -> Comparis
     comparison
 }
 
-/// Roots of a reduced model at `p`, static ones of an undamped model with both signs.
+/// Roots of a reduced model at `p`. Static roots of an undamped model are listed with both signs.
 ///
 /// # Errors
 /// [`SolveError`].
@@ -150,17 +155,18 @@ pub fn reduced_roots(model: &Model, solver: &mut Solver, p: &OperatingPoint) -> 
     Ok(roots)
 }
 
-/// Windows of instability of both models, paired off.
+/// Comparison of the windows of instability of both models.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct WindowComparison {
-    /// Window of the full model and of the reduced one.
+    /// Pairs of a full and a reduced window.
     pub pairs: Vec<(Window, Window)>,
     pub missed: Vec<Window>,
     pub invented: Vec<Window>,
 }
 
 impl WindowComparison {
-    /// The largest difference of an end; at least that, where one of two windows goes on beyond `mu_max`.
+    /// Largest difference of a window end, in friction coefficient. If only one of two windows ends below `mu_max`, the
+    /// difference is taken to `mu_max`, a lower bound.
     pub fn friction_error(&self, mu_max: f64) -> f64 {
         let of = |(full, reduced): &(Window, Window)| {
             let to = match (full.mu_to, reduced.mu_to) {
@@ -174,7 +180,7 @@ impl WindowComparison {
     }
 }
 
-/// Pairs off windows: the same kind, frequencies within a fifth, the nearest ends first.
+/// Pairs windows of the same kind whose frequencies differ by at most a fifth, nearest first.
 pub fn compare_windows(full: &[Window], reduced: &[Window]) -> WindowComparison {
     let mut distances = vec![];
     for (i, a) in full.iter().enumerate() {
@@ -198,8 +204,8 @@ pub fn compare_windows(full: &[Window], reduced: &[Window]) -> WindowComparison 
     comparison
 }
 
-/// The windows of instability of a full model at the load and speed of `p`, from the friction coefficient 0 to
-/// `options.mu_max`; `options.band_max_hz` is the band.
+/// Windows of instability of a full model at the load and speed of `p`, for friction coefficients from 0 to
+/// `options.mu_max`. `band_rad_s` is the end of the band in rad/s, `options.band_max_hz` the same in Hz.
 ///
 /// # Errors
 /// [`CompareError`].
@@ -214,7 +220,8 @@ pub fn full_windows(
     let mut basis = Basis { columns: Mat::zeros(model.dimension(), 0) };
     let mut roots = 0;
     let mut sample = |mu: f64, columns: usize| -> Result<FullSpectrum, ReductionError> {
-        // Vectors found join the columns, which grow into another place; then there are these, products and a new basis.
+        // Memory: adding vectors takes the columns and a grown copy of them; projecting takes the columns, products
+        // with them and the new basis.
         let columns = size_of::<f64>() * model.dimension() * (columns + 4 * roots);
         solver.make_room(FullVectors::Both, roots, 2 * columns, 3 * columns)?;
         let found = solver.roots(&p.with_friction(mu), 1.1 * band_rad_s, FullVectors::Both, progress)?;
@@ -267,7 +274,7 @@ pub fn full_windows(
     })
 }
 
-/// The [`ADDED`] of `ends`, or fewer, that are farthest from what was `sampled` and from each other.
+/// At most [`ADDED`] of the `ends`: those farthest from the `sampled` friction coefficients and from each other.
 fn farthest(ends: &[f64], sampled: &[f64]) -> Vec<f64> {
     let mut known = sampled.to_vec();
     let mut chosen = vec![];
@@ -283,12 +290,12 @@ fn farthest(ends: &[f64], sampled: &[f64]) -> Vec<f64> {
     chosen
 }
 
-/// Whether vectors of a root are of interest: those damped more than [`DAMPED`] are not.
+/// Whether a root may become unstable: its damping ratio is below [`DAMPED`].
 fn may_grow(lambda: c64) -> bool {
     lambda.re > -DAMPED * lambda.norm()
 }
 
-/// The largest `|Δλ| / |λ|` of the full roots of the band that may grow; infinite where one of them has no partner.
+/// Largest `|Δλ| / |λ|` of the full roots in the band that may become unstable; infinite if one of them has no partner.
 fn error_of_projection(full: &FullSpectrum, projected: &[c64], band_rad_s: f64) -> f64 {
     let full: Vec<c64> = full.roots.iter().map(|root| root.lambda).filter(|lambda| may_grow(*lambda)).collect();
     let judged = Judged { band_rad_s, instability_threshold: f64::INFINITY, decay_per_s: f64::INFINITY };
@@ -296,18 +303,18 @@ fn error_of_projection(full: &FullSpectrum, projected: &[c64], band_rad_s: f64) 
     if compared.unpaired > 0 { f64::INFINITY } else { compared.relative_error() }
 }
 
-/// Orthonormal columns that span vectors of a full model.
+/// Orthonormal basis of eigenvectors of a full model.
 struct Basis {
     columns: Mat<f64>,
 }
 
 impl Basis {
-    /// Adds real and imaginary parts of right and left vectors, as far as they are new.
+    /// Adds the real and imaginary parts of right and left vectors, as far as they are outside the span.
     fn add(&mut self, found: &FullSpectrum) {
         let n = self.columns.nrows();
         for vectors in [&found.right, &found.left] {
             for k in (0..vectors.ncols()).filter(|&k| may_grow(found.roots[k].lambda)) {
-                // Turned so that a vector that is real but for a factor becomes real.
+                // Rotates the phase so that a real vector times a complex factor becomes real.
                 let square: c64 = (0..n).map(|i| vectors[(i, k)] * vectors[(i, k)]).sum();
                 let turn =
                     if square.norm() > 0.0 { (square / square.norm()).sqrt().conj() } else { c64::new(1.0, 0.0) };
@@ -322,7 +329,7 @@ impl Basis {
                         column -= &self.columns * held;
                     }
                     let norm = column.norm_l2();
-                    // The vector itself has length 1.
+                    // Relative to the vector, whose length is 1.
                     if norm > NEW {
                         let last = self.columns.ncols();
                         self.columns.resize_with(n, last + 1, |i, _| column[(i, 0)] / norm);
@@ -349,7 +356,7 @@ mod tests {
         let found = compare_roots(&full, &reduced, &JUDGED);
         assert_eq!(found.missed, [l(5.0, 300.0)]);
         assert_eq!(found.invented, [l(2.0, 501.0)]);
-        // What decays fast and what lies above the band is not compared.
+        // Roots that decay fast or lie above the band are not compared.
         assert_eq!((found.pairs.len(), found.unpaired), (4, 0));
         assert!((found.frequency_error() - 0.01).abs() < 1e-12);
         assert_eq!(found.growth_error_per_s(), 5.0);
@@ -357,8 +364,8 @@ mod tests {
         assert_eq!((nothing.missed.len(), nothing.unpaired), (1, 4));
     }
 
-    /// Windows of a full model against those of all its degrees of freedom; a basis of its vectors at one load is good
-    /// there, and wrong at another where the contact is stiffer.
+    /// Windows of the full model agree with those of a dense model of all its degrees of freedom. A basis from one load
+    /// reproduces the roots at that load and fails at another, where the contact is stiffer.
     #[test]
     fn a_basis_made_at_one_load_is_caught_at_another() {
         let law = ContactLaw { exponent: 1.0, ..ContactLaw::default() };
@@ -382,12 +389,12 @@ mod tests {
         let compared = compare_windows(&map.windows, &of_full);
         assert!(!compared.pairs.is_empty(), "no window at all");
         assert!(compared.missed.is_empty() && compared.invented.is_empty(), "{compared:?}");
-        // Ends are polished to 1e-10 of the map's own; those of the full model stay within 1e-8.
+        // The map refines window ends to 1e-10; those of the full model converge to 1e-8.
         let error = compared.friction_error(options.mu_max);
         assert!(error < 2.0 * STILL, "{error:e}");
 
         let mut basis = Basis { columns: Mat::zeros(n, 0) };
-        // A narrow band, so that the basis stays far from complete.
+        // A narrow band keeps the basis far from complete.
         let judged = Judged { band_rad_s: 250.0, ..JUDGED };
         basis.add(&solver.roots(&at(500.0, 0.45), judged.band_rad_s, FullVectors::Both, &mut |_| {}).unwrap());
         assert!(basis.columns.ncols() < n / 3, "{} columns", basis.columns.ncols());
@@ -402,11 +409,11 @@ mod tests {
             compared.relative_error()
         };
         let (own, other) = (error(500.0), error(2000.0));
-        // At its own load the basis holds the roots themselves.
+        // At its own load the basis contains the exact vectors.
         assert!(own < 1e-9 && other > 1e-6, "{own:e} {other:e}");
     }
 
-    /// The rounds and the limit while something is spoilt.
+    /// Rounds and limit under fault injection.
     pub(super) fn spoilt(rounds: usize, limit: f64) -> (usize, f64) {
         use crate::spoil::{Spoil, spoilt};
         if spoilt(Spoil::Rounds) {
@@ -439,7 +446,7 @@ mod tests {
         assert_eq!(farthest(&[0.5, 0.5], &[0.0, 0.5, 1.0]), [0.0; 0]);
     }
 
-    /// Between its samples a projection is held against the full model by every root that may grow.
+    /// The check between samples covers every root that may become unstable.
     #[test]
     fn a_projection_that_has_not_seen_everything_is_told() {
         let model = touching(42, 0.0, ContactLaw::default());
@@ -454,7 +461,8 @@ mod tests {
             let roots = reduced_roots(&reduced, &mut Solver::new(reduced.dimension()), &point(0.4)).unwrap();
             error_of_projection(&checked, &roots, band)
         };
-        // Vectors of the lower half of the band alone, of one friction coefficient, of those that windows begin with.
+        // Samples: the lower half of the band only, one friction coefficient, and the three that [`full_windows`]
+        // starts with.
         let (half, one, three) =
             (error(&[(0.0, 0.5 * band)]), error(&[(0.0, band)]), error(&[(0.0, band), (0.5, band), (1.0, band)]));
         assert!(half > 1e-3 && one > CHECKED && three < one, "{half:e} {one:e} {three:e}");

@@ -1,39 +1,39 @@
-//! Roots of a reduced model beside those of the full one: errors, and which were missed or invented.
+//! Pairing of the roots of a reduced model with those of the full one: errors, missed and invented roots.
 
 use faer::c64;
 
-/// Roots further apart than this, relative to `|λ|`, are not the same root.
+/// Largest distance of paired roots, relative to `|λ|`.
 const SAME: f64 = 1e-2;
 
-/// Which roots count.
+/// Region of the complex plane in which roots are compared.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Counted {
-    /// Largest frequency, rad/s.
+    /// Highest angular frequency, rad/s.
     pub band_rad_s: f64,
-    /// Smallest growth rate, 1/s.
+    /// Lowest growth rate, 1/s; negative for decaying roots.
     pub growth_floor_per_s: f64,
 }
 
 impl Counted {
-    /// Whether a root oscillates within the band and grows, or decays slowly enough.
+    /// Whether a root oscillates within the band and its growth rate is above the floor.
     pub fn counts(&self, lambda: c64) -> bool {
         lambda.im > 0.0 && lambda.im <= self.band_rad_s && lambda.re > self.growth_floor_per_s
     }
 }
 
-/// What a comparison found.
+/// Result of pairing the roots of two models.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RootMatch {
-    /// Roots of the full model that count, with `|Δλ|/|λ|` of each.
+    /// Counted full roots with a partner, and the error `|Δλ|/|λ|` of each.
     pub errors: Vec<(c64, f64)>,
-    /// Roots of the full model that count and that the reduced one does not have.
+    /// Counted full roots without a partner.
     pub missed: Vec<c64>,
-    /// Roots of the reduced model that count and that the full one does not have.
+    /// Counted reduced roots without a partner.
     pub invented: Vec<c64>,
 }
 
 impl RootMatch {
-    /// The largest error; infinite where a root was missed or invented.
+    /// Largest error; infinite if a root was missed or invented.
     pub fn worst(&self) -> f64 {
         if !self.missed.is_empty() || !self.invented.is_empty() {
             return f64::INFINITY;
@@ -42,8 +42,8 @@ impl RootMatch {
     }
 }
 
-/// Pairs off, nearest first: of distances between one of `full` and one of others, `(distance, one, other)`, the other of
-/// each.
+/// Pairs items one to one, nearest first. `near` lists candidate pairs `(distance, one, other)`, `full` is the number
+/// of items on the first side. Returns the partner of each of them.
 pub(super) fn pair_off(mut near: Vec<(f64, usize, usize)>, full: usize) -> Vec<Option<usize>> {
     near.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut partners = vec![None; full];
@@ -55,10 +55,10 @@ pub(super) fn pair_off(mut near: Vec<(f64, usize, usize)>, full: usize) -> Vec<O
     partners
 }
 
-/// Compares roots one to one, nearest first.
+/// Pairs roots one to one, nearest first.
 ///
-/// `full`, `reduced`: all roots with `ω > 0` of each; those of the full model a little beyond the band too, so that one
-/// near its end is found again on the other side.
+/// `full`, `reduced`: all roots with `ω > 0`. Full roots should extend slightly beyond the band, so that a root near
+/// its end finds its partner on the other side.
 pub fn match_roots(full: &[c64], reduced: &[c64], counted: Counted) -> RootMatch {
     let distance = |i: usize, j: usize| (full[i] - reduced[j]).norm() / full[i].norm();
     let near = (0..full.len())
