@@ -1,12 +1,14 @@
-//! Solves with a full model of two parts that touch: symmetric factors of the parts, and the contact between them.
+//! Linear solves with a full model whose parts are joined by contact only: symmetric factors of the parts, and a
+//! low-rank correction for the contact.
 //!
 //! ```text
 //! Q(s) = A + Lᵀ W R,   A = diag(K + s² M) of the parts,   W = k + s c,   R and L rows of contact pairs
 //! Q⁻¹ b = A⁻¹ (b - Lᵀ y),   y = (I + W G)⁻¹ W R A⁻¹ b,   G = R A⁻¹ Lᵀ
 //! ```
 //!
-//! (Woodbury). At `s = iω`, `A` is real: `A = P L D Lᵀ Pᵀ`. The rows that the contact touches are eliminated last, so
-//! that `G` needs only the last block of the factor, and a solve one pass forward, the contact, and one pass back.
+//! This is the Woodbury formula. At `s = iω`, `A` is real and `A = P L D Lᵀ Pᵀ`. The contact rows are eliminated last,
+//! so that `G` only needs the trailing block of the factor. A solve is then one forward pass, a dense solve for the
+//! contact, and one backward pass.
 //!
 //! Source: Hager, "Updating the inverse of a matrix", SIAM Review 31 (1989) 221-239.
 
@@ -19,17 +21,17 @@ use super::full_model::{FullModel, LowRank, SparseRow};
 use super::krylov_schur::Number;
 use super::pencil::{Ldlt, Pencil};
 
-/// The parts of a full model, ordered and analysed.
+/// The parts of a full model, ordered and symbolically analysed.
 pub(super) struct Parts<'a> {
     pencils: Vec<Pencil<'a>>,
-    /// First row of every part.
+    /// First row of every part in the full model.
     offsets: Vec<usize>,
-    /// Rows of every part that the contact touches.
+    /// Rows of every part that belong to contact pairs.
     touched: Vec<Vec<usize>>,
 }
 
 impl<'a> Parts<'a> {
-    /// Checks, orders and analyses every part.
+    /// Checks, orders and analyses every part, with its contact rows eliminated last.
     pub(super) fn new(model: &'a FullModel) -> Result<Self, ReductionError> {
         let (rows, offsets) = (model.contact_rows(), model.offsets());
         let (mut pencils, mut touched) = (vec![], vec![]);
@@ -42,12 +44,13 @@ impl<'a> Parts<'a> {
         Ok(Self { pencils, offsets, touched })
     }
 
-    /// Bytes that are needed.
+    /// Estimated memory.
     pub(super) fn bytes(&self) -> PartBytes {
         let float = size_of::<f64>();
         let dense = |rows: &Vec<usize>| float * rows.len() * rows.len();
         let pencils = self.pencils.iter();
-        // Beside a factor, its pivots; `L` and `A⁻¹` of what the contact touches, and as much again to find them.
+        // In addition to a factor: its pivots, and `L` and `A⁻¹` of the contact rows, with temporaries of the same
+        // size.
         let (factors, pivots) = pencils.clone().fold((0, 0), |(bytes, pivots), pencil| {
             (bytes + pencil.factor_bytes(), pivots + float * pencil.dimension())
         });
@@ -62,12 +65,12 @@ impl<'a> Parts<'a> {
         }
     }
 
-    /// How many `ω²` of the parts, apart from each other, lie below `square`.
+    /// Number of `ω²` of the separate parts below `square`, rad²/s².
     pub(super) fn count_below(&self, square: f64) -> Result<usize, ReductionError> {
         self.pencils.iter().map(|pencil| pencil.count_below(square)).sum()
     }
 
-    /// The factors of `K - ω² M`.
+    /// Factorises `K - ω² M` of every part, where `square` is `ω²`, rad²/s².
     pub(super) fn at(&self, square: f64) -> Result<Shifted, ReductionError> {
         let mut parts = vec![];
         for (index, pencil) in self.pencils.iter().enumerate() {
@@ -77,25 +80,25 @@ impl<'a> Parts<'a> {
     }
 }
 
-/// Bytes that parts need.
+/// Memory of the parts, bytes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PartBytes {
-    /// Of the analysis.
+    /// Held after the symbolic analysis.
     pub held: usize,
-    /// Of the factors at one shift.
+    /// Factors at one shift.
     pub factors: usize,
-    /// While a factor is made, beside it.
+    /// Additional memory while a factor is computed.
     pub factoring: usize,
 }
 
-/// One part, factored.
+/// Factor of one part.
 struct PartFactor {
     ldlt: Ldlt,
     offset: usize,
     pivots: Vec<f64>,
-    /// `L` of the rows that the contact touches.
+    /// Trailing block of `L`, for the contact rows.
     last: Mat<f64>,
-    /// `A⁻¹` between them.
+    /// Block of `A⁻¹` for the contact rows.
     flexibility: Mat<f64>,
 }
 
@@ -110,39 +113,40 @@ impl PartFactor {
         Self { ldlt, offset, pivots, last, flexibility }
     }
 
-    /// The first place that the contact touches, in the order of elimination.
+    /// Position of the first contact row in the order of elimination.
     fn first(&self) -> usize {
         self.pivots.len() - self.last.nrows()
     }
 }
 
-/// Factors of `K - ω² M` of every part.
+/// Factors of `K - ω² M` of every part at one shift.
 pub(super) struct Shifted {
     /// `ω²`, rad²/s².
     pub square: f64,
     parts: Vec<PartFactor>,
 }
 
-/// Rows of pairs over the places that the contact touches, part by part.
+/// Rows of the contact pairs, for each part, indexed by position among its contact rows.
 type Placed = Vec<Vec<SparseRow>>;
 
-/// `Q(s)` of a shift and an operating point, either way round.
+/// Solver with `Q(s)`, or its transpose, at one shift and operating point.
 pub(super) struct Coupled<'a, T: Number> {
     shifted: &'a Shifted,
     left: Placed,
     right: Placed,
     weights: Vec<T>,
-    /// Of `I + W G`.
+    /// LU factors of `I + W G`.
     factor: PartialPivLu<T>,
 }
 
 impl Shifted {
-    /// Whether the parts are positive definite there.
+    /// Whether `K - ω² M` of every part is positive definite.
     pub(super) fn is_definite(&self) -> bool {
         self.parts.iter().flat_map(|part| &part.pivots).all(|pivot| *pivot > 0.0)
     }
 
-    /// Joins the parts by the pairs of `low_rank`; `weights` are `k + s c`. `transposed` gives `Q(s)ᵀ`.
+    /// Couples the parts by the pairs of `low_rank`; `weights` are `k + s c`. With `transposed` the result solves with
+    /// `Q(s)ᵀ`.
     pub(super) fn couple<T: Number>(&self, low_rank: &LowRank, weights: Vec<T>, transposed: bool) -> Coupled<'_, T>
     where
         PartialPivLu<T>: Solver<T>,
@@ -174,7 +178,7 @@ impl Shifted {
         Coupled { shifted: self, left, right, weights, factor: <PartialPivLu<T> as Solver<T>>::of(matrix.as_ref()) }
     }
 
-    /// Rows over all degrees of freedom as rows over what the contact touches of each part.
+    /// Converts rows over all degrees of freedom to rows over the contact rows of each part.
     fn placed(&self, rows: &[SparseRow]) -> Placed {
         let of_part = |part: &PartFactor| {
             let order = &part.ldlt.order()[part.first()..];
@@ -188,7 +192,7 @@ impl Shifted {
     }
 }
 
-/// A dense factor of either kind of numbers.
+/// Dense LU factors of a real or complex matrix.
 pub(super) trait Solver<T: Number> {
     fn of(matrix: MatRef<'_, T>) -> Self;
     fn solved(&self, rhs: Mat<T>) -> Mat<T>;
@@ -220,7 +224,7 @@ where
 {
     /// `Q⁻¹ B`.
     pub(super) fn solve(&self, b: MatRef<'_, T>) -> Mat<T> {
-        // Complex columns are two real ones, the imaginary parts after the real ones.
+        // A block of complex columns is solved as real columns: first all real parts, then all imaginary parts.
         let (columns, real) = (b.ncols(), if T::REAL { b.ncols() } else { 2 * b.ncols() });
         let component = |value: T, column: usize| {
             let value = value.complex();
