@@ -1,11 +1,12 @@
-//! Why a model could not be reduced.
+//! Errors of model reduction.
 
 use crate::physics::SolveError;
 
 /// Bytes in a GiB.
 pub const GIB: f64 = (1_u64 << 30) as f64;
 
-/// What went wrong, where, with which value against which limit. Rows, columns and modes are counted from 0.
+/// Error of model reduction, with the offending value and the limit it broke. Rows, columns and modes are counted from
+/// 0.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ReductionError {
     #[error("{what} is {rows}x{columns}, expected {expected}x{expected}")]

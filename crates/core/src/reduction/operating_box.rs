@@ -1,18 +1,18 @@
-//! A box of operating points and well-spread points in it.
+//! A box of operating points and well-distributed points in it.
 
 use super::ReductionError;
 use crate::physics::OperatingPoint;
 use crate::physics::chart::radical_inverse;
 
-/// A range whose ends have a ratio above this is sampled evenly in the logarithm.
+/// Ratio of the ends of a range above which it is sampled uniformly in the logarithm.
 const GEOMETRIC_ABOVE: f64 = 3.0;
 
-/// Closed ranges of the operating conditions; a range may be a single value.
+/// Closed ranges of the operating conditions. A range may be a single value.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OperatingBox {
     pub friction_coefficient: [f64; 2],
     pub normal_load_n: [f64; 2],
-    /// Not across 0: a disc that stands does not slide.
+    /// Must not contain 0, where there is no sliding.
     pub disc_speed_rad_s: [f64; 2],
 }
 
@@ -25,7 +25,8 @@ impl OperatingBox {
         ]
     }
 
-    /// That every range is finite and ascending, the load above 0 and the speed on one side of 0.
+    /// Checks that every range is finite and ascending, that the load is above 0 and that the speed does not change
+    /// sign.
     ///
     /// # Errors
     /// [`ReductionError::Range`].
@@ -48,7 +49,8 @@ impl OperatingBox {
         Ok(())
     }
 
-    /// The same box with a single value of what does not matter, the middle of its range.
+    /// The same box with load or speed, if flagged, replaced by the middle of its range, for models that do not depend
+    /// on it.
     pub fn without(&self, load: bool, speed: bool) -> Self {
         let middle = self.at([0.5; 3]);
         let mut smaller = *self;
@@ -61,16 +63,16 @@ impl OperatingBox {
         smaller
     }
 
-    /// How many of its ranges are more than a single value.
+    /// Number of ranges wider than a single value.
     pub fn widths(&self) -> usize {
         self.ranges().iter().filter(|(_, [low, high])| low < high).count()
     }
 
-    /// The point at `unit`, each coordinate from 0 to 1: friction, load, speed.
+    /// The point with the normalised coordinates `unit`, each from 0 to 1, in the order friction, load, speed.
     pub fn at(&self, unit: [f64; 3]) -> OperatingPoint {
         let along = |[low, high]: [f64; 2], u: f64| {
             if low * high > 0.0 && (high / low).max(low / high) > GEOMETRIC_ABOVE {
-                // Ends exactly, whatever the power rounds to.
+                // Return the end exactly, regardless of rounding in the power.
                 if u == 1.0 { high } else { low * (high / low).powf(u) }
             } else {
                 low + u * (high - low)
@@ -96,7 +98,8 @@ impl OperatingBox {
         points
     }
 
-    /// `count` points of Halton's sequence from its `first` on: well spread, never twice the same.
+    /// `count` points of the Halton sequence in bases 2, 3 and 5, starting at index `first`. They are well distributed
+    /// and never repeat.
     pub fn spread(&self, first: usize, count: usize) -> Vec<OperatingPoint> {
         (first..first + count).map(|index| self.at([2, 3, 5].map(|base| radical_inverse(index + 1, base)))).collect()
     }
@@ -113,7 +116,7 @@ mod tests {
     fn points_lie_in_the_box_and_are_all_different() {
         let mut points = BOX.corners_and_middle();
         assert_eq!(points.len(), 9);
-        // The middle of ranges that span decades is their geometric mean.
+        // The middle of a range sampled in the logarithm is the geometric mean.
         assert!((points[8].normal_load_n - 316.227766016838).abs() < 1e-9);
         points.extend(BOX.spread(0, 40));
         for (k, p) in points.iter().enumerate() {

@@ -1,7 +1,7 @@
-//! Fill-reducing order of the rows of a symmetric matrix by nested dissection.
+//! Fill-reducing ordering of a sparse symmetric matrix by nested dissection.
 //!
-//! Rows with the same neighbours (the degrees of freedom of one node) are eliminated together: the graph that is
-//! dissected has one vertex for each such group, a third of the rows of a solid mesh, and the fill is that of the mesh.
+//! Rows with the same neighbours, such as the degrees of freedom of one node, are eliminated together. The graph to
+//! dissect has one vertex per such group, a third of the rows of a solid mesh, and gives the fill of the mesh.
 //!
 //! Source: George, "Nested dissection of a regular finite element mesh", SIAM J. Numer. Anal. 10 (1973) 345-363;
 //! Karypis, Kumar, "A fast and high quality multilevel scheme for partitioning irregular graphs", SIAM J. Sci. Comput.
@@ -12,13 +12,13 @@ use std::collections::HashMap;
 use faer::perm::Perm;
 use feral_metis::CscPattern;
 
-/// The neighbours of a row, itself included, ascending: written into the vector handed in.
+/// Writes the neighbours of a row into a vector: ascending, the row itself included.
 pub(super) type Neighbours<'a> = dyn Fn(usize, &mut Vec<usize>) + 'a;
 
-/// A permutation of `n` rows; `neighbours` describes a symmetric pattern.
+/// The permutation that eliminates `n` rows in nested-dissection order; `neighbours` describes a symmetric pattern.
 ///
 /// # Errors
-/// What the dissection says of a graph it cannot take.
+/// The reason, if the graph is too large, unsymmetric or rejected by the partitioner.
 pub(super) fn nested_dissection(n: usize, neighbours: &Neighbours<'_>) -> Result<Perm<usize>, String> {
     let (group_of, members) = groups(n, neighbours);
     let mut row = vec![];
@@ -48,8 +48,8 @@ pub(super) fn nested_dissection(n: usize, neighbours: &Neighbours<'_>) -> Result
     Ok(Perm::new_checked(forward.into(), inverse.into(), n))
 }
 
-/// Adds the edges that are there one way only. A matrix of symmetric values has such where an entry is stored that is zero;
-/// the dissection would take an unsymmetric graph and go astray.
+/// Adds the reverse of one-way edges. They occur in symmetric matrices that store an explicit zero in one triangle
+/// only. Dissection requires a symmetric graph.
 fn complete(graph: &mut [Vec<i32>]) {
     let mut missing = vec![];
     for (from, seen) in graph.iter().enumerate() {
@@ -63,7 +63,7 @@ fn complete(graph: &mut [Vec<i32>]) {
     }
 }
 
-/// Rows with equal neighbours: the group of every row, and the rows of every group.
+/// Groups rows with equal neighbours: the group of every row, and the rows of every group.
 fn groups(n: usize, neighbours: &Neighbours<'_>) -> (Vec<usize>, Vec<Vec<usize>>) {
     let (mut group_of, mut members) = (vec![0; n], Vec::<Vec<usize>>::new());
     let mut by_hash: HashMap<u64, Vec<usize>> = HashMap::new();
@@ -115,7 +115,7 @@ mod tests {
             assert!(three.iter().all(|row| row % nodes == three[0] % nodes), "{three:?}");
         }
         assert!((0..3 * nodes).all(|row| forward[inverse[row]] == row));
-        // A line is cut in the middle: what is eliminated last lies near there, not at an end.
+        // A line is cut in the middle: the rows eliminated last lie near there, not at an end.
         let last = forward[3 * nodes - 1] % nodes;
         assert!((nodes / 3..2 * nodes / 3).contains(&last), "{last}");
     }

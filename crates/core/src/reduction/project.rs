@@ -1,20 +1,23 @@
-//! Projection of terms on a basis.
+//! Projection of matrices on a basis.
 
 use faer::{Mat, MatRef};
 
 use super::sparse::{SparseMatrix, times};
 
-/// `Φᵀ A Φ` of a sparse `A`, `n×n`, on `basis`, `n×k`; exactly symmetric where `symmetric` says that `A` is.
+/// `Φᵀ A Φ`, `k×k`, for a sparse `A`, `n×n`, and a `basis` `Φ`, `n×k`. The result is exactly symmetric if `symmetric`
+/// states that `A` is.
 pub fn project_sparse(matrix: &SparseMatrix, basis: MatRef<'_, f64>, symmetric: bool) -> Mat<f64> {
     mirrored(basis.transpose() * times(matrix, basis), symmetric)
 }
 
-/// `Φᵀ A Φ` of a dense `A`, `n×n`, on `basis`, `n×k`; exactly symmetric where `symmetric` says that `A` is.
+/// `Φᵀ A Φ`, `k×k`, for a dense `A`, `n×n`, and a `basis` `Φ`, `n×k`. The result is exactly symmetric if `symmetric`
+/// states that `A` is.
 pub fn project_dense(matrix: MatRef<'_, f64>, basis: MatRef<'_, f64>, symmetric: bool) -> Mat<f64> {
     mirrored(basis.transpose() * (matrix * basis), symmetric)
 }
 
-/// Copies the lower triangle to the upper one: rounding must not hide a symmetry that the solver looks for.
+/// Copies the lower triangle to the upper one if `symmetric`: the solver tests for exact symmetry, which rounding would
+/// destroy.
 fn mirrored(matrix: Mat<f64>, symmetric: bool) -> Mat<f64> {
     if !symmetric {
         return matrix;

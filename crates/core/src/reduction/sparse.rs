@@ -1,14 +1,14 @@
-//! Sparse matrices: sums, products, symmetry.
+//! Sparse matrices: sums, products, norms and symmetry.
 
 use faer::sparse::{SparseColMat, Triplet};
 use faer::{Mat, MatRef};
 
 use super::{ReductionError, SYMMETRY_TOLERANCE};
 
-/// Compressed columns, both triangles stored.
+/// Sparse matrix in compressed columns; both triangles of a symmetric matrix are stored.
 pub type SparseMatrix = SparseColMat<usize, f64>;
 
-/// Columns of a dense matrix that a sparse one is multiplied with at once: its entries are then read once for all.
+/// Number of dense columns multiplied at a time, so that each sparse entry is read once for all of them.
 const TOGETHER: usize = 16;
 
 /// Every entry of a sparse matrix as `(row, column, value)`.
@@ -21,7 +21,8 @@ pub fn is_symmetric(matrix: &SparseMatrix) -> bool {
     worst_asymmetry(matrix).is_none()
 }
 
-/// The first pair of mirrored entries that differ by too much: `(row, column, value, mirrored, limit)`.
+/// First pair of mirrored entries that differ by more than [`SYMMETRY_TOLERANCE`] times the largest entry:
+/// `(row, column, value, mirrored, limit)`.
 pub(super) fn worst_asymmetry(matrix: &SparseMatrix) -> Option<(usize, usize, f64, f64, f64)> {
     let limit = SYMMETRY_TOLERANCE * entries(matrix).fold(0.0, |largest: f64, (_, _, value)| largest.max(value.abs()));
     let view = matrix.as_ref();
@@ -31,10 +32,10 @@ pub(super) fn worst_asymmetry(matrix: &SparseMatrix) -> Option<(usize, usize, f6
     })
 }
 
-/// `Σ w A`, every `A` `n×n`.
+/// The weighted sum `Σ w A` of `n×n` matrices, given as `(w, A)`.
 ///
 /// # Errors
-/// [`ReductionError::Shape`], [`ReductionError::Factorisation`] where memory does not suffice.
+/// [`ReductionError::Shape`]; [`ReductionError::Factorisation`] if memory is insufficient.
 pub fn weighted_sum(n: usize, terms: &[(f64, &SparseMatrix)]) -> Result<SparseMatrix, ReductionError> {
     let mut triplets = Vec::with_capacity(terms.iter().map(|(_, matrix)| matrix.compute_nnz()).sum());
     for (weight, matrix) in terms {
@@ -57,7 +58,7 @@ pub(super) fn times(matrix: &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
     let (mut from, mut to) = (vec![], vec![]);
     for first in (0..columns).step_by(TOGETHER) {
         let width = TOGETHER.min(columns - first);
-        // Row by row, so that the innermost loop runs over neighbours in memory.
+        // Stored row by row, so that the innermost loop runs over adjacent memory.
         from.clear();
         from.extend((0..x.nrows()).flat_map(|i| (0..width).map(move |k| x[(i, first + k)])));
         to.clear();
@@ -95,7 +96,7 @@ pub(super) fn transposed(matrix: &SparseMatrix) -> Result<SparseMatrix, Reductio
     })
 }
 
-/// Largest sum of magnitudes of a column: for a symmetric matrix a bound of its 2-norm.
+/// The 1-norm, the largest column sum of magnitudes. For a symmetric matrix it bounds the 2-norm.
 pub(super) fn one_norm(matrix: &SparseMatrix) -> f64 {
     (0..matrix.ncols()).map(|j| matrix.as_ref().val_of_col(j).iter().map(|value| value.abs()).sum()).fold(0.0, f64::max)
 }

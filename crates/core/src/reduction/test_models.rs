@@ -1,11 +1,11 @@
-//! Small full models, shared by the tests of this folder.
+//! Small full models shared by the tests of this module.
 
 use faer::sparse::Triplet;
 
 use super::{FullContact, FullModel, FullPart, SparseMatrix};
 use crate::physics::ContactLaw;
 
-/// A held chain of `count` masses joined by `spring`, no two alike.
+/// A grounded chain of `count` masses with springs of about `spring`, N/m; masses and springs vary along the chain.
 fn chain(name: &str, count: usize, spring: f64) -> FullPart {
     let (mut mass, mut stiffness) = (vec![], vec![]);
     for i in 0..count {
@@ -20,7 +20,7 @@ fn chain(name: &str, count: usize, spring: f64) -> FullPart {
     FullPart { name: name.to_owned(), mass: build(&mass), stiffness: build(&stiffness) }
 }
 
-/// Two chains of 40 and 35 masses that touch along two directions at three places.
+/// Two chains of 40 and 35 masses with three contact pairs.
 pub fn chains(damping: f64, contact_law: ContactLaw) -> FullModel {
     let (pad, disc) = (chain("pad", 40, 4e6), chain("disc", 35, 5e6));
     let row = |a: usize, b: usize| vec![(a, 1.0), (40 + b, -1.0)];
