@@ -1,12 +1,13 @@
-//! A full model: what a finite-element program gives, before anything is left out.
+//! The full model: the matrices of a finite-element model before reduction.
 //!
 //! ```text
 //! M q̈ + C(p) q̇ + K(p) q = 0,   K(p) = diag(K_part) + Σ law(p) K_term + κ(N) (B_n + s μ B_t)ᵀ K_c B_n
 //! C(p) = Σ law(p) C_term + (B_n + s μ B_t)ᵀ C_c B_n + dμ/dv B_tᵀ diag(N_0) B_t + μ B_bᵀ diag(N_0 / v) B_b
 //! ```
 //!
-//! Everything sparse: the parts symmetric and apart from each other, terms of any symmetry, and rows `B` of contact pairs
-//! that join the parts. [`FullModel::project`] takes all of it to a basis, where it is an ordinary [`Model`].
+//! All matrices are sparse. The parts are symmetric and not coupled to each other, terms may have any symmetry, and the
+//! rows `B` of the contact pairs couple the parts. [`FullModel::project`] projects everything on a basis, which gives
+//! an ordinary [`Model`].
 
 use faer::sparse::Triplet;
 use faer::{Mat, MatRef};
@@ -19,15 +20,15 @@ use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, Operating
 /// A part of a full model: a substructure with its contact interface free, or a whole system.
 #[derive(Clone, Debug)]
 pub struct FullPart {
-    /// `pad`, `disc` or `system`: how errors name it.
+    /// Name in errors: `pad`, `disc` or `system`.
     pub name: String,
     /// `M`, `n×n`, kg, symmetric, positive semidefinite with a positive diagonal.
     pub mass: SparseMatrix,
-    /// Constant `K`, `n×n`, N/m, symmetric; without entries where all stiffness is in terms.
+    /// Constant `K`, `n×n`, N/m, symmetric; empty if all stiffness is in terms.
     pub stiffness: SparseMatrix,
 }
 
-/// A sparse matrix times a law of the operating point.
+/// A sparse matrix multiplied by a law that depends on the operating point.
 #[derive(Clone, Debug)]
 pub struct SparseTerm {
     /// `n×n` over the rows of all parts.
@@ -35,7 +36,7 @@ pub struct SparseTerm {
     pub law: Law,
 }
 
-/// A linear form of the displacements: `(row, weight)`.
+/// A linear form of the displacements: a list of `(row, weight)`.
 pub type SparseRow = Vec<(usize, f64)>;
 
 /// Contact pairs over the rows of all parts: relative displacement, pad minus disc, along the triad `n`, `t`, `b`.
@@ -52,7 +53,7 @@ pub struct FullContact {
     pub radius_m: Vec<f64>,
 }
 
-/// A full model; the rows of its parts follow each other.
+/// A full model. The rows of its parts are concatenated in order.
 #[derive(Clone, Debug)]
 pub struct FullModel {
     pub parts: Vec<FullPart>,
@@ -62,7 +63,7 @@ pub struct FullModel {
     pub contact_law: ContactLaw,
 }
 
-/// A full model on a basis.
+/// A full model projected on a basis.
 #[derive(Clone, Debug)]
 pub struct Projected {
     /// `V`, `n×k`, kg^-1/2: mass-normalised, and `Vᵀ diag(K_part) V = diag(Ω²)`.
@@ -75,14 +76,14 @@ pub struct Projected {
     pub damping: Vec<Term>,
 }
 
-/// A product of contact rows, one for each pair: `leftᵀ diag(weights) right`.
+/// A sum over contact pairs, `leftᵀ diag(weights) right`, with one row of `left` and `right` per pair.
 struct ContactTerm<'a> {
     left: Vec<SparseRow>,
     weights: Vec<f64>,
     right: &'a [SparseRow],
 }
 
-/// A sum of products of rows: `Σ leftᵀ (stiffness + λ damping) right`.
+/// A low-rank matrix `Σ leftᵀ (stiffness + λ damping) right`.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LowRank {
     pub left: Vec<SparseRow>,
@@ -110,7 +111,8 @@ impl FullModel {
             .collect()
     }
 
-    /// Whether load and speed change anything beyond opening, stopping and reversing.
+    /// Whether the model depends on load and on speed, apart from opening of the contact, stopping and reversal of
+    /// sliding: `(load, speed)`.
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
         let (mut load, mut speed) = (false, false);
         for term in self.stiffness.iter().chain(&self.damping) {
@@ -134,16 +136,16 @@ impl FullModel {
         self.damping.is_empty() && !self.contact.as_ref().is_some_and(|contact| rubs || dampers(contact))
     }
 
-    /// What `law` is at `p`; a model without contact pairs never opens.
+    /// Value of `law` at `p`; a model without contact pairs is always closed.
     fn value(&self, law: &Law, p: &OperatingPoint) -> f64 {
         let state = if self.contact.is_some() { p.contact_state() } else { p.state_closed() };
         law.value(&self.contact_law, state, p)
     }
 
-    /// `M`, `C(p)` and `K(p)`, both triangles stored.
+    /// Assembles `M`, `C(p)` and `K(p)`, `n×n`, both triangles stored.
     ///
     /// # Errors
-    /// [`ReductionError::Factorisation`] where memory does not suffice.
+    /// [`ReductionError::Factorisation`] if memory is insufficient.
     pub fn matrices_at(&self, p: &OperatingPoint) -> Result<[SparseMatrix; 3], ReductionError> {
         let n = self.dimension();
         let (mut mass, mut damping, mut stiffness) = (vec![], vec![], vec![]);
@@ -177,7 +179,7 @@ impl FullModel {
         Ok([build(&mass)?, build(&damping)?, build(&stiffness)?])
     }
 
-    /// What the contact adds to `K` and to `C` at `p`, of low rank; nothing where its weights are 0.
+    /// Low-rank contributions of the contact to `K` and `C` at `p`; terms whose weights are all 0 are omitted.
     fn contact_terms(&self, p: &OperatingPoint) -> [Vec<ContactTerm<'_>>; 2] {
         let Some(contact) = &self.contact else { return [vec![], vec![]] };
         let [kappa, damper, friction, slope, lateral] = [
@@ -216,7 +218,7 @@ impl FullModel {
         [stiffness, damping].map(|terms| terms.into_iter().filter(some).collect())
     }
 
-    /// What the contact adds at `p`, pair by pair: `Σ leftᵀ (k + λ c) right`.
+    /// Contact contributions at `p`, pair by pair: `Σ leftᵀ (k + λ c) right`.
     pub(super) fn low_rank(&self, p: &OperatingPoint) -> LowRank {
         let [stiffness, damping] = self.contact_terms(p);
         let mut sum = LowRank::default();
@@ -227,7 +229,7 @@ impl FullModel {
             sum.damping.resize(sum.stiffness.len(), 0.0);
         }
         for term in &damping {
-            // Springs and dampers of a pair act along the same rows.
+            // The spring and the damper of a pair act along the same rows and share one entry.
             if sum.left == term.left && sum.right == term.right && sum.damping.iter().all(|value| *value == 0.0) {
                 sum.damping.clone_from(&term.weights);
                 continue;
@@ -240,7 +242,7 @@ impl FullModel {
         sum
     }
 
-    /// The rows of all parts that the contact touches, ascending.
+    /// Rows of all parts that belong to contact pairs, ascending.
     pub(super) fn contact_rows(&self) -> Vec<usize> {
         let contact = self.contact.iter();
         let mut rows: Vec<usize> = contact
@@ -252,7 +254,8 @@ impl FullModel {
         rows
     }
 
-    /// The model on the span of `basis`, `n×k`, whose columns need only be independent.
+    /// Projects the model on the span of `basis`, `n×k`, whose columns must be linearly independent but need not be
+    /// orthogonal.
     ///
     /// # Errors
     /// [`ReductionError`]: `Indefinite` where the columns depend on each other, `Factorisation`.
@@ -288,7 +291,7 @@ impl FullModel {
         self.parts_times(|part| &part.mass, x)
     }
 
-    /// `C(p) X`, or `C(p)ᵀ X`; nothing is assembled.
+    /// `C(p) X`, or `C(p)ᵀ X` if `transposed`, without assembling `C`.
     pub(super) fn damping_times(&self, p: &OperatingPoint, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
         let mut product = Mat::zeros(x.nrows(), x.ncols());
         let [_, contact] = self.contact_terms(p);
@@ -296,7 +299,7 @@ impl FullModel {
         product
     }
 
-    /// `K(p) X`, or `K(p)ᵀ X`; nothing is assembled.
+    /// `K(p) X`, or `K(p)ᵀ X` if `transposed`, without assembling `K`.
     pub(super) fn stiffness_times(&self, p: &OperatingPoint, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
         let mut product = self.parts_times(|part| &part.stiffness, x);
         let [contact, _] = self.contact_terms(p);
@@ -304,7 +307,7 @@ impl FullModel {
         product
     }
 
-    /// `diag(A_part) X`, every `A_part` symmetric.
+    /// `diag(A_part) X`, where `of` selects a symmetric matrix of every part.
     fn parts_times(&self, of: fn(&FullPart) -> &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
         let mut product = Mat::zeros(x.nrows(), x.ncols());
         for (part, offset) in self.parts.iter().zip(self.offsets()) {
@@ -314,7 +317,7 @@ impl FullModel {
         product
     }
 
-    /// Adds what terms and contact do to `X`, or what their transposes do.
+    /// Adds the products of terms and contact with `X`, or those of their transposes, to `product`.
     fn add_terms(
         &self,
         terms: &[SparseTerm],
@@ -341,7 +344,7 @@ impl FullModel {
 }
 
 impl FullContact {
-    /// The pairs in the coordinates of a basis, `n×k`.
+    /// The contact pairs in the coordinates of a basis, `n×k`.
     pub fn on(&self, basis: MatRef<'_, f64>) -> ContactPairs {
         let rows = |rows: &[SparseRow]| {
             Mat::from_fn(rows.len(), basis.ncols(), |pair, column| {
@@ -360,7 +363,8 @@ impl FullContact {
 }
 
 impl Projected {
-    /// The same on the span of `coefficients`, `k×r`: columns, independent, in the coordinates of this basis.
+    /// Projects further on the span of `coefficients`, `k×r`: linearly independent columns in the coordinates of this
+    /// basis.
     ///
     /// # Errors
     /// [`ReductionError`]: `Indefinite` where the columns depend on each other, `Factorisation`.
@@ -369,7 +373,7 @@ impl Projected {
             self.omega_squared[i] * coefficients[(i, j)]
         });
         let stiffness = coefficients.transpose() * &free;
-        // M is the unit matrix here.
+        // M is the identity in these coordinates.
         let gram = coefficients.transpose() * coefficients;
         let symmetric = |m: &Mat<f64>| Mat::from_fn(m.nrows(), m.ncols(), |i, j| m[(i.max(j), i.min(j))]);
         let whitening = whiten("basis", symmetric(&gram).as_ref())?;
@@ -402,7 +406,7 @@ impl Projected {
         })
     }
 
-    /// The equation of motion in the coordinates of the basis, under `contact_law`.
+    /// The reduced equation of motion in the coordinates of the basis, with `contact_law`.
     ///
     /// # Errors
     /// Those of [`Model::new`] and [`Model::with_contact`].
@@ -429,7 +433,7 @@ mod tests {
         SparseMatrix::try_new_from_triplets(n, n, &triplets).unwrap()
     }
 
-    /// Two held chains of three masses that touch at their ends along two directions.
+    /// Two grounded chains of three masses with contact pairs along three directions.
     fn two_chains() -> FullModel {
         let part = |name: &str, spring: f64| FullPart {
             name: name.to_owned(),
@@ -463,8 +467,8 @@ mod tests {
         }
     }
 
-    /// On a basis of as many vectors as there are degrees of freedom nothing is lost: the roots of the projected model
-    /// make the full matrices singular, turning either way, without sliding and without contact.
+    /// A basis with as many vectors as degrees of freedom loses nothing: the roots of the projected model make the full
+    /// matrices singular, for either direction of sliding, without sliding and without contact.
     #[test]
     fn a_whole_basis_loses_nothing() {
         let full = two_chains();
@@ -489,7 +493,7 @@ mod tests {
                         (lambda * lambda * parts(&mass, i) + lambda * parts(&damping, i) + parts(&stiffness, i)).norm()
                     })
                     .fold(0.0, f64::max);
-                // Rounding of a dense solve, relative to the stiffest entry.
+                // Rounding error of a dense solve, relative to the largest stiffness entry.
                 assert!(residual < 1e-10 * stiffness.norm_max() * x.norm_max(), "{p:?} {lambda} {residual:e}");
             }
         }
