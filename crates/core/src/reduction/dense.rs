@@ -1,26 +1,26 @@
-//! Dense symmetric modes and the Cholesky factor of the mass matrix.
+//! Real modes of dense symmetric systems, and the Cholesky factor of the mass matrix.
 
 use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par, Side};
 
 use super::{DEFINITE_TOLERANCE, ReductionError, SEMIDEFINITE_TOLERANCE, SYMMETRY_TOLERANCE};
 
-/// Which modes of a substructure take part.
+/// Selection of the modes of a substructure.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ModeSelection {
-    /// Every one.
+    /// All modes.
     All,
-    /// The `k` of lowest frequency.
+    /// The modes of lowest frequency, as many as given.
     Lowest(usize),
-    /// These, counted from 0 in ascending frequency.
+    /// The modes with these indices, counted from 0 in ascending frequency.
     Indices(Vec<usize>),
 }
 
 impl ModeSelection {
-    /// The positions selected out of `available` modes, ascending.
+    /// Indices selected out of `available` modes, ascending; `what` names the field in errors.
     ///
     /// # Errors
-    /// [`ReductionError::ModeCount`] for none, too many, repeated or missing ones; `what` names the rig's field.
+    /// [`ReductionError::ModeCount`] if the selection is empty, exceeds the available modes, or repeats one.
     pub fn indices(&self, what: &str, available: usize) -> Result<Vec<usize>, ReductionError> {
         let refuse =
             |value: String, limit: String| Err(ReductionError::ModeCount { what: what.to_owned(), value, limit });
@@ -48,19 +48,20 @@ impl ModeSelection {
     }
 }
 
-/// Real modes, ascending in frequency.
+/// Real modes in ascending order of frequency.
 #[derive(Clone, Debug)]
 pub struct Modes {
     /// `ω`, rad/s, one per mode.
     pub omega_rad_s: Vec<f64>,
-    /// `Φ`, degrees of freedom by modes, kg^-1/2, `Φᵀ M Φ = I`; the largest entry of each column is positive.
+    /// `Φ`, degrees of freedom by modes, kg^-1/2, mass-normalised: `Φᵀ M Φ = I`. The largest entry of each column is
+    /// positive.
     pub phi: Mat<f64>,
 }
 
-/// Modes of a substructure whose contact interface is free: `K φ = ω² M φ`.
+/// Real modes of a substructure with free contact interface, `K φ = ω² M φ`.
 ///
-/// `mass`, `stiffness`: `n×n`, symmetric; `mass` positive definite, `stiffness` at least semidefinite (a rigid-body
-/// motion has `ω = 0`). `what` is how errors name the substructure.
+/// `mass`, kg, and `stiffness`, N/m, are `n×n` and symmetric. `mass` must be positive definite and `stiffness` positive
+/// semidefinite; rigid-body modes have `ω = 0`. `what` names the substructure in errors.
 ///
 /// # Errors
 /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `NegativeStiffness`, `ModeCount`.
@@ -89,13 +90,13 @@ pub fn free_interface_modes(
     Ok(Modes { omega_rad_s: chosen.iter().map(|&mode| squares[mode].max(0.0).sqrt()).collect(), phi })
 }
 
-/// Cholesky factor `L` of a mass matrix, `M = L Lᵀ`: coordinates `y = Lᵀ x` have unit mass.
+/// Cholesky factor `L` of a mass matrix, `M = L Lᵀ`. In the coordinates `y = Lᵀ x` the mass matrix is the identity.
 #[derive(Clone, Debug)]
 pub struct Whitening {
     lower: Mat<f64>,
 }
 
-/// Factors a mass matrix, `n×n`, symmetric and positive definite; `what` is how errors name it.
+/// Factorises a mass matrix, `n×n`, symmetric and positive definite; `what` names it in errors.
 ///
 /// # Errors
 /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`.
@@ -118,7 +119,7 @@ pub fn whiten(what: &str, mass: MatRef<'_, f64>) -> Result<Whitening, ReductionE
     Ok(Whitening { lower })
 }
 
-/// The pivot of `matrix` at `row`, `m_rr - m_rᵀ M⁻¹ m_r` over the rows before it: what an error reports.
+/// Cholesky pivot of `matrix` at `row`, `m_rr - m_rᵀ M⁻¹ m_r` over the preceding rows, for an error.
 fn pivot(matrix: MatRef<'_, f64>, row: usize) -> f64 {
     let mut solved = matrix.submatrix(0, row, row, 1).to_owned();
     match matrix.submatrix(0, 0, row, row).llt(Side::Lower) {
@@ -129,7 +130,7 @@ fn pivot(matrix: MatRef<'_, f64>, row: usize) -> f64 {
 }
 
 impl Whitening {
-    /// `L⁻¹ A L⁻ᵀ`; exactly symmetric where `symmetric` says that `A` is.
+    /// `L⁻¹ A L⁻ᵀ`; exactly symmetric if `symmetric` states that `A` is.
     pub fn congruence(&self, matrix: MatRef<'_, f64>, symmetric: bool) -> Mat<f64> {
         let mut left = matrix.to_owned();
         solve_lower_triangular_in_place(self.lower.as_ref(), left.as_mut(), Par::Seq);
@@ -141,20 +142,20 @@ impl Whitening {
         both.transpose().to_owned()
     }
 
-    /// `X L⁻ᵀ` in place: of unit length and orthogonal where `Xᵀ X`, in whatever metric, was the factored matrix.
+    /// `X L⁻ᵀ` in place. If `L Lᵀ` is the Gram matrix of `X` in some metric, the result is orthonormal in that metric.
     pub fn right(&self, vectors: &mut Mat<f64>) {
         let mut turned = vectors.transpose().to_owned();
         solve_lower_triangular_in_place(self.lower.as_ref(), turned.as_mut(), Par::Seq);
         vectors.copy_from(turned.transpose());
     }
 
-    /// `L⁻ᵀ Y` in place: from unit-mass coordinates back to degrees of freedom.
+    /// `L⁻ᵀ Y` in place: transforms unit-mass coordinates back to degrees of freedom.
     pub fn back(&self, vectors: &mut Mat<f64>) {
         solve_upper_triangular_in_place(self.lower.transpose(), vectors.as_mut(), Par::Seq);
     }
 }
 
-/// A finite, square, symmetric matrix as the mean of both triangles.
+/// Checks that a matrix is finite, square and symmetric, and returns the mean of both triangles.
 fn symmetrised(what: &str, matrix: MatRef<'_, f64>) -> Result<Mat<f64>, ReductionError> {
     let (rows, columns) = matrix.shape();
     if rows != columns || rows == 0 {
@@ -180,10 +181,10 @@ fn symmetrised(what: &str, matrix: MatRef<'_, f64>) -> Result<Mat<f64>, Reductio
     Ok(Mat::from_fn(rows, columns, |i, j| 0.5 * (matrix[(i, j)] + matrix[(j, i)])))
 }
 
-/// Eigenvalues, ascending, and orthonormal eigenvectors of an exactly symmetric matrix.
+/// Eigenvalues, ascending, and orthonormal eigenvectors of an exactly symmetric matrix; `what` names it in errors.
 ///
-/// faer 0.24 deflates with an absolute tolerance near 1e-16: a matrix of entries near 1e-6 then loses half of its
-/// digits. It is scaled to entries near 1 first, by a power of two, which rounds nothing.
+/// The matrix is first scaled to entries near 1, by a power of two, which is exact. faer 0.24 deflates with an absolute
+/// tolerance near 1e-16, which would lose half the digits of a matrix with entries near 1e-6.
 pub(super) fn symmetric_eigen(what: &str, matrix: MatRef<'_, f64>) -> Result<(Vec<f64>, Mat<f64>), ReductionError> {
     let failed = |reason: String| ReductionError::Factorisation { what: what.to_owned(), reason };
     let largest = matrix.norm_max();
@@ -199,12 +200,13 @@ pub(super) fn symmetric_eigen(what: &str, matrix: MatRef<'_, f64>) -> Result<(Ve
     Ok((values, eigen.U().to_owned()))
 }
 
-/// Turns every column so that its largest entry is positive: modes then do not depend on how they were found.
+/// Changes the sign of every column so that its largest entry is positive, which makes modes independent of the
+/// algorithm.
 pub(super) fn fix_signs(phi: &mut Mat<f64>) {
     for column in phi.col_iter_mut() {
         let mut largest = 0.0_f64;
         for &value in column.as_ref().iter() {
-            // Of entries equal up to rounding, the first decides.
+            // Among entries equal up to rounding, the first decides.
             if value.abs() > largest.abs() * (1.0 + 1e-9) {
                 largest = value;
             }
@@ -231,7 +233,7 @@ mod tests {
         assert!((modes.omega_rad_s[0] - 1.0).abs() < 1e-15);
         assert!((modes.omega_rad_s[1] - 3.0_f64.sqrt()).abs() < 1e-15);
         assert!((modes.phi.transpose() * &mass * &modes.phi - Mat::<f64>::identity(2, 2)).norm_max() < 1e-15);
-        // In phase first.
+        // The first mode is in phase.
         assert!((modes.phi[(0, 0)] - 0.5).abs() < 1e-15 && (modes.phi[(1, 0)] - 0.5).abs() < 1e-15);
     }
 
@@ -240,7 +242,7 @@ mod tests {
         let mass = faer::mat![[0.3, 0.0, 0.0], [0.0, 0.7, 0.0], [0.0, 0.0, 1.1]];
         let stiffness = faer::mat![[1e9, -1e9, 0.0], [-1e9, 3e9, -2e9], [0.0, -2e9, 2e9]];
         let modes = free_interface_modes("pad", mass.as_ref(), stiffness.as_ref(), &ModeSelection::All).unwrap();
-        // Rounding leaves ω² below n ε times the largest: 2.6e-8 of it in ω with n = 3.
+        // Rounding errors of ω² are below n ε times the largest ω²: 2.6e-8 of the largest ω for n = 3.
         assert!(modes.omega_rad_s[0] < (3.0 * f64::EPSILON).sqrt() * modes.omega_rad_s[2], "{:?}", modes.omega_rad_s);
     }
 

@@ -1,13 +1,13 @@
-//! Largest eigenpairs of an unsymmetric operator: block Arnoldi, restarted by its Schur form (Krylov-Schur).
+//! Largest eigenpairs of an unsymmetric operator: block Arnoldi with Krylov-Schur restarts.
 //!
 //! ```text
 //! C V = V H + W R E_lastᵀ,   Vᴴ V = I,   H = U T Uᴴ   =>   C (V Z) = (V Z) ZᴴHZ + W (R E_lastᵀ Z)
 //! ```
 //!
-//! `Z` spans the first columns of `U`, the eigenvalues of `T` ordered by magnitude: a space that `H` maps to itself, so
-//! that a full basis shrinks to its best part and goes on as if nothing had happened. A block catches multiple
-//! eigenvalues; vectors are kept orthogonal to all before them, twice. The basis of a real operator stays real: the
-//! space kept is closed under conjugation, and its projector `Re(U Uᴴ)` has a real basis.
+//! The eigenvalues of `T` are ordered by magnitude, and `Z` spans the first columns of `U`, an invariant subspace of
+//! `H`. A full basis is thus truncated to its best part without breaking the recurrence. A block finds multiple
+//! eigenvalues. Every new vector is orthogonalised twice against all previous ones. The basis of a real operator stays
+//! real: the retained subspace is closed under conjugation, so its projector `Re(U Uᴴ)` has a real basis.
 //!
 //! Source: Stewart, "A Krylov-Schur algorithm for large eigenproblems", SIAM J. Matrix Anal. Appl. 23 (2002) 601-614;
 //! Zhou, Saad, "Block Krylov-Schur method for large symmetric eigenvalue problems", Numer. Algorithms 47 (2008) 341-359.
@@ -19,28 +19,28 @@ use super::ReductionError;
 use super::lanczos::random_block;
 use super::schur::Schur;
 
-/// Vectors that enter the basis together.
+/// Block size: number of vectors added per step.
 pub(super) const BLOCK: usize = 4;
-/// Restarts after which no more progress is expected.
+/// Largest number of restarts.
 const MOST_RESTARTS: usize = 40;
-/// Rows of the basis that are recombined at once on a restart.
+/// Number of rows of the basis recombined at a time.
 const ROWS_TOGETHER: usize = 4096;
-/// Neighbouring magnitudes this close belong together when a basis is cut.
+/// Relative difference of magnitudes below which two eigenvalues are a pair that a restart must not separate.
 const TOGETHER: f64 = 1e-9;
 
-/// Numbers a basis is made of.
+/// Scalar type of a basis: real or complex.
 pub(super) trait Number: ComplexField<Real = f64> + Copy + std::ops::Mul<Output = Self> {
-    /// As a complex number.
+    /// Converts to a complex number.
     fn complex(self) -> c64;
-    /// Its first part, for a number known to be of this kind.
+    /// Converts from a complex number; a real type takes the real part.
     fn from_complex(value: c64) -> Self;
     /// `Aᴴ B`.
     fn inner(a: MatRef<'_, Self>, b: MatRef<'_, Self>) -> Mat<Self>;
     /// `A B`.
     fn product(a: MatRef<'_, Self>, b: MatRef<'_, Self>) -> Mat<Self>;
-    /// Whether a space must be closed under conjugation.
+    /// Whether the type is real, so that subspaces must be closed under conjugation.
     const REAL: bool;
-    /// An orthonormal basis of the span of `q`, orthonormal itself.
+    /// Basis of this type for the span of `q`, which has orthonormal columns; the result has them too.
     fn basis_of(q: MatRef<'_, c64>) -> Result<Mat<Self>, ReductionError>;
 }
 
@@ -63,7 +63,7 @@ impl Number for f64 {
         let m = q.nrows();
         let real = Mat::from_fn(m, m, |i, j| 0.5 * (projector[(i, j)].re + projector[(j, i)].re));
         let (_, vectors) = super::dense::symmetric_eigen("projector", real.as_ref())?;
-        // Eigenvalues 0 and 1, ascending.
+        // The projector has the eigenvalues 0 and 1, in ascending order.
         Ok(vectors.subcols(m - q.ncols(), q.ncols()).to_owned())
     }
 }
@@ -87,46 +87,50 @@ impl Number for c64 {
     }
 }
 
-/// Numbers in [-1, 1) of any kind, the same on every run.
+/// Pseudo-random numbers in [-1, 1), real or complex, reproducible.
 pub(super) fn random<T: Number>(n: usize, columns: usize, seed: u64) -> Mat<T> {
     let (re, im) = (random_block(n, columns, seed), random_block(if T::REAL { 0 } else { n }, columns, seed ^ 0x5a5a));
     Mat::from_fn(n, columns, |i, j| T::from_complex(c64::new(re[(i, j)], if T::REAL { 0.0 } else { im[(i, j)] })))
 }
 
-/// Converged eigenpairs, largest first.
+/// Converged eigenpairs in descending magnitude.
 pub(super) struct Largest {
     pub theta: Vec<c64>,
-    /// `n` by as many as `theta`, each of length 1.
+    /// Eigenvectors, `n×theta.len()`, 2-norm 1.
     pub vectors: Mat<c64>,
 }
 
-/// What the iteration is told.
+/// Parameters of the iteration.
 pub(super) struct Iteration<'a> {
-    /// How errors name the system.
+    /// Name of the system in errors.
     pub what: &'a str,
-    /// `n`.
+    /// Size `n` of the operator.
     pub dimension: usize,
-    /// Pairs that are wanted.
+    /// Number of pairs wanted.
     pub count: usize,
-    /// Residual a pair may have, relative to its `θ`.
+    /// Largest residual of a pair, relative to its `θ`.
     pub residual_limit: f64,
-    /// Which random start.
+    /// Seed of the random start block.
     pub seed: u64,
 }
 
-/// Vectors that a basis for `count` pairs holds at most.
+/// Largest size of a basis for `count` pairs.
 pub(super) fn capacity(dimension: usize, count: usize) -> usize {
     (3 * count + 4 * BLOCK).min(dimension / BLOCK * BLOCK)
 }
 
-/// Pairs that are handed back at most where `count` are wanted.
+/// Largest number of pairs returned where `count` are wanted.
 pub(super) fn most_found(count: usize) -> usize {
     count + count / 2
 }
 
 impl Iteration<'_> {
-    /// The largest pairs of `apply`: `count` of them or some more, or fewer where `enough` is content with the converged `θ`, or where
-    /// the whole space is at hand. `progress` is told how many vectors were built and how many pairs converged.
+    /// Computes the largest eigenpairs of `apply`: at least `count`, or fewer if `enough` accepts the converged `θ` or
+    /// the basis spans the whole (or an invariant) space. `progress` receives the number of vectors built and of
+    /// converged pairs.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `NotConverged`, `Factorisation`.
     pub(super) fn run<T: Number>(
         &self,
         apply: &dyn Fn(Mat<T>) -> Mat<T>,
@@ -181,13 +185,13 @@ impl Iteration<'_> {
     }
 }
 
-/// The ordered Schur form of the projected operator and the residual of every Ritz pair, relative to its `θ`.
+/// Ordered Schur form of the projected operator, and the residual of every Ritz pair relative to its `θ`.
 struct Ritz {
     schur: Schur,
     residuals: Vec<f64>,
 }
 
-/// Orthonormal vectors `V` with `H = Vᴴ C V`.
+/// Orthonormal basis `V` and the projected operator `H = Vᴴ C V`.
 struct Space<T: Number> {
     basis: Mat<T>,
     projected: Mat<c64>,
@@ -203,7 +207,7 @@ impl<T: Number> Space<T> {
         self.basis.subcols(self.size - BLOCK, BLOCK).to_owned()
     }
 
-    /// Takes everything the basis holds out of `w = C V_last`, twice, and notes the coefficients in `H`.
+    /// Orthogonalises `w = C V_last` against the basis, twice, and adds the coefficients to `H`.
     fn project_out(&mut self, w: &mut Mat<T>) {
         let first = self.size - BLOCK;
         for _ in 0..2 {
@@ -218,8 +222,8 @@ impl<T: Number> Space<T> {
         }
     }
 
-    /// Appends a block after making it orthonormal, `W = Q R`; `R` joins it to the block before, or `coupling` to all.
-    /// A vector that vanishes is replaced by a random one that nothing is joined to.
+    /// Orthonormalises a block, `W = Q R`, and appends `Q`. `R` couples it to the previous block; after a restart,
+    /// `coupling` couples `W` to the whole basis. A vector that vanishes is replaced by a random one without coupling.
     fn append(&mut self, block: Mat<T>, coupling: Option<Mat<c64>>, seed: u64) {
         let (n, start) = (block.nrows(), self.size);
         let mut r = Mat::<c64>::zeros(BLOCK, BLOCK);
@@ -230,7 +234,7 @@ impl<T: Number> Space<T> {
             (0..column).for_each(|i| r[(i, column)] = within[(i, 0)].complex());
             let mut norm = vector.norm_l2();
             if norm > 1e-13 * whole {
-                // What little is left of a vector may lean on all before.
+                // A small remainder may no longer be orthogonal to the basis.
                 self.make_orthogonal(&mut vector, 0);
                 norm = vector.norm_l2();
                 r[(column, column)] = c64::new(norm, 0.0);
@@ -253,7 +257,7 @@ impl<T: Number> Space<T> {
             self.size += 1;
         }
         let joined = match coupling {
-            // `W = Q R`: the coupling of `W` to the basis becomes that of `Q`.
+            // `W = Q R`: multiply by `R` to convert the coupling of `W` to that of `Q`.
             Some(of_w) => &r * of_w,
             None => r,
         };
@@ -263,7 +267,7 @@ impl<T: Number> Space<T> {
         }
     }
 
-    /// Takes out of a vector what the basis holds from its column `from` on; returns how much of each.
+    /// Orthogonalises a vector against the basis from column `from` on; returns the coefficients.
     fn make_orthogonal(&self, vector: &mut Mat<T>, from: usize) -> Mat<T> {
         let held = self.basis.subcols(from, self.size - from);
         let coefficients = T::inner(held, vector.as_ref());
@@ -271,7 +275,7 @@ impl<T: Number> Space<T> {
         coefficients
     }
 
-    /// The Schur form of `H` and residuals, `remainder` being the Gram matrix of the next block.
+    /// Ordered Schur form of `H` and residuals; `remainder` is the Gram matrix of the next block.
     fn ritz(&self, what: &str, remainder: MatRef<'_, T>) -> Result<Ritz, ReductionError> {
         let m = self.size;
         let failed = || ReductionError::Factorisation {
@@ -293,7 +297,7 @@ impl<T: Number> Space<T> {
         Ok(Ritz { schur, residuals })
     }
 
-    /// The first `count` Ritz vectors.
+    /// The Ritz vectors of the `count` largest Ritz values.
     fn vectors(&self, ritz: &Ritz, count: usize) -> Mat<c64> {
         let n = self.basis.nrows();
         let mut mixed = Mat::<c64>::zeros(self.size, count);
@@ -310,12 +314,12 @@ impl<T: Number> Space<T> {
         vectors
     }
 
-    /// Shrinks the basis to about `keep` vectors that hold the best pairs; returns how the next block `W` is joined to
-    /// them.
+    /// Truncates the basis to about `keep` vectors, which span the Schur vectors of the largest Ritz values. Returns
+    /// the coupling of the next block `W` to them.
     fn restart(&mut self, ritz: &Ritz, keep: usize) -> Result<Mat<c64>, ReductionError> {
         let m = self.size;
         let size = |k: usize| ritz.schur.value(k).norm();
-        // A conjugate pair is not cut in two.
+        // Do not separate a conjugate pair.
         let mut keep = keep.min(m - BLOCK);
         while keep > 1 && (size(keep - 1) - size(keep)).abs() < TOGETHER * size(keep) {
             keep -= 1;
@@ -339,7 +343,8 @@ impl<T: Number> Space<T> {
 mod tests {
     use super::*;
 
-    /// A block diagonal real operator with eigenvalues `(a ± b i)`, each block twice, largest first; restarts are needed.
+    /// A block-diagonal real operator with eigenvalues `a ± b i`, every block twice, largest first. The basis needs
+    /// restarts.
     #[test]
     fn double_complex_pairs_of_a_real_operator() {
         let blocks = 400;
@@ -364,11 +369,11 @@ mod tests {
             let nearest =
                 expected.iter().enumerate().min_by(|a, b| (a.1 - theta).norm().total_cmp(&(b.1 - theta).norm()));
             let (index, nearest) = nearest.map(|(i, value)| (i, *value)).unwrap();
-            // Blocks are not normal by a factor 2.
+            // The blocks are non-normal by a factor of 2.
             assert!((nearest - theta).norm() < 1e-11, "{theta} {nearest}");
             expected.remove(index);
         }
-        // None of the largest is left over.
+        // No larger eigenvalue was missed.
         let last = found.theta.last().unwrap().norm();
         assert!(expected[0].norm() <= last * (1.0 + 1e-9), "{} {last}", expected[0]);
         for (k, theta) in found.theta.iter().enumerate() {

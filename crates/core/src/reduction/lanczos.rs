@@ -4,8 +4,9 @@
 //! C V = V T + W E_lastᵀ,   VᵀV = I,   T s = θ s   =>   |C V s - θ V s| = |W s_last|
 //! ```
 //!
-//! Vectors are kept orthogonal to all before them, twice, so no ghosts appear; a block catches multiple eigenvalues.
-//! When the basis is full it is restarted from its best Ritz vectors, which `W` continues as if nothing had happened.
+//! Every new vector is orthogonalised twice against all previous ones, which prevents spurious copies of eigenvalues. A
+//! block finds multiple eigenvalues. A full basis is restarted from its best Ritz vectors; the residual block `W`
+//! continues the recurrence unchanged.
 //!
 //! Source: Grimes, Lewis, Simon, "A shifted block Lanczos algorithm for solving sparse symmetric generalized
 //! eigenproblems", SIAM J. Matrix Anal. Appl. 15 (1994) 228-272; Wu, Simon, "Thick-restart Lanczos method for large
@@ -16,44 +17,47 @@ use faer::{Mat, MatRef};
 use super::ReductionError;
 use super::dense::symmetric_eigen;
 
-/// Vectors that enter the basis together.
+/// Block size: number of vectors added per step.
 pub(super) const BLOCK: usize = 6;
-/// Restarts after which no more progress is expected.
+/// Largest number of restarts.
 const MOST_RESTARTS: usize = 60;
-/// Rows of the basis that are recombined at once.
+/// Number of rows of the basis recombined at a time.
 const ROWS_TOGETHER: usize = 4096;
 
 /// Converged eigenpairs, largest `θ` first.
 pub(super) struct Largest {
     pub theta: Vec<f64>,
-    /// `n` by as many as `theta`, orthonormal; they hold the memory of the whole basis.
+    /// Orthonormal eigenvectors, `n×theta.len()`. The matrix keeps the memory allocated for the whole basis.
     pub vectors: Mat<f64>,
 }
 
-/// What the iteration is told.
+/// Parameters of the iteration.
 pub(super) struct Iteration<'a> {
-    /// How errors name the system.
+    /// Name of the system in errors.
     pub what: &'a str,
-    /// `n`.
+    /// Size `n` of the operator.
     pub dimension: usize,
-    /// Pairs that are wanted at least.
+    /// Number of pairs wanted, at least.
     pub count: usize,
-    /// Vectors the basis may hold.
+    /// Largest size of the basis.
     pub capacity: usize,
-    /// Residual a pair may have, relative to its `θ`.
+    /// Largest residual of a pair, relative to its `θ`.
     pub residual_limit: f64,
-    /// Which random start.
+    /// Seed of the random start block.
     pub seed: u64,
 }
 
-/// Vectors that a basis for `count` pairs holds at most: nearly three times as many, so that few restarts are needed.
+/// Largest size of a basis for `count` pairs: nearly three times as many vectors, so that few restarts are needed.
 pub(super) fn capacity(dimension: usize, count: usize) -> usize {
     (11 * count / 4 + 8 * BLOCK).min(dimension / BLOCK * BLOCK)
 }
 
 impl Iteration<'_> {
-    /// The largest pairs of `apply`: as many as are needed until `enough` is satisfied with the converged `θ`.
-    /// `progress` is told how many vectors were built and how many pairs have converged.
+    /// Computes the largest eigenpairs of `apply` until `enough` accepts the converged `θ`. `progress` receives the
+    /// number of vectors built and of converged pairs.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `NotConverged`, `Factorisation`.
     pub(super) fn run(
         &self,
         apply: &dyn Fn(Mat<f64>) -> Mat<f64>,
@@ -74,7 +78,7 @@ impl Iteration<'_> {
                 let converged = (0..ritz.theta.len()).take_while(good).count();
                 progress(built, converged);
                 if enough(&ritz.theta[..converged]) {
-                    // In the memory of the basis: that is the most there is at a time.
+                    // Reuse the memory of the basis, which is the peak.
                     space.recombine(ritz.vectors.subcols(0, converged));
                     let mut vectors = space.basis;
                     vectors.truncate(self.dimension, converged);
@@ -104,12 +108,12 @@ impl Iteration<'_> {
 /// Approximate eigenpairs of the projected operator, largest `θ` first.
 struct Ritz {
     theta: Vec<f64>,
-    /// Relative to `θ`.
+    /// Residuals, relative to `θ`.
     residuals: Vec<f64>,
     vectors: Mat<f64>,
 }
 
-/// Orthonormal vectors `V` with `T = Vᵀ C V`.
+/// Orthonormal basis `V` and the projected operator `T = Vᵀ C V`.
 struct Space {
     basis: Mat<f64>,
     projected: Mat<f64>,
@@ -129,8 +133,8 @@ impl Space {
         self.basis.subcols(self.size - BLOCK, BLOCK).to_owned()
     }
 
-    /// Takes everything the basis holds out of `w = C V_last`, twice, notes the coefficients in `T`, and returns the
-    /// Gram matrix `wᵀ w` of what remains.
+    /// Orthogonalises `w = C V_last` against the basis, twice, and adds the coefficients to `T`. Returns the Gram
+    /// matrix `wᵀ w` of the remainder.
     fn project_out(&mut self, w: &mut Mat<f64>) -> Mat<f64> {
         let first = self.size - BLOCK;
         for _ in 0..2 {
@@ -142,13 +146,14 @@ impl Space {
         w.transpose() * &*w
     }
 
-    /// Appends a block after making it orthonormal; a vector that vanishes is replaced by a random one.
+    /// Orthonormalises a block and appends it. A vector that vanishes is replaced by a random one.
     fn append(&mut self, block: Mat<f64>, seed: u64) {
         let n = block.nrows();
         let block_start = self.size;
         for column in 0..BLOCK {
             let mut vector = block.subcols(column, 1).to_owned();
-            // The block is orthogonal to all before it already, unless little is left of a vector within the block.
+            // The block is already orthogonal to the basis, unless cancellation within the block leaves little of a
+            // vector.
             let mut from = block_start;
             for attempt in 0..4_u64 {
                 let before = vector.norm_l2();
@@ -170,17 +175,17 @@ impl Space {
         }
     }
 
-    /// Takes out of a vector what the basis holds from its column `from` on.
+    /// Orthogonalises a vector against the basis from column `from` on.
     fn make_orthogonal(&self, vector: &mut Mat<f64>, from: usize) {
         let held = self.basis.subcols(from, self.size - from);
         let coefficients = held.transpose() * &*vector;
         *vector -= held * coefficients;
     }
 
-    /// Ritz values and residuals, `remainder` being the Gram matrix of the next block.
+    /// Ritz pairs and their residuals; `remainder` is the Gram matrix of the next block.
     fn ritz(&self, what: &str, remainder: MatRef<'_, f64>) -> Result<Ritz, ReductionError> {
         let m = self.size;
-        // Columns of T are known from their own step; the upper triangle holds each coupling once.
+        // Each column of T is computed in its own step, so that the upper triangle holds every coefficient once.
         let t = Mat::from_fn(m, m, |i, j| self.projected[(i.min(j), i.max(j))]);
         let (theta, vectors) = symmetric_eigen(what, t.as_ref())?;
         let residual = |k: usize| {
@@ -194,7 +199,7 @@ impl Space {
         })
     }
 
-    /// Puts `V S` in place of the first vectors.
+    /// Overwrites the first columns of the basis with `V S`.
     fn recombine(&mut self, s: MatRef<'_, f64>) {
         for first in (0..self.basis.nrows()).step_by(ROWS_TOGETHER) {
             let rows = ROWS_TOGETHER.min(self.basis.nrows() - first);
@@ -203,7 +208,7 @@ impl Space {
         }
     }
 
-    /// Keeps the `keep` best Ritz vectors; what remains of the last block goes on from them.
+    /// Restarts from the `keep` best Ritz vectors; the recurrence continues with the remainder of the last block.
     fn restart(&mut self, ritz: &Ritz, keep: usize) {
         self.recombine(ritz.vectors.subcols(0, keep));
         self.projected.fill(0.0);
@@ -214,7 +219,7 @@ impl Space {
     }
 }
 
-/// Numbers in [-1, 1), the same on every run (SplitMix64, Steele et al. 2014).
+/// Pseudo-random numbers in [-1, 1), reproducible (SplitMix64, Steele et al. 2014).
 pub(super) fn random_block(n: usize, columns: usize, seed: u64) -> Mat<f64> {
     let mut state = seed.wrapping_mul(0x2545_f491_4f6c_dd1d).wrapping_add(0x1234_5678);
     let mut next = || {
@@ -246,7 +251,7 @@ mod tests {
         let found = iteration.run(&apply, &|theta| theta.len() >= 12, &mut |built, _| most = built).unwrap();
         assert!(most > 72, "no restart was needed: {most} vectors");
         for (k, found) in found.theta[..12].iter().enumerate() {
-            // An eigenvalue is no further away than the residual.
+            // The error of an eigenvalue is at most the residual.
             assert!((found - theta(k)).abs() < 1e-12, "{k}: {found}");
         }
         let gram = found.vectors.transpose() * &found.vectors;

@@ -1,17 +1,18 @@
-//! Schur form of a small complex matrix, its eigenvalues in any order.
+//! Complex Schur form of a small matrix, with eigenvalues in any order.
 //!
 //! ```text
 //! A = U T Uᴴ,   Uᴴ U = I,   T upper triangular
 //! ```
 //!
-//! By Householder reflections to Hessenberg form and the QR iteration with Wilkinson's shift; neighbours on the diagonal
-//! change places by a rotation. All of it is backward stable, however near eigenvectors are to each other.
+//! The matrix is reduced to Hessenberg form by Householder reflections, then to triangular form by QR iterations with
+//! Wilkinson's shift. A rotation exchanges neighbouring eigenvalues. All steps are backward stable, even for nearly
+//! parallel eigenvectors.
 //!
 //! Source: Golub, Van Loan, "Matrix computations" (2013), sections 7.4 to 7.6.
 
 use faer::{Mat, MatRef, c64};
 
-/// Iterations for each eigenvalue before the matrix is given up.
+/// Largest number of QR iterations per eigenvalue.
 const MOST_ITERATIONS: usize = 60;
 
 /// `A = U T Uᴴ`.
@@ -24,7 +25,7 @@ const ZERO: c64 = c64::new(0.0, 0.0);
 const ONE: c64 = c64::new(1.0, 0.0);
 
 impl Schur {
-    /// The Schur form of `matrix`, `m×m`; `None` where an eigenvalue does not converge.
+    /// Schur form of `matrix`, `m×m`; `None` if an eigenvalue does not converge.
     pub(super) fn new(matrix: MatRef<'_, c64>) -> Option<Self> {
         let m = matrix.nrows();
         let mut schur = Self { t: matrix.to_owned(), u: Mat::identity(m, m) };
@@ -32,7 +33,7 @@ impl Schur {
         schur.iterate().then_some(schur)
     }
 
-    /// Makes `T` zero below its first subdiagonal.
+    /// Reduces `T` to Hessenberg form: zero below the first subdiagonal.
     fn hessenberg(&mut self) {
         let m = self.t.nrows();
         for k in 0..m.saturating_sub(2) {
@@ -60,7 +61,7 @@ impl Schur {
         }
     }
 
-    /// QR iterations until `T` is triangular.
+    /// QR iterations until `T` is triangular; `false` if an eigenvalue does not converge.
     fn iterate(&mut self) -> bool {
         let m = self.t.nrows();
         let size = self.t.norm_max().max(f64::MIN_POSITIVE);
@@ -88,7 +89,8 @@ impl Schur {
         true
     }
 
-    /// The eigenvalue of the last block of two that is nearer to its corner; now and then something else.
+    /// Wilkinson's shift: the eigenvalue of the trailing 2x2 block nearer to its last entry. Every tenth iteration uses
+    /// an exceptional shift instead.
     fn shift(&self, end: usize, iterations: usize) -> c64 {
         let (i, j) = (end - 2, end - 1);
         let (a, b, c, d) = (self.t[(i, i)], self.t[(i, j)], self.t[(j, i)], self.t[(j, j)]);
@@ -101,7 +103,7 @@ impl Schur {
         d + if plus.norm() < minus.norm() { plus } else { minus }
     }
 
-    /// One QR step of the rows from `start` to `end`.
+    /// One QR step on the active block, rows `start` to `end` (exclusive).
     fn sweep(&mut self, start: usize, end: usize, shift: c64) {
         let m = self.t.nrows();
         let (mut x, mut y) = (self.t[(start, start)] - shift, self.t[(start + 1, start)]);
@@ -122,7 +124,7 @@ impl Schur {
         }
     }
 
-    /// Columns `k` and `k + 1` of `T`, down to row `rows`, and of `U` times `[[c, -s̄], [s, c̄]]`.
+    /// Multiplies columns `k` and `k + 1` of `T`, down to row `rows`, and of `U` by `[[c, -s̄], [s, c̄]]`.
     fn mix_columns(&mut self, k: usize, [c, s]: [c64; 2], rows: usize) {
         let m = self.u.nrows();
         for (matrix, rows) in [(&mut self.t, rows), (&mut self.u, m)] {
@@ -134,7 +136,7 @@ impl Schur {
         }
     }
 
-    /// Lets the eigenvalues at `k` and `k + 1` change places.
+    /// Exchanges the eigenvalues at `k` and `k + 1`.
     fn swap(&mut self, k: usize) {
         let m = self.t.nrows();
         let (first, second, above) = (self.t[(k, k)], self.t[(k + 1, k + 1)], self.t[(k, k + 1)]);
@@ -165,12 +167,12 @@ impl Schur {
         }
     }
 
-    /// The eigenvalue at place `k`.
+    /// The eigenvalue at position `k`.
     pub(super) fn value(&self, k: usize) -> c64 {
         self.t[(k, k)]
     }
 
-    /// The eigenvector at place `k` of the matrix itself, of length 1.
+    /// Eigenvector of the original matrix for the eigenvalue at position `k`, 2-norm 1.
     pub(super) fn vector(&self, k: usize) -> Mat<c64> {
         let tiny = f64::EPSILON * self.t.norm_max();
         let mut y = Mat::<c64>::zeros(k + 1, 1);
@@ -196,7 +198,7 @@ mod tests {
         let m = 60;
         let (re, im) = (random_block(m, m, 3), random_block(m, m, 4));
         let mut matrix = Mat::from_fn(m, m, |i, j| c64::new(re[(i, j)], im[(i, j)]));
-        // A defective pair and a multiple eigenvalue on top.
+        // Add a defective pair and a multiple eigenvalue.
         for j in 0..m {
             for i in [10, 11, 12] {
                 matrix[(i, j)] = ZERO;
