@@ -1,8 +1,9 @@
-//! Lowest real modes of a large sparse system.
+//! Lowest real modes of a large sparse symmetric system.
 //!
-//! With `A = K + s M = L Lᵀ` positive definite, `C = L⁻¹ M L⁻ᵀ` is symmetric and has the eigenvalues
-//! `θ = 1 / (ω² + s)`, largest for the lowest modes; `φ = L⁻ᵀ y / √θ`. A small `s` keeps bodies that float freely apart
-//! from singular. The inertia of `K - σ M` counts the modes below `σ` (Sylvester), so that a missed one is an error.
+//! With `A = K + s M = L Lᵀ` positive definite, `C = L⁻¹ M L⁻ᵀ` is symmetric with the eigenvalues `θ = 1 / (ω² + s)`,
+//! the largest of which belong to the lowest modes. The eigenvectors `y` of `C` give `φ = L⁻ᵀ y / √θ`. A small shift
+//! `s` keeps `A` definite when there are rigid-body modes. The inertia of `K - σ M` counts the modes below `σ`
+//! (Sylvester's law), which detects missed modes.
 
 use faer::Mat;
 
@@ -12,60 +13,63 @@ use super::pencil::{Llt, Pencil};
 use super::sparse::{entries, one_norm, times};
 use super::{ReductionError, SparseMatrix, whiten};
 
-/// Residual of `C` a mode may have, relative to its `θ`.
+/// Largest residual of an eigenpair of `C`, relative to its `θ`.
 const RESIDUAL_LIMIT: f64 = 1e-12;
-/// Residual `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` a mode may have, in 1-norms of the matrices.
+/// Largest backward error `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of a mode, with 1-norms of the matrices.
 const BACKWARD_LIMIT: f64 = 1e-12;
-/// Two neighbouring `ω²` this far apart, relative to their size, leave room for a Sturm count between them.
+/// Relative gap of two neighbouring `ω²` that is wide enough for an inertia (Sturm) count between them.
 const GAP: f64 = 1e-7;
 /// Below this many degrees of freedom a dense solve is at least as fast.
 const DENSE_BELOW: usize = 400;
-/// The first shift that is tried, and the largest, relative to `tr K / tr M`.
+/// The first and the largest shift to try, relative to `tr K / tr M`.
 const FIRST_SHIFT: f64 = 1e-8;
 const LARGEST_SHIFT: f64 = 1e5;
-/// Above this ratio of `θ` the shift is moved: small `θ` would drown in the rounding of the largest.
+/// Largest ratio of the wanted `θ`. Above it the shift is increased, because small `θ` would lose digits to the
+/// rounding of the largest.
 const WIDEST_SPREAD: f64 = 1e6;
 
-/// Which modes are wanted.
+/// Which modes to compute.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Wanted {
-    /// As many of lowest frequency.
+    /// The modes of lowest frequency, as many as given.
     Lowest(usize),
-    /// Every one with `ω` below this, rad/s.
+    /// All modes with `ω` below this, rad/s.
     Below(f64),
-    /// The same, as many as [`Analysed::count_below`] counted.
+    /// All modes below `below_rad_s`, whose number [`Analysed::count_below`] has already determined.
     Counted { modes: usize, below_rad_s: f64 },
 }
 
-/// What a computation of modes is doing.
+/// Progress of a computation of modes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Progress {
     /// The system is being ordered and analysed.
     Analysing,
-    /// Ordered and analysed: the numbers in a factor and the bytes that will be needed beside what is held already.
+    /// The system is ordered and symbolically analysed. `factor_entries` is the number of entries of a factor; `bytes`
+    /// is the memory needed in addition to what is already held.
     Analysed { factor_entries: usize, bytes: usize },
-    /// `K + s M` is factored, `s` in rad²/s².
+    /// `K + s M` is factorised with the shift `s`, rad²/s².
     Factored { shift: f64 },
-    /// Vectors built so far, and modes converged of those wanted.
+    /// Lanczos vectors built so far, and how many of the wanted modes have converged.
     Iterated { vectors: usize, converged: usize, wanted: usize },
-    /// The inertia of `K - σ M` told how many modes lie below `ω² = σ`, rad²/s².
+    /// The inertia of `K - σ M` gave the number of modes below `ω² = σ`, rad²/s².
     Counted { modes: usize, below: f64 },
-    /// Static responses found so far, of those to unit loads at the contact.
+    /// Number of unit loads at the contact whose static response has been computed, of `loads`.
     Loaded { solved: usize, loads: usize },
 }
 
-/// Lowest modes of a symmetric system that need not be stable.
+/// Lowest modes of a symmetric system, which may be statically unstable.
 #[derive(Clone, Debug)]
 pub struct SparseModes {
-    /// `ω²`, rad²/s², ascending; negative where the stiffness is not semidefinite.
+    /// `ω²`, rad²/s², ascending; negative values occur if the stiffness is indefinite.
     pub omega_squared: Vec<f64>,
-    /// `Φ`, degrees of freedom by modes, kg^-1/2, `Φᵀ M Φ = I`.
+    /// `Φ`, degrees of freedom by modes, kg^-1/2, mass-normalised: `Φᵀ M Φ = I`.
     pub phi: Mat<f64>,
-    /// `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of every mode, 2-norms of vectors and 1-norms of matrices.
+    /// Backward error `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of every mode, with 2-norms of vectors and 1-norms of
+    /// matrices.
     pub residuals: Vec<f64>,
 }
 
-/// The `count` lowest modes of `K φ = ω² M φ`: [`normal_modes`] without a limit of memory.
+/// The `count` lowest modes of `K φ = ω² M φ`: [`normal_modes`] without a memory limit.
 ///
 /// # Errors
 /// As [`normal_modes`].
@@ -78,10 +82,11 @@ pub fn lowest_modes(
     normal_modes(what, mass, stiffness, Wanted::Lowest(count), None, &mut |_| {})
 }
 
-/// The lowest modes of `K φ = ω² M φ`, both sparse, symmetric, `n×n`, `M` positive definite.
+/// The lowest modes of `K φ = ω² M φ` with sparse, symmetric `n×n` matrices: `mass` `M`, kg, positive definite, and
+/// `stiffness` `K`, N/m.
 ///
-/// `what` is how errors name the system; `memory_limit_bytes` is what may be taken beside what is held, compared with the need before the work starts;
-/// `progress` hears what is done.
+/// `what` names the system in errors. `memory_limit_bytes` limits the memory taken in addition to what is already held;
+/// the estimated need is compared with it before the work starts. `progress` receives the progress.
 ///
 /// # Errors
 /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `ModeCount`, `Memory`, `NoShift`,
@@ -97,7 +102,8 @@ pub fn normal_modes(
     Analysed::new(what, mass, stiffness)?.modes(wanted, memory_limit_bytes, progress)
 }
 
-/// A sparse symmetric system `K - σ M`, checked, ordered and analysed: ready for its modes and what they leave out.
+/// A sparse symmetric system `K - σ M`, checked, ordered and symbolically analysed: ready to compute its modes and
+/// residuals.
 pub struct Analysed<'a> {
     pub(super) pencil: Pencil<'a>,
 }
@@ -111,27 +117,28 @@ impl<'a> Analysed<'a> {
         Ok(Self { pencil: Pencil::new(what, mass, stiffness)? })
     }
 
-    /// Bytes that are held beside both matrices as they came.
+    /// Bytes held in addition to the two given matrices.
     pub fn held_bytes(&self) -> usize {
         self.pencil.held_bytes()
     }
 
-    /// Bytes that `count` modes need beside that: a factor and, while it is made, what that takes, or the vectors of the iteration.
+    /// Estimated bytes needed for `count` modes in addition to [`Self::held_bytes`]: the factor, plus the larger of the
+    /// memory to compute it and the vectors of the iteration.
     pub fn bytes_for(&self, count: usize) -> usize {
         let n = self.pencil.dimension();
-        // The basis; a block, its products and what they are made from, or as much of the vectors at the end.
+        // The basis, and temporaries: a block and its products, or a set of vectors transformed back at the end.
         let vectors = size_of::<f64>() * n * (capacity(n, count) + AT_A_TIME * TOGETHER);
-        // Beside all modes, when the factor has gone: they themselves again, K and M times them.
+        // After the factor is freed: the modes, a copy of them, and their products with K and M.
         let finished = size_of::<f64>() * n * 4 * count;
         (self.pencil.factor_bytes() + vectors.max(self.pencil.factoring_bytes())).max(finished)
     }
 
-    /// Numbers the factor holds.
+    /// Number of entries of a factor.
     pub fn factor_entries(&self) -> usize {
         self.pencil.factor_entries()
     }
 
-    /// How many modes lie below `omega_rad_s`, by the inertia of `K - ω² M`.
+    /// Number of modes below `omega_rad_s`, from the inertia of `K - ω² M`.
     ///
     /// # Errors
     /// [`ReductionError::Factorisation`].
@@ -161,7 +168,7 @@ impl<'a> Analysed<'a> {
             }
             _ => Ok(()),
         };
-        // Without a count, the factor alone tells whether counting is possible.
+        // Without a known count, check only whether there is memory for the factor that counting needs.
         let analysed = told(match wanted {
             Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
             Wanted::Below(_) => 0,
@@ -213,7 +220,7 @@ impl<'a> Analysed<'a> {
             };
             match counted {
                 Ok(()) => return finish(pencil, found.first(count)),
-                // Another start vector, before giving up.
+                // Retry with another start block before giving up.
                 Err(ReductionError::MissedModes { .. }) if attempt < 3 => {}
                 Err(error) => return Err(error),
             }
@@ -222,9 +229,10 @@ impl<'a> Analysed<'a> {
     }
 }
 
-/// Vectors that are solved for together at the end.
+/// Number of vectors transformed back at a time.
 const TOGETHER: usize = 24;
-/// Copies of them at a time: before, in the order of elimination, while solving, and back.
+/// Number of copies of them held meanwhile: the input, permuted to the order of elimination, during the solve, and
+/// permuted back.
 const AT_A_TIME: usize = 4;
 
 /// Modes before their residuals are known.
@@ -245,7 +253,11 @@ fn typical_square(pencil: &Pencil<'_>) -> f64 {
     (trace(pencil.stiffness) / trace(pencil.mass)).max(f64::MIN_POSITIVE)
 }
 
-/// `K + s M = L Lᵀ` with the smallest of a few `s` from `first` on for which it is positive definite.
+/// Factorises `K + s M = L Lᵀ` with the smallest `s` of the sequence `first`, 100 `first`, ... for which it is positive
+/// definite.
+///
+/// # Errors
+/// [`ReductionError`]: `NoShift`, `Factorisation`.
 fn factor_from<'p>(pencil: &'p Pencil<'_>, first: f64) -> Result<(Llt<'p>, f64), ReductionError> {
     let most = typical_square(pencil) * LARGEST_SHIFT;
     let mut shift = first;
@@ -258,7 +270,7 @@ fn factor_from<'p>(pencil: &'p Pencil<'_>, first: f64) -> Result<(Llt<'p>, f64),
     Err(ReductionError::NoShift { what: pencil.what.to_owned(), value: shift })
 }
 
-/// All modes by a dense solve, for small systems.
+/// The `count` lowest modes by a dense solve, for small systems.
 fn dense(pencil: &Pencil<'_>, count: usize) -> Result<Found, ReductionError> {
     let whitening = whiten(&format!("{}.mass", pencil.what), pencil.mass.to_dense().as_ref())?;
     let stiffness = pencil.stiffness.to_dense();
@@ -268,8 +280,8 @@ fn dense(pencil: &Pencil<'_>, count: usize) -> Result<Found, ReductionError> {
     Ok(Found { omega_squared: squares[..count].to_vec(), phi })
 }
 
-/// Converged modes by Lanczos on `L⁻¹ M L⁻ᵀ`: `count` of them, and some more up to a gap where no cut-off is given; and
-/// the shift, which is `first` or more.
+/// Converged modes by Lanczos on `L⁻¹ M L⁻ᵀ`: `count` of them and, without a cut-off, more until a gap follows. Also
+/// returns the shift used, which is at least `first`.
 fn shifted(
     pencil: &Pencil<'_>,
     first: f64,
@@ -279,7 +291,7 @@ fn shifted(
     progress: &mut dyn FnMut(Progress),
 ) -> Result<(Found, f64), ReductionError> {
     let n = pencil.dimension();
-    // The one that a test loses comes on top.
+    // One more, because a test removes one.
     #[cfg(test)]
     let count = count + usize::from(crate::spoil::spoilt(crate::spoil::Spoil::Mode));
     let (factor, shift) = factor_from(pencil, first)?;
@@ -314,7 +326,7 @@ fn shifted(
     for (k, theta) in largest.theta.iter().enumerate() {
         basis.col_mut(k).iter_mut().for_each(|value| *value /= theta.sqrt());
     }
-    // What the basis took is given back as soon as the factor is.
+    // Free the factor, then copy the modes out of the larger allocation of the basis.
     drop(factor);
     let phi = basis.as_ref().to_owned();
     let found = Found { omega_squared: largest.theta.into_iter().map(square).collect(), phi };
@@ -323,7 +335,7 @@ fn shifted(
     Ok((found, shift))
 }
 
-/// Compares the modes found below a gap with the inertia of `K - σ M` there.
+/// Checks that the number of modes below the first gap after `count` equals the inertia count of `K - σ M` there.
 fn complete_below_gap(
     pencil: &Pencil<'_>,
     squares: &[f64],
@@ -340,8 +352,8 @@ fn complete_below_gap(
     if counted == found { Ok(()) } else { missed(found, counted, below) }
 }
 
-/// That the `count` lowest modes found are those which the inertia of `K - σ M` counted below the cut-off `σ`: one
-/// missed below would let one from above in.
+/// Checks that the `count` lowest modes found all lie below the cut-off `σ`, where the inertia of `K - σ M` counted as
+/// many. A missed mode would let one from above the cut-off take its place.
 fn complete_below_cutoff(pencil: &Pencil<'_>, squares: &[f64], count: usize, below: f64) -> Result<(), ReductionError> {
     let found = squares.iter().filter(|square| **square < below + GAP * below.abs()).count();
     if found >= count {
@@ -350,13 +362,16 @@ fn complete_below_cutoff(pencil: &Pencil<'_>, squares: &[f64], count: usize, bel
     Err(ReductionError::MissedModes { what: pencil.what.to_owned(), found, counted: count, below })
 }
 
-/// The smallest number of values, at least `count`, after which a gap follows.
+/// Smallest number of values, at least `count`, that is followed by a gap; `None` if there is none.
 fn gap_after(squares: &[f64], count: usize) -> Option<usize> {
     let largest = squares.iter().fold(0.0, |largest: f64, square| largest.max(square.abs()));
     (count..squares.len()).find(|&k| squares[k] - squares[k - 1] > GAP * squares[k].abs().max(1e-6 * largest))
 }
 
-/// Signs, and the residual of every mode in explicit arithmetic.
+/// Normalises signs and computes the backward error of every mode explicitly.
+///
+/// # Errors
+/// [`ReductionError::Residual`].
 fn finish(pencil: &Pencil<'_>, found: Found) -> Result<SparseModes, ReductionError> {
     let Found { omega_squared, mut phi } = found;
     fix_signs(&mut phi);
@@ -382,7 +397,8 @@ mod tests {
     use super::*;
     use faer::sparse::Triplet;
 
-    /// A square membrane of `side × side` points: `ω² = 4 - 2 cos(pπ/(s+1)) - 2 cos(qπ/(s+1))`, nearly all double.
+    /// A square membrane of `side × side` points: `ω² = (4 - 2 cos(pπ/(s+1)) - 2 cos(qπ/(s+1))) / mass_of` with
+    /// `s = side`; nearly all are double.
     fn membrane(side: usize, mass_of: f64) -> (SparseMatrix, SparseMatrix, Vec<f64>) {
         let at = |x: usize, y: usize| x * side + y;
         let (mut stiffness, mut mass, mut expected) = (vec![], vec![], vec![]);
@@ -418,14 +434,14 @@ mod tests {
         let inertia = times(&mass, modes.phi.as_ref());
         let stiff = times(&stiffness, modes.phi.as_ref());
         let residual = Mat::from_fn(900, 40, |i, k| stiff[(i, k)] - modes.omega_squared[k] * inertia[(i, k)]);
-        // `A r` grows by the norm of K, 8, over what the iteration tolerates.
+        // The residual in `K` and `M` exceeds that of the iteration by the norm of K, 8.
         assert!(residual.norm_max() < 8.0 * 1e-10 * modes.phi.norm_max(), "{:e}", residual.norm_max());
     }
 
     #[test]
     fn a_free_and_an_unstable_membrane() {
         let (mass, stiffness, expected) = membrane(25, 2.0);
-        // Lowered by a multiple of the mass: the first modes become negative, one of them zero.
+        // Subtracting a multiple of the mass makes the first `ω²` negative, and one of them zero.
         let lowered = weighted_sum(625, &[(1.0, &stiffness), (-expected[3], &mass)]).unwrap();
         let modes = lowest_modes("system", &mass, &lowered, 12).unwrap();
         for (found, expected_here) in modes.omega_squared.iter().zip(&expected) {
@@ -436,7 +452,7 @@ mod tests {
     #[test]
     fn modes_below_a_cut_off_are_counted_first() {
         let (mass, stiffness, expected) = membrane(30, 1e-7);
-        // Between the 17th and the 18th, which are one pair apart from the rest; rad/s.
+        // Between the 17th and the 18th frequency, where a pair ends; rad/s.
         let cutoff = (0.5 * (expected[16] + expected[17])).sqrt();
         let below = expected.iter().filter(|square| **square < cutoff * cutoff).count();
         let mut told = vec![];
@@ -457,12 +473,12 @@ mod tests {
         let mut told = vec![];
         let refused = normal_modes("disc", &mass, &stiffness, Wanted::Lowest(40), Some(1 << 20), &mut |p| told.push(p));
         let Err(ReductionError::Memory { bytes, limit, .. }) = refused else { panic!("{refused:?}") };
-        // At least the basis of 3·40 + 48 vectors of 900 numbers.
+        // At least a basis of 3·40 + 48 vectors of 900 numbers.
         assert!(bytes > 168 * 900 * 8 && limit == 1 << 20, "{bytes} {limit}");
         assert!(matches!(told[..], [Progress::Analysed { .. }]), "{told:?}");
     }
 
-    /// Without mode `lost`.
+    /// `found` without the mode at index `lost`.
     pub(super) fn without(found: Found, lost: usize) -> Found {
         let Found { mut omega_squared, phi } = found;
         omega_squared.remove(lost);
@@ -471,8 +487,8 @@ mod tests {
         Found { omega_squared, phi }
     }
 
-    /// A mode that the iteration loses each time it is begun anew is missed by the count of the inertia, where modes are asked for
-    /// by number as well as below a cut-off.
+    /// The inertia count detects a mode that every attempt of the iteration misses, both for a given number of modes
+    /// and for a cut-off.
     #[test]
     fn a_lost_mode_is_missed_by_the_inertia() {
         use crate::spoil::{Spoil, with};
@@ -494,8 +510,8 @@ mod tests {
         }
     }
 
-    /// Every other point without inertia of its own against its neighbour's: `M = [1 1; 1 1]` in pairs. Condensed by hand,
-    /// `M` acts on the sum of a pair alone: `K⁻¹ M` and its projection on the sums have the same eigenvalues `1/ω²`.
+    /// A semidefinite mass with blocks `M = [1 1; 1 1]` for pairs of points. Condensed by hand, `M` acts on the sum of
+    /// a pair only: `K⁻¹ M` and its projection on the sums have the same non-zero eigenvalues `1/ω²`.
     #[test]
     fn a_semidefinite_mass_has_as_many_modes_as_its_rank() {
         let (_, stiffness, _) = membrane(25, 1.0);

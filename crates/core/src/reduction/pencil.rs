@@ -1,4 +1,4 @@
-//! `K - σ M` of a sparse symmetric system: analysed once, factored at many shifts.
+//! The pencil `K - σ M` of a sparse symmetric system: analysed once, factorised at many shifts.
 
 use std::sync::Arc;
 
@@ -20,12 +20,13 @@ use super::ordering::nested_dissection;
 use super::sparse::{entries, worst_asymmetry};
 use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
 
-/// Steps of the Lanczos recurrence that looks for the smallest eigenvalue of a scaled mass matrix.
+/// Number of Lanczos steps to estimate the smallest eigenvalue of a scaled mass matrix.
 const MASS_STEPS: usize = 40;
-/// A scaled mass matrix whose smallest eigenvalue is found above this needs no factorisation to be told definite.
+/// Estimated smallest eigenvalue of a scaled mass matrix above which it counts as positive definite without a
+/// factorisation.
 const CLEARLY_DEFINITE: f64 = 1e-3;
 
-/// A symmetric pencil `K - σ M`: lower triangles on one pattern, ordered and analysed.
+/// A symmetric pencil `K - σ M`: the lower triangles on a common pattern, ordered and symbolically analysed.
 pub(super) struct Pencil<'a> {
     pub what: &'a str,
     pub mass: &'a SparseMatrix,
@@ -37,7 +38,8 @@ pub(super) struct Pencil<'a> {
 }
 
 impl<'a> Pencil<'a> {
-    /// Checks both matrices, orders their common pattern by nested dissection and analyses it.
+    /// Checks both matrices, orders their common pattern by nested dissection and analyses it symbolically; `what`
+    /// names the system in errors.
     pub(super) fn new(
         what: &'a str,
         mass: &'a SparseMatrix,
@@ -46,7 +48,7 @@ impl<'a> Pencil<'a> {
         Self::with_last(what, mass, stiffness, &[])
     }
 
-    /// The same with the rows `last` eliminated after all others, in that order.
+    /// Like [`Self::new`], with the rows `last` eliminated after all others, in the given order.
     pub(super) fn with_last(
         what: &'a str,
         mass: &'a SparseMatrix,
@@ -91,26 +93,28 @@ impl<'a> Pencil<'a> {
         self.mass.nrows()
     }
 
-    /// Numbers the factor holds.
+    /// Number of entries of a factor.
     pub(super) fn factor_entries(&self) -> usize {
         self.symbolic.len_val()
     }
 
-    /// Bytes held once it is analysed, beside both matrices as they came: their lower triangles, and what the analysis found.
+    /// Bytes held after the analysis in addition to the two given matrices: their lower triangles and the symbolic
+    /// factor.
     pub(super) fn held_bytes(&self) -> usize {
         let (index, float) = (size_of::<usize>(), size_of::<f64>());
         let supernodes = supernodal(&self.symbolic);
-        // Rows of every supernode, by columns and by rows; the order both ways, and where columns and supernodes begin.
+        // Row indices of the supernodes, by columns and by rows; the permutation and its inverse; offsets of columns
+        // and supernodes.
         let analysis = 2 * supernodes.row_idx().len() + 6 * self.dimension();
         (index + 2 * float) * self.lower_mass.len() + index * analysis
     }
 
-    /// Bytes of a factor.
+    /// Bytes of one factor.
     pub(super) fn factor_bytes(&self) -> usize {
         size_of::<f64>() * self.factor_entries()
     }
 
-    /// Bytes that making a factor needs beside it: the shifted matrix, and what faer works in.
+    /// Additional bytes needed while a factor is computed: the shifted matrix and the workspace of faer.
     pub(super) fn factoring_bytes(&self) -> usize {
         let llt = self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default());
         let ldlt = self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default());
@@ -122,7 +126,7 @@ impl<'a> Pencil<'a> {
         self.lower_stiffness.iter().zip(&self.lower_mass).map(|(stiffness, mass)| k * stiffness + m * mass).collect()
     }
 
-    /// `K + s M = L Lᵀ`; `None` where that is not positive definite.
+    /// Cholesky factor `K + s M = L Lᵀ`; `None` if the matrix is not positive definite.
     pub(super) fn llt(&self, shift: f64) -> Result<Option<Llt<'_>>, ReductionError> {
         let lower = self.sum(1.0, shift);
         let mut values = self.room(self.symbolic.len_val())?;
@@ -143,7 +147,8 @@ impl<'a> Pencil<'a> {
         }
     }
 
-    /// How many `ω²` lie below `square`: negative pivots of `K - σ M = L D Lᵀ` (Sylvester's law of inertia).
+    /// Number of `ω²` below `square`, rad²/s²: the number of negative pivots of `K - σ M = L D Lᵀ` (Sylvester's law of
+    /// inertia).
     pub(super) fn count_below(&self, square: f64) -> Result<usize, ReductionError> {
         let pivots = self.pivots(&self.sum(1.0, -square))?;
         match pivots.iter().find(|(_, pivot)| !pivot.is_finite()) {
@@ -152,7 +157,8 @@ impl<'a> Pencil<'a> {
         }
     }
 
-    /// `P (K - σ M) Pᵀ = L D Lᵀ`, without exchanging pivots: what it solves is to be checked.
+    /// Factorises `P (K - σ M) Pᵀ = L D Lᵀ` with `σ = square`. There is no numerical pivoting, so callers must check
+    /// the accuracy of solves.
     pub(super) fn ldlt(&self, square: f64) -> Result<Ldlt, ReductionError> {
         self.factor_ldlt(&self.sum(1.0, -square))
     }
@@ -175,15 +181,16 @@ impl<'a> Pencil<'a> {
         Ok(Ldlt { symbolic: self.symbolic.clone(), values })
     }
 
-    /// The pivots of `L D Lᵀ`, each with the row it belongs to.
+    /// The pivots of `L D Lᵀ`, each with its row.
     fn pivots(&self, lower: &[f64]) -> Result<Vec<(usize, f64)>, ReductionError> {
         let factor = self.factor_ldlt(lower)?;
         Ok(forward(&self.symbolic).iter().copied().zip(factor.pivots()).collect())
     }
 
-    /// That `M` is positive semidefinite with a positive diagonal. A mesh's mass matrix, scaled to a unit diagonal, has
-    /// eigenvalues well away from zero, which a short Lanczos recurrence shows; only where it does not, `M` is factored,
-    /// its diagonal raised by [`SEMIDEFINITE_TOLERANCE`]: CalculiX gives the inner modes of its bricks a singular mass.
+    /// Checks that `M` is positive semidefinite with a positive diagonal. The mass matrix of a mesh, scaled to a unit
+    /// diagonal, has eigenvalues well above zero, which a short Lanczos recurrence usually shows. Otherwise `M` is
+    /// factorised with its diagonal raised by [`SEMIDEFINITE_TOLERANCE`]: a singular `M` is valid, because CalculiX
+    /// assigns a singular mass to the incompatible modes of its bricks.
     fn check_mass(&self) -> Result<(), ReductionError> {
         let what = format!("{}.mass", self.what);
         let diagonal: Vec<f64> =
@@ -196,7 +203,7 @@ impl<'a> Pencil<'a> {
         }
         let mut raised = self.sum(0.0, 1.0);
         for (column, &start) in self.pattern.col_ptr()[..self.dimension()].iter().enumerate() {
-            // The lower triangle of a column begins on its diagonal.
+            // The first entry of a column of the lower triangle is its diagonal.
             raised[start] += SEMIDEFINITE_TOLERANCE * diagonal[column];
         }
         match self.pivots(&raised)?.into_iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
@@ -205,7 +212,7 @@ impl<'a> Pencil<'a> {
         }
     }
 
-    /// Zeros, if there is memory for them.
+    /// A vector of zeros, or an error if memory is insufficient.
     fn room(&self, length: usize) -> Result<Vec<f64>, ReductionError> {
         let mut values = vec![];
         values
@@ -220,7 +227,7 @@ impl<'a> Pencil<'a> {
     }
 }
 
-/// `P (K + s M) Pᵀ = L Lᵀ`.
+/// Cholesky factor `P (K + s M) Pᵀ = L Lᵀ`.
 pub(super) struct Llt<'a> {
     symbolic: &'a SymbolicCholesky<usize>,
     values: Vec<f64>,
@@ -269,7 +276,7 @@ impl Llt<'_> {
     }
 }
 
-/// `P (K - σ M) Pᵀ = L D Lᵀ`; vectors are in the order of elimination.
+/// The factor `P (K - σ M) Pᵀ = L D Lᵀ`; vectors are in the order of elimination.
 pub(super) struct Ldlt {
     symbolic: Arc<SymbolicCholesky<usize>>,
     values: Vec<f64>,
@@ -280,12 +287,12 @@ impl Ldlt {
         SupernodalLdltRef::new(supernodal(&self.symbolic), &self.values)
     }
 
-    /// The row that is eliminated at each position.
+    /// The row eliminated at each position of the elimination order.
     pub(super) fn order(&self) -> &[usize] {
         forward(&self.symbolic)
     }
 
-    /// `D`.
+    /// The pivots, the diagonal of `D`.
     pub(super) fn pivots(&self) -> Vec<f64> {
         let factor = self.supernodal();
         let mut pivots = vec![0.0; self.symbolic.nrows()];
@@ -296,7 +303,7 @@ impl Ldlt {
         pivots
     }
 
-    /// `L` of the `count` rows eliminated last, dense.
+    /// Trailing block of `L` for the `count` rows eliminated last, dense.
     pub(super) fn trailing(&self, count: usize) -> Mat<f64> {
         let first = self.symbolic.nrows() - count;
         let factor = self.supernodal();
@@ -353,7 +360,7 @@ impl Ldlt {
     }
 }
 
-/// The order of elimination: nested dissection of all rows but those that come last.
+/// The order of elimination: nested dissection of all rows except `last`, followed by `last`.
 fn ordered(mass: &SparseMatrix, stiffness: &SparseMatrix, last: &[usize]) -> Result<Perm<usize>, String> {
     let n = mass.nrows();
     let mut place = vec![0; n];
@@ -376,7 +383,7 @@ fn ordered(mass: &SparseMatrix, stiffness: &SparseMatrix, last: &[usize]) -> Res
     Ok(Perm::new_checked(forward.into(), inverse.into(), n))
 }
 
-/// The row that is eliminated at each position.
+/// The row eliminated at each position of the elimination order.
 fn forward(symbolic: &SymbolicCholesky<usize>) -> &[usize] {
     symbolic.perm().expect("a permutation was given").arrays().0
 }
@@ -405,7 +412,8 @@ fn check(field: &str, what: &str, matrix: &SparseMatrix, n: usize) -> Result<(),
     }
 }
 
-/// Every place of a column where either matrix has an entry, ascending: row, entry of `a`, entry of `b`.
+/// Calls `each(row, entry of a, entry of b)` for every row of a column in which either matrix has an entry, in
+/// ascending order.
 fn merge(
     a: &SparseColMat<usize, f64>,
     b: &SparseColMat<usize, f64>,
@@ -435,8 +443,8 @@ fn merge(
     }
 }
 
-/// A lower estimate of the smallest eigenvalue of `D^-1/2 A D^-1/2`, `D` the diagonal of `A`: the smallest Ritz value
-/// less its residual. `None` where the recurrence found no positive one.
+/// Lower estimate of the smallest eigenvalue of `D^-1/2 A D^-1/2`, where `D` is the diagonal of `A`: the smallest Ritz
+/// value minus its residual. `None` if the smallest Ritz value is not positive.
 fn smallest_scaled(matrix: &SparseMatrix, diagonal: &[f64]) -> Option<f64> {
     let n = diagonal.len();
     let scale: Vec<f64> = diagonal.iter().map(|value| value.sqrt().recip()).collect();

@@ -1,4 +1,4 @@
-//! Substructures to their modes and residuals, side by side where memory allows.
+//! Modes and residuals of several substructures, in parallel if memory allows.
 
 use std::sync::mpsc;
 
@@ -8,34 +8,36 @@ use super::{InertiaBy, ReductionError, Residual, SparseMatrix};
 /// A substructure with its contact interface free.
 #[derive(Clone, Copy, Debug)]
 pub struct Substructure<'a> {
-    /// How errors and progress name it.
+    /// Name in errors and progress.
     pub name: &'a str,
     /// `M`, `n×n`, kg.
     pub mass: &'a SparseMatrix,
     /// `K`, `n×n`, N/m.
     pub stiffness: &'a SparseMatrix,
-    /// The rows of its degrees of freedom at the contact; `None` is one that is held.
+    /// Rows of its degrees of freedom at the contact; `None` stands for a fixed one.
     pub rows: &'a [Option<usize>],
     /// Which modes to keep.
     pub wanted: Wanted,
 }
 
-/// What is kept of a substructure.
+/// Modes and residuals kept of a substructure.
 #[derive(Clone, Debug)]
 pub struct Kept {
     pub modes: SparseModes,
-    /// What the modes left out do at the contact, if it was asked for.
+    /// Residual flexibility and inertia of the truncated modes, if requested.
     pub residual: Option<Residual>,
 }
 
-/// Modes of every part, and residuals `with_residual`: one thread for each part where all of them together take no more than
-/// `memory_limit_bytes` beside the matrices themselves, else one part after the other; answers to contact forces kept where there is room for them. The
-/// result depends on that by rounding alone: 1e-7 of the residual inertia.
+/// Computes the modes of every part and, if `with_residual`, the residuals of the truncated modes.
 ///
-/// `progress` hears which part does what.
+/// The parts run in parallel, one thread each, if all of them together fit in `memory_limit_bytes` in addition to the
+/// given matrices; otherwise one after the other. Responses to contact forces are stored if memory allows, see
+/// [`InertiaBy::KeptAnswers`]. These choices change the result by rounding only: 1e-7 of the residual inertia.
+///
+/// `progress` receives the index of a part and its progress.
 ///
 /// # Errors
-/// Those of [`Analysed::modes`] and [`Analysed::residual`]; `Memory` before anything is factored.
+/// Those of [`Analysed::modes`] and [`Analysed::residual`]; `Memory` before any factorisation.
 pub fn keep_modes(
     parts: &[Substructure<'_>],
     with_residual: bool,
@@ -64,7 +66,7 @@ pub fn keep_modes(
             if way.at_once {
                 return held + needs.iter().sum::<usize>();
             }
-            // The modes of a part that is done stay.
+            // Modes of finished parts stay in memory.
             let modes = |index: usize| size_of::<f64>() * parts[index].mass.nrows() * count_of(wanted[index]);
             held + needs.iter().copied().max().unwrap_or(0) + (0..parts.len()).map(modes).sum::<usize>()
         };
@@ -97,7 +99,7 @@ pub fn keep_modes(
     }
     let indices: Vec<usize> = (0..parts.len()).collect();
     side_by_side(&indices, way.at_once, progress, &|&index, hear| {
-        // What it needs has been told.
+        // Its memory need has been reported already.
         let mut hear = |p: Progress| {
             if !matches!(p, Progress::Analysed { .. }) {
                 hear(p);
@@ -113,7 +115,7 @@ pub fn keep_modes(
     })
 }
 
-/// How many modes are wanted, as far as it is known.
+/// Number of wanted modes; 0 if not known yet.
 fn count_of(wanted: Wanted) -> usize {
     match wanted {
         Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
@@ -121,17 +123,17 @@ fn count_of(wanted: Wanted) -> usize {
     }
 }
 
-/// A way to go about it that memory allows.
+/// A strategy that fits in memory.
 #[derive(Clone, Copy, Debug)]
 struct Plan {
     at_once: bool,
     inertia_by: InertiaBy,
 }
 
-/// What is done with an item, and who hears of it.
+/// Work on one item, which reports its progress to a callback.
 type Work<'a, T, R> = dyn Fn(&T, &mut dyn FnMut(Progress)) -> Result<R, ReductionError> + Sync + 'a;
 
-/// `work` on every item, on threads of their own if `at_once`; what they report is heard here, on one thread.
+/// Runs `work` on every item, each on its own thread if `at_once`. Progress is reported on the calling thread.
 fn side_by_side<T: Sync, R: Send>(
     items: &[T],
     at_once: bool,
@@ -148,7 +150,7 @@ fn side_by_side<T: Sync, R: Send>(
             .enumerate()
             .map(|(index, item)| {
                 let told = told.clone();
-                // Nobody hears it any more: nothing is lost with it.
+                // A closed channel means that nobody listens to progress; ignore it.
                 scope.spawn(move || {
                     work(item, &mut |p| {
                         let _ = told.send((index, p));
@@ -184,7 +186,8 @@ mod tests {
     fn side_by_side_or_one_after_the_other_is_the_same() {
         let [pad, disc] = [chain(500, 100.0), chain(700, 300.0)];
         let rows = [Some(0), None, Some(499)];
-        // ω = 2 sqrt(k/m) sin(p π / 2n), p from 0: 12 of the disc below the middle of p = 11 and 12.
+        // `ω = 2 sqrt(k/m) sin(p π / 2n)` with p from 0. The cut-off lies between p = 11 and p = 12 of the disc: 12
+        // modes are below it.
         let below = 2.0 * 150.0_f64.sqrt() * (11.5 * std::f64::consts::PI / 1400.0).sin();
         let owned = [("pad", pad, Wanted::Lowest(9)), ("disc", disc, Wanted::Below(below))];
         let parts: Vec<Substructure<'_>> = owned
@@ -205,7 +208,7 @@ mod tests {
         })
         .unwrap();
         assert_eq!(together.iter().map(|kept| kept.modes.omega_squared.len()).collect::<Vec<_>>(), [9, 12]);
-        // Each fits alone, with its answers kept; both do not.
+        // Each part fits alone with stored responses; both together do not.
         let limit = needs.iter().copied().max().unwrap() + 200_000;
         let mut order = vec![];
         let apart = keep_modes(&parts, true, Some(limit), &mut |part, p| {
