@@ -1,20 +1,21 @@
-//! What the modes left out still do at the contact: residual flexibility and residual inertia.
+//! Residual flexibility and residual inertia: the quasi-static response of the truncated modes at the contact.
 //!
 //! ```text
-//! R = Σ φ φᵀ / ω²,   Q = Σ φ φᵀ / ω⁴     over the modes left out, at the contact's degrees of freedom
+//! R = Σ φ φᵀ / ω²,   Q = Σ φ φᵀ / ω⁴
 //! ```
 //!
-//! The modes themselves are not needed. Unit loads `F`, freed of the kept modes, are applied to `A = K + s M`, and the
-//! inertia of the answers again:
+//! The sums are over the truncated modes, with `φ` restricted to the degrees of freedom of the contact. The truncated
+//! modes themselves are not computed. Unit loads `F`, made orthogonal to the kept modes, are applied to `A = K + s M`;
+//! a second solve applies the inertia forces of the responses:
 //!
 //! ```text
 //! X = A⁻¹ (F - M Φ Φᵀ F),   R_s = Fᵀ X,   Q_s = Fᵀ A⁻¹ M X = Xᵀ M X
 //! ```
 //!
-//! `Q_s` takes either a second solve for every load, or all answers in single precision, which is faster and costs 4 bytes
-//! times the size of the system times the number of loads. `R_s` and `Q_s` differ from `R` and `Q` by powers of `s/ω²`;
-//! `s` is a millionth of the last kept `ω²`: a body that floats freely needs no other treatment, and `R = R_s + s Q_s` is
-//! good to 1e-12.
+//! `Q_s` needs either a second solve per load, or all responses stored in single precision. The latter is faster and
+//! takes 4 bytes times the number of degrees of freedom times the number of loads. `R_s` and `Q_s` differ from `R` and
+//! `Q` by powers of `s/ω²`. With `s` a millionth of the last kept `ω²`, rigid-body modes need no special treatment, and
+//! `R = R_s + s Q_s` is accurate to 1e-12.
 //!
 //! Source: MacNeal 1971; Rubin 1975.
 
@@ -24,50 +25,53 @@ use super::ReductionError;
 use super::normal_modes::{Analysed, Progress, SparseModes};
 use super::sparse::{SparseMatrix, times};
 
-/// The shift, relative to the last kept `ω²`.
+/// The shift `s`, relative to the last kept `ω²`.
 const SHIFT: f64 = 1e-6;
-/// `ω²` up to this times the largest ratio of stiffness to mass on a diagonal is that of a rigid-body motion: rounding.
+/// Largest `ω²` of a rigid-body mode (a rounding error), relative to the largest ratio of diagonal entries of stiffness
+/// and mass.
 const RIGID: f64 = 1e-13;
-/// Loads that are solved for at once.
+/// Number of loads solved at a time.
 const TOGETHER: usize = 32;
-/// Rows of kept answers that are multiplied at once.
+/// Number of rows of stored responses multiplied at a time.
 const ROWS_TOGETHER: usize = 4096;
 
-/// How the residual inertia is found.
+/// Method for the residual inertia.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InertiaBy {
-    /// `Xᵀ M X` of answers kept in single precision: good to 1e-7 of the largest entry.
+    /// `Xᵀ M X` of responses stored in single precision; accurate to 1e-7 of the largest entry.
     KeptAnswers,
-    /// A second solve for every load.
+    /// A second solve per load.
     SecondSolve,
 }
 
-/// Residuals between degrees of freedom of the contact, in the order they were asked for.
+/// Residuals between degrees of freedom of the contact, in the order requested.
 #[derive(Clone, Debug)]
 pub struct Residual {
-    /// `R`, m/N, symmetric.
+    /// Residual flexibility `R`, m/N, symmetric.
     pub flexibility: Mat<f64>,
-    /// `Q`, s²·m/N, symmetric.
+    /// Residual inertia `Q`, s²·m/N, symmetric.
     pub inertia: Mat<f64>,
 }
 
 impl Analysed<'_> {
-    /// Bytes that residuals for so many `loads` need beside what is held already, `count` modes included.
+    /// Estimated bytes that residuals for `loads` loads need in addition to [`Self::held_bytes`], including `count`
+    /// modes.
     pub fn bytes_for_residual(&self, count: usize, loads: usize, inertia_by: InertiaBy) -> usize {
-        // The modes, their inertia, and loads, answers, products and room to permute them of one set of loads.
+        // The modes and their products with M; for one set of loads: loads, responses, products and permuted copies.
         let columns = 2 * count + 5 * TOGETHER;
         let kept = if inertia_by == InertiaBy::KeptAnswers { size_of::<f32>() * loads } else { 0 };
         let vectors = self.pencil.dimension() * (size_of::<f64>() * columns + kept);
-        // Both results, and once more where they are put in order.
+        // Both results and reordered copies of them.
         let between = 4 * size_of::<f64>() * loads * loads;
         self.pencil.factor_bytes() + between + vectors.max(self.pencil.factoring_bytes())
     }
 
-    /// Residual flexibility and inertia of the modes beyond `modes` between the degrees of freedom `rows`; `None` is one
-    /// that is held, whose rows and columns are 0.
+    /// Residual flexibility and inertia of the modes that `modes` omits, between the degrees of freedom `rows`. `None`
+    /// stands for a fixed degree of freedom, whose rows and columns are 0. `progress` receives the progress.
     ///
     /// # Errors
-    /// [`ReductionError`]: `OnlyRigid` where no kept mode tells how stiff the part is, `NegativeStiffness` where a kept mode is unstable, `NoShift`, `Factorisation`.
+    /// [`ReductionError`]: `OnlyRigid` if all kept modes are rigid-body modes, which give no scale for the shift;
+    /// `NegativeStiffness` if a kept mode is unstable; `NoShift`; `Factorisation`.
     pub fn residual(
         &self,
         modes: &SparseModes,
@@ -93,7 +97,7 @@ impl Analysed<'_> {
         let free: Vec<usize> = rows.iter().flatten().copied().collect();
         let phi = modes.phi.as_ref();
         let inertia_of_modes = times(mass, phi);
-        // Of an answer, what rounding brought back of the kept modes, rigid ones above all.
+        // Removes components of the kept modes that rounding reintroduces, above all rigid-body ones.
         let freed = |mut x: Mat<f64>| {
             let back = inertia_of_modes.transpose() * &x;
             x -= phi * back;
@@ -165,7 +169,7 @@ impl Analysed<'_> {
     }
 }
 
-/// `leftᵀ right`, in double precision.
+/// `leftᵀ right`, computed in double precision.
 fn product_of(left: &Mat<f32>, right: &Mat<f64>) -> Mat<f64> {
     let mut product = Mat::zeros(left.ncols(), right.ncols());
     for first in (0..left.nrows()).step_by(ROWS_TOGETHER) {
@@ -198,7 +202,7 @@ mod tests {
         (build(&mass), build(&stiffness))
     }
 
-    /// Its one rigid-body motion says nothing of how stiff it is.
+    /// A rigid-body mode gives no scale of stiffness for the shift.
     #[test]
     fn nothing_but_rigid_motions_leaves_no_residual() {
         let (mass, stiffness) = chain(420);
@@ -220,11 +224,11 @@ mod tests {
         let analysed = Analysed::new("pad", &mass, &stiffness).unwrap();
         let by = |way| analysed.residual(&kept, &rows, way, &mut |_| {}).unwrap();
         let [found, faster] = [InertiaBy::SecondSolve, InertiaBy::KeptAnswers].map(by);
-        // `R` does not depend on how `Q` was found but by s Q, a millionth of a millionth.
+        // `R` depends on the method for `Q` only through `s Q`, a relative 1e-12.
         assert!((&found.flexibility - &faster.flexibility).norm_max() < 1e-12 * found.flexibility.norm_max());
         assert!((&found.inertia - &faster.inertia).norm_max() < 1e-6 * found.inertia.norm_max());
-        // The sum over the other 400 modes of a dense solve. A kept mode's error of 1e-12 enters squared; the dense
-        // ω² of the lowest left out, 1e-2 of the largest 500, is good to 1e-11.
+        // Expected: the sum over the other 400 modes of a dense solve. Errors of 1e-12 of a kept mode enter squared.
+        // The lowest truncated ω², 1e-2 of the largest (500), is accurate to 1e-11 in the dense solve.
         let all =
             free_interface_modes("pad", mass.to_dense().as_ref(), stiffness.to_dense().as_ref(), &ModeSelection::All)
                 .unwrap();
@@ -236,7 +240,7 @@ mod tests {
             for (a, row) in rows.iter().enumerate() {
                 for (b, column) in rows.iter().enumerate() {
                     let expected = if let (Some(i), Some(j)) = (row, column) { sum(*i, *j, power) } else { 0.0 };
-                    // Q itself is taken at the shift: 2e-6 of it.
+                    // `Q` is evaluated at the shift, which changes it by 2e-6.
                     let tolerance = if power == 2 { 1e-10 } else { 3e-6 };
                     let value = matrix[(a, b)];
                     assert!((value - expected).abs() < tolerance * largest, "{power} {a} {b}: {value} {expected}");
