@@ -1,8 +1,9 @@
-//! The 8-node brick with incompatible modes.
+//! The 8-node brick element with incompatible modes.
 //!
-//! To the trilinear displacement come `Σ_m (1 - ξ_m²) α_m`, inner to the element, which let it bend without shear. Their
-//! gradients use the Jacobian of the centre, scaled by `det J₀ / det J`, so that constant strain stays exact on distorted
-//! bricks (patch test). `α` is condensed out as the stiffness lets it follow the corners, and takes its inertia along.
+//! The displacement is trilinear plus `Σ_m (1 - ξ_m²) α_m`, internal modes that let the element bend without parasitic
+//! shear. Their gradients use the Jacobian at the centre, scaled by `det J₀ / det J`, so that the patch test (constant
+//! strain) holds for distorted bricks. `α` is eliminated by static condensation of the stiffness; the mass is
+//! transformed accordingly.
 //!
 //! Source: Wilson, Taylor, Doherty, Ghaboussi, "Incompatible displacement models", in Numerical and Computer Methods in
 //! Structural Mechanics (1973) 43-57; Taylor, Beresford, Wilson, "A non-conforming element for stress analysis", Int. J.
@@ -10,7 +11,7 @@
 
 use super::Material;
 
-/// Corners in the order of Abaqus and CalculiX, in natural coordinates `ξ, η, ζ`.
+/// Natural coordinates `ξ, η, ζ` of the corners, in the node order of Abaqus and CalculiX.
 const CORNERS: [[f64; 3]; 8] = [
     [-1.0, -1.0, -1.0],
     [1.0, -1.0, -1.0],
@@ -21,7 +22,7 @@ const CORNERS: [[f64; 3]; 8] = [
     [1.0, 1.0, 1.0],
     [-1.0, 1.0, 1.0],
 ];
-/// Nodes and incompatible modes.
+/// Number of shape functions: 8 nodes and 3 incompatible modes.
 const SHAPES: usize = 11;
 
 /// Matrices of one brick.
@@ -29,15 +30,15 @@ const SHAPES: usize = 11;
 pub struct BrickMatrices {
     /// `K`, N/m; row `3 a + d` is node `a`, direction `d`.
     pub stiffness: [[f64; 24]; 24],
-    /// `M`, kg, rows as those of the stiffness.
+    /// `M`, kg, in the row order of the stiffness.
     pub mass: [[f64; 24]; 24],
 }
 
-/// The matrices of a brick with its eight corners at `nodes_m`, ordered as `C3D8I` of CalculiX, the stiffness integrated at 2x2x2
-/// points.
+/// Stiffness and mass of a brick with the corners `nodes_m`, m, in the node order of `C3D8I` of CalculiX. The stiffness
+/// is integrated with 2x2x2 Gauss points, the mass with 3x3x3.
 ///
 /// # Errors
-/// The Jacobian, m³, where it is not above 0: the brick is inverted or too distorted.
+/// The determinant of the Jacobian, m³, if it is not above 0: the brick is inverted or too distorted.
 pub fn brick(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<BrickMatrices, f64> {
     let (lambda, shear) = material.lame_pa();
     let (centre, centre_det) = inverse(&jacobian(nodes_m, [0.0; 3]));
@@ -70,7 +71,9 @@ pub fn brick(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<BrickMatric
     Ok(BrickMatrices { stiffness: outer(&full), mass: outer(&full_mass) })
 }
 
-/// Adds `∇ₐᵀ D ∇_b w` of an isotropic material: `λ gₐ g_bᵀ + G (g_b gₐᵀ + gₐ·g_b I)`, lower triangle of blocks mirrored.
+/// Adds `w ∇ₐᵀ D ∇_b` of an isotropic material at one integration point with weight `w`: the block
+/// `λ gₐ g_bᵀ + G (g_b gₐᵀ + gₐ·g_b I)` for every pair of shape functions. Blocks below the diagonal are computed,
+/// those above are mirrored.
 fn add_stiffness(
     full: &mut [[f64; 3 * SHAPES]; 3 * SHAPES],
     gradients: &[[f64; 3]; SHAPES],
@@ -95,7 +98,8 @@ fn add_stiffness(
     }
 }
 
-/// Adds `∫ ρ Nᵀ N dV` of corners and incompatible modes, at 3x3x3 points: the squares of the latter are of fourth degree.
+/// Adds `∫ ρ Nᵀ N dV` over corner and incompatible shape functions. 3x3x3 points are needed because squares of
+/// incompatible modes are of fourth degree.
 fn add_mass(full: &mut [[f64; 3 * SHAPES]; 3 * SHAPES], nodes_m: &[[f64; 3]; 8], density_kg_per_m3: f64) {
     let (points, weights) = ([-0.6_f64.sqrt(), 0.0, 0.6_f64.sqrt()], [5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0]);
     for [i, j, k] in (0..27).map(|index| [index % 3, index / 3 % 3, index / 9]) {
@@ -115,8 +119,8 @@ fn add_mass(full: &mut [[f64; 3 * SHAPES]; 3 * SHAPES], nodes_m: &[[f64; 3]; 8],
     }
 }
 
-/// Eliminates the incompatible modes, last first, as the stiffness lets them follow the corners, `α = T u`; the mass
-/// follows with them. Both stay exactly symmetric.
+/// Eliminates the incompatible modes, last first, by static condensation `α = T u` of the stiffness. The mass is
+/// transformed with the same `T` (Guyan reduction). Both matrices stay exactly symmetric.
 fn condense(stiffness: &mut [[f64; 3 * SHAPES]; 3 * SHAPES], mass: &mut [[f64; 3 * SHAPES]; 3 * SHAPES]) {
     for pivot in (24..3 * SHAPES).rev() {
         let (row, inertia) = (stiffness[pivot], mass[pivot]);
@@ -136,13 +140,14 @@ fn shape(corner: [f64; 3], point: [f64; 3]) -> f64 {
     (0..3).map(|axis| 0.5 * (1.0 + corner[axis] * point[axis])).product()
 }
 
-/// `∂N/∂(ξ, η, ζ)` of a corner's shape function.
+/// Gradient `∂N/∂(ξ, η, ζ)` of the shape function of a corner.
 fn natural_gradient(corner: [f64; 3], point: [f64; 3]) -> [f64; 3] {
     let [x, y, z] = [0, 1, 2].map(|axis| 0.5 * (1.0 + corner[axis] * point[axis]));
     [0.5 * corner[0] * y * z, 0.5 * corner[1] * x * z, 0.5 * corner[2] * x * y]
 }
 
-/// `J = ∂(ξ, η, ζ) → ∂(x, y, z)`: row `i` is the derivative of the position along natural coordinate `i`.
+/// Jacobian at a point in natural coordinates: row `i` is the derivative of the position `(x, y, z)` with respect to
+/// natural coordinate `i`, m.
 fn jacobian(nodes_m: &[[f64; 3]; 8], point: [f64; 3]) -> [[f64; 3]; 3] {
     let mut jacobian = [[0.0; 3]; 3];
     for (node_m, corner) in nodes_m.iter().zip(CORNERS) {
@@ -175,7 +180,7 @@ mod tests {
 
     const STEEL: Material = Material { density_kg_per_m3: 7800.0, young_pa: 210e9, poisson: 0.3 };
 
-    /// A brick with every corner moved: no two edges parallel.
+    /// A distorted brick without parallel edges.
     fn distorted() -> [[f64; 3]; 8] {
         let push = [0.13, -0.07, 0.11, 0.05, -0.12, 0.09, -0.04, 0.08];
         std::array::from_fn(|a| std::array::from_fn(|d| CORNERS[a][d] + push[(a + 3 * d) % 8]))
@@ -185,8 +190,7 @@ mod tests {
     fn the_mass_adds_up_to_density_times_volume_and_the_stiffness_knows_no_rigid_motion() {
         let nodes = distorted();
         let matrices = brick(&nodes, &STEEL).unwrap();
-        // A box of 2x2x2 pushed at its corners; volume by the divergence theorem over faces as bilinear patches is what
-        // 2x2x2 points integrate exactly, so a 5x5x5 rule must agree.
+        // A distorted 2x2x2 box. 2x2x2 Gauss points integrate its volume exactly, so a 5x5x5 rule must agree.
         let (points, weights) = (
             [-0.906_179_845_938_664, -0.538_469_310_105_683, 0.0, 0.538_469_310_105_683, 0.906_179_845_938_664],
             [
@@ -205,7 +209,7 @@ mod tests {
                 }
             }
         }
-        // Moved as a whole along x, the incompatible modes rest.
+        // In a translation along x, the incompatible modes are zero.
         let total: f64 = (0..24)
             .step_by(3)
             .flat_map(|i| (0..24).step_by(3).map(move |j| (i, j)))
@@ -225,7 +229,7 @@ mod tests {
             let u: Vec<f64> = nodes.iter().flat_map(|&node| motion(node)).collect();
             for row in &matrices.stiffness {
                 let force: f64 = row.iter().zip(&u).map(|(k, u)| k * u).sum();
-                // 24 products of entries below `largest`, rounded.
+                // Rounding error of 24 products with entries up to `largest`.
                 assert!(force.abs() < 100.0 * f64::EPSILON * largest, "{force}");
             }
         }
@@ -233,8 +237,8 @@ mod tests {
 
     #[test]
     fn one_brick_in_bending_is_exact() {
-        // Pure bending of a box about z, E I κ² L / 2 of energy per unit of curvature with ν = 0: the incompatible modes
-        // hold the parabolic deflection, a trilinear brick without them would be 1.5 times as stiff here.
+        // Pure bending of a box about z with ν = 0: the energy is E I κ² L / 2 at the curvature κ = 1. The incompatible
+        // modes represent the parabolic deflection; a trilinear brick would be 1.5 times as stiff.
         let material = Material { poisson: 0.0, ..STEEL };
         let nodes = CORNERS;
         let u: Vec<f64> = nodes.iter().flat_map(|&[x, y, _]| [-x * y, 0.0, 0.0]).collect();

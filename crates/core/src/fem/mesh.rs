@@ -1,15 +1,16 @@
-//! Structured meshes of bricks: boxes and annuli that share nodes where their lines meet and hang them where not.
+//! Structured meshes of bricks: boxes and annuli joined by shared nodes where their grid lines coincide and by hanging
+//! nodes elsewhere.
 //!
-//! A [`Block`] is a lattice of lines in three coordinates, mapped to space. A node of a new block that lies on an older
-//! one is the older block's own node, or hangs between its nodes: it moves with their interpolation,
-//! `u = Σ w_k u_k`. As long as no line of the older block crosses a cell of the new one within the common face, the
-//! displacement is continuous and constant strain stays exact.
+//! A [`Block`] is a lattice of grid lines in three coordinates, mapped to space. Where a node of a new block lies on an
+//! older block, it is either the same node or a hanging node. A hanging node moves with the interpolation between nodes
+//! of the older block, `u = Σ w_k u_k`. The displacement is continuous, and the patch test holds, as long as no grid
+//! line of the older block crosses a cell of the new one within the common face.
 
 use std::collections::BTreeMap;
 
 use super::Material;
 
-/// A part of one material.
+/// A named component of one material.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Component {
     pub name: String,
@@ -23,49 +24,49 @@ pub struct Brick {
     pub component: usize,
 }
 
-/// Nodes, bricks and the nodes that hang between others.
+/// Nodes, bricks, components and hanging nodes.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
     pub nodes_m: Vec<[f64; 3]>,
     pub bricks: Vec<Brick>,
     pub components: Vec<Component>,
-    /// Of a hanging node: the independent nodes it moves with, and their weights, which sum to 1.
+    /// For each hanging node: the independent nodes it depends on and their weights, which sum to 1.
     pub hanging: BTreeMap<usize, Vec<(usize, f64)>>,
 }
 
-/// Of a lattice: which cells are filled, and whether the third coordinate closes on itself.
+/// Shape of a lattice: which cells are filled, and whether the third coordinate is periodic.
 #[derive(Clone, Copy)]
 pub struct Extent<'a> {
     pub filled: &'a dyn Fn([usize; 3]) -> bool,
     pub closed: bool,
 }
 
-/// The whole lattice, open.
+/// All cells filled, not periodic.
 pub const SOLID: Extent<'static> = Extent { filled: &|_| true, closed: false };
 
 /// A structured piece of a mesh.
 #[derive(Clone, Debug)]
 pub struct Block {
-    /// Lines in each coordinate of the lattice, ascending.
+    /// Grid lines in each lattice coordinate, ascending.
     lines: [Vec<f64>; 3],
-    /// Node at each lattice point, where there is one.
+    /// Node at each lattice point; `None` where no filled cell touches it.
     nodes: Vec<Option<usize>>,
     /// Whether each cell is filled.
     filled: Vec<bool>,
 }
 
-/// Two lattice coordinates this close, relative to the length of the lattice, are the same.
+/// Distance, relative to the length of the lattice, below which two lattice coordinates are equal.
 const SAME: f64 = 1e-9;
 
 impl Mesh {
-    /// Adds a component and returns its number.
+    /// Adds a component and returns its index.
     pub fn add_component(&mut self, name: &str, material: Material) -> usize {
         self.components.push(Component { name: name.to_owned(), material });
         self.components.len() - 1
     }
 
-    /// Adds a lattice of bricks of `component` between `lines`, mapped to metres by `place`, which keeps the orientation;
-    /// where it touches `neighbours`, their nodes are used.
+    /// Adds a lattice of bricks of `component` between the grid lines `lines`. `place` maps lattice coordinates to
+    /// metres and must preserve orientation. Where the block touches `neighbours`, it is joined to their nodes.
     pub fn add_block(
         &mut self,
         component: usize,
@@ -100,7 +101,7 @@ impl Mesh {
         block
     }
 
-    /// The node at a lattice point of a block, made where there is none yet.
+    /// The node at a lattice point of a block, created if it does not exist yet.
     fn node_at(
         &mut self,
         block: &mut Block,
@@ -127,7 +128,7 @@ impl Mesh {
         self.nodes_m.len() - 1
     }
 
-    /// A node that moves with others, at the place that this gives it.
+    /// Adds a hanging node that depends on `between`, at the interpolated position.
     fn add_hanging(&mut self, between: &[(usize, f64)]) -> usize {
         let mut weights = BTreeMap::new();
         for &(node, weight) in between {
@@ -143,7 +144,7 @@ impl Mesh {
         node
     }
 
-    /// Adds what another mesh holds, joined to nothing; returns the number that its first node gets.
+    /// Adds a copy of another mesh without joining it; returns the index of its first node.
     pub fn append(&mut self, other: &Mesh) -> usize {
         let (node, component) = (self.nodes_m.len(), self.components.len());
         self.nodes_m.extend_from_slice(&other.nodes_m);
@@ -158,12 +159,12 @@ impl Mesh {
         node
     }
 
-    /// The independent nodes that a node moves with: itself, unless it hangs.
+    /// The independent nodes that a node depends on, with weights: the node itself, unless it is a hanging node.
     pub fn weights(&self, node: usize) -> Vec<(usize, f64)> {
         self.hanging.get(&node).cloned().unwrap_or_else(|| vec![(node, 1.0)])
     }
 
-    /// Corners of a brick, m.
+    /// Positions of the corners of a brick, m.
     pub fn corners_m(&self, brick: &Brick) -> [[f64; 3]; 8] {
         brick.nodes.map(|node| self.nodes_m[node])
     }
@@ -173,7 +174,7 @@ impl Mesh {
 const CORNERS: [[usize; 3]; 8] =
     [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]];
 
-/// All index triples below `counts`, the first index fastest.
+/// All index triples below the given counts; the first index varies fastest.
 fn lattice([u, v, w]: [usize; 3]) -> impl Iterator<Item = [usize; 3]> {
     (0..w).flat_map(move |k| (0..v).flat_map(move |j| (0..u).map(move |i| [i, j, k])))
 }
@@ -183,7 +184,7 @@ fn offset([i, j, k]: [usize; 3], counts: [usize; 3]) -> usize {
 }
 
 impl Block {
-    /// Number of lines in each coordinate.
+    /// Number of grid lines in each lattice coordinate.
     pub fn counts(&self) -> [usize; 3] {
         [0, 1, 2].map(|axis| self.lines[axis].len())
     }
@@ -191,12 +192,12 @@ impl Block {
     /// The node at a lattice point.
     ///
     /// # Panics
-    /// Where the lattice has no node there.
+    /// If the lattice has no node there.
     pub fn node(&self, point: [usize; 3]) -> usize {
         self.nodes[self.offset(point)].expect("a node of a filled cell")
     }
 
-    /// Lines in a coordinate of the lattice.
+    /// Grid lines in one lattice coordinate.
     pub fn lines(&self, axis: usize) -> &[f64] {
         &self.lines[axis]
     }
@@ -205,9 +206,10 @@ impl Block {
         offset(point, self.counts())
     }
 
-    /// The nodes around a place of the lattice and their weights; `None` outside the filled cells.
+    /// Nodes and weights that interpolate at the lattice coordinates `at`; `None` outside the filled cells.
     pub fn locate(&self, at: [f64; 3]) -> Option<Vec<(usize, f64)>> {
-        // Per coordinate: the line before, the share of the next one, and the cells that touch the place.
+        // Per coordinate: the preceding grid line, the weight of the next one, and the first and last cell that touch
+        // the position.
         let mut found = [(0, 0.0, [0, 0]); 3];
         for axis in 0..3 {
             let lines = &self.lines[axis];
@@ -238,7 +240,7 @@ impl Block {
     }
 }
 
-/// Lines through `breakpoints`, ascending, every interval divided evenly into pieces of about `spacing`.
+/// Grid lines through `breakpoints`, ascending; every interval is divided evenly into pieces of about `spacing`.
 pub fn stations(breakpoints: &[f64], spacing: f64) -> Vec<f64> {
     let mut lines = vec![breakpoints[0]];
     for pair in breakpoints.windows(2) {
@@ -247,12 +249,12 @@ pub fn stations(breakpoints: &[f64], spacing: f64) -> Vec<f64> {
     lines
 }
 
-/// How many pieces of about `spacing` a length has: at least one.
+/// Number of pieces of about `spacing` in a length, at least 1.
 pub fn pieces(length: f64, spacing: f64) -> usize {
     (length / spacing).round().max(1.0) as usize
 }
 
-/// The ends of `count` equal pieces between two values, the last exactly `to`.
+/// The upper ends of `count` equal pieces between two values; the last is exactly `to`.
 pub fn divided(from: f64, to: f64, count: usize) -> impl Iterator<Item = f64> {
     let step = (to - from) / count as f64;
     (1..=count).map(move |piece| if piece == count { to } else { from + step * piece as f64 })
@@ -273,7 +275,7 @@ mod tests {
         let fine = stations(&[0.0, 1.0], 0.5);
         let above = mesh.add_block(steel, [fine.clone(), vec![0.0, 1.0], fine], SOLID, &[&below], |at| at);
         assert_eq!(mesh.bricks.len(), 4 + 4);
-        // 18 below; above 9 on top, and at the bottom 4 corners shared, 5 hanging.
+        // 18 nodes below; above, 9 on the top face and at the bottom 4 shared corners and 5 hanging nodes.
         assert_eq!(mesh.nodes_m.len(), 18 + 9 + 5);
         assert_eq!(mesh.hanging.len(), 5);
         assert_eq!(above.node([0, 0, 0]), below.node([0, 1, 0]));

@@ -1,13 +1,13 @@
-//! Finite elements of linear elasticity: 8-node bricks on structured meshes, assembled to sparse matrices.
+//! Linear elastic finite elements: 8-node bricks on structured meshes, assembled to sparse matrices.
 //!
 //! ```text
 //! K = Σ_e ∫ Bᵀ D B dV + Σ springs      stiffness, N/m
 //! M = Σ_e ∫ ρ Nᵀ N dV                  consistent mass, kg
 //! ```
 //!
-//! [`brick`] is the element, with the incompatible modes of Wilson and Taylor; [`Mesh`] holds nodes, bricks and hanging
-//! nodes; [`Block`] is a structured piece of it; [`Structure`] adds supports and springs and assembles; [`tribometer`] is
-//! the reference rig.
+//! [`brick`] computes the element matrices, with the incompatible modes of Wilson and Taylor. A [`Mesh`] holds nodes,
+//! bricks and hanging nodes; a [`Block`] is a structured piece of it. A [`Structure`] adds supports and springs and is
+//! assembled. [`tribometer`] is the reference rig.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
@@ -28,7 +28,7 @@ pub struct Material {
     pub poisson: f64,
 }
 
-/// What was wrong with a model, where, with which value. Nodes and bricks are counted from 0.
+/// Error of a finite-element model, with the offending value. Nodes and bricks are counted from 0.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum FemError {
     #[error("{component}: {field} is {value}, expected {limit}")]
@@ -44,7 +44,7 @@ pub enum FemError {
 }
 
 impl Material {
-    /// Lamé's constants `λ = E ν / ((1 + ν)(1 - 2ν))`, `G = E / (2 (1 + ν))`, Pa.
+    /// Lamé's constants `λ = E ν / ((1 + ν)(1 - 2ν))` and `G = E / (2 (1 + ν))`, Pa, as `(λ, G)`.
     pub fn lame_pa(&self) -> (f64, f64) {
         let shear = self.young_pa / (2.0 * (1.0 + self.poisson));
         (2.0 * shear * self.poisson / (1.0 - 2.0 * self.poisson), shear)

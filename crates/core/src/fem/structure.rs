@@ -1,4 +1,4 @@
-//! A mesh with supports and springs, and its matrices.
+//! A mesh with supports and springs, and its assembled matrices.
 
 use std::collections::BTreeSet;
 
@@ -7,7 +7,7 @@ use faer::sparse::SymbolicSparseColMat;
 use super::{FemError, Mesh, brick};
 use crate::reduction::SparseMatrix;
 
-/// A spring along one direction, 0 to 2 for x, y, z: between two nodes, or from a node to the ground.
+/// A spring along one direction (0 to 2 for x, y, z) between two nodes, or between a node and the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spring {
     pub node: usize,
@@ -16,11 +16,11 @@ pub struct Spring {
     pub stiffness_n_per_m: f64,
 }
 
-/// A mesh, what holds it and what joins it.
+/// A mesh with its supports and springs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Structure {
     pub mesh: Mesh,
-    /// Node and direction, 0 to 2, of each displacement held at 0. Hanging nodes move with others and are not held.
+    /// Node and direction, 0 to 2, of each displacement fixed at 0. Hanging nodes depend on others and cannot be fixed.
     pub fixed: BTreeSet<(usize, usize)>,
     pub springs: Vec<Spring>,
 }
@@ -28,16 +28,16 @@ pub struct Structure {
 /// Matrices over the free degrees of freedom.
 #[derive(Clone, Debug)]
 pub struct Assembled {
-    /// `K`, N/m, exactly symmetric, both triangles.
+    /// `K`, N/m, `n×n`, exactly symmetric, both triangles stored.
     pub stiffness: SparseMatrix,
-    /// `M`, kg, exactly symmetric, both triangles.
+    /// `M`, kg, `n×n`, exactly symmetric, both triangles stored.
     pub mass: SparseMatrix,
     /// Node and direction of each row, ascending.
     pub rows: Vec<(usize, usize)>,
 }
 
 impl Structure {
-    /// Adds what another structure holds, joined to nothing; returns the number that its first node gets.
+    /// Adds a copy of another structure without joining it; returns the index of its first node.
     pub fn append(&mut self, other: &Structure) -> usize {
         let node = self.mesh.append(&other.mesh);
         self.fixed.extend(other.fixed.iter().map(|&(held, direction)| (node + held, direction)));
@@ -58,12 +58,12 @@ impl Structure {
             .collect()
     }
 
-    /// How many degrees of freedom are free.
+    /// Number of free degrees of freedom.
     pub fn dof(&self) -> usize {
         3 * (self.mesh.nodes_m.len() - self.mesh.hanging.len()) - self.fixed.len()
     }
 
-    /// Stiffness and mass of bricks and springs over the free degrees of freedom.
+    /// Assembles stiffness and mass of bricks and springs over the free degrees of freedom.
     ///
     /// # Errors
     /// [`FemError`]: `Material`, `Inverted`, `Loose`, `Spring`.
@@ -85,7 +85,7 @@ impl Structure {
             let component = &self.mesh.components[element.component];
             let matrices = brick(&self.mesh.corners_m(element), &component.material)
                 .map_err(|value| FemError::Inverted { brick: index, component: component.name.clone(), value })?;
-            // Corner, independent node that it moves with, weight.
+            // Corner, independent node that it depends on, weight.
             let terms: Vec<(usize, usize, f64)> = element
                 .nodes
                 .iter()
@@ -125,14 +125,17 @@ impl Structure {
         Ok(Assembled { stiffness: stiffness.finish(), mass: mass.finish(), rows })
     }
 
-    /// The elongation of a spring as a sum over independent nodes.
+    /// The elongation of a spring as a weighted sum over independent nodes.
     fn spring_terms(&self, spring: &Spring) -> Vec<(usize, f64)> {
         let other = spring.other.map_or(vec![], |other| self.mesh.weights(other));
         let negative = other.into_iter().map(|(node, weight)| (node, -weight));
         self.mesh.weights(spring.node).into_iter().chain(negative).collect()
     }
 
-    /// For each independent node the nodes that share a brick or a spring with it, itself included, ascending.
+    /// For each independent node: the nodes that share a brick or a spring with it, itself included, ascending.
+    ///
+    /// # Errors
+    /// [`FemError::Loose`].
     fn neighbours(&self) -> Result<Vec<Vec<usize>>, FemError> {
         let independent = |nodes: &[usize]| -> Vec<usize> {
             nodes.iter().flat_map(|&node| self.mesh.weights(node)).map(|(node, _)| node).collect()
@@ -166,7 +169,7 @@ impl Structure {
     }
 }
 
-/// A symmetric matrix of known pattern, filled in its lower triangle.
+/// A symmetric matrix of known pattern, assembled in its lower triangle.
 struct Symmetric {
     starts: Vec<usize>,
     rows: Vec<usize>,
@@ -174,7 +177,8 @@ struct Symmetric {
 }
 
 impl Symmetric {
-    /// Zeros where `of` says that a row's column has entries, ascending; the pattern is symmetric.
+    /// A zero matrix; `of` returns the rows, ascending, with entries in the column of a degree of freedom. The pattern
+    /// must be symmetric.
     fn new(rows: &[(usize, usize)], of: impl Fn((usize, usize)) -> Vec<usize>) -> Self {
         let (mut starts, mut entries) = (vec![0], vec![]);
         for &row in rows {
@@ -190,10 +194,11 @@ impl Symmetric {
         self.values[start + within] += value;
     }
 
-    /// Copies the lower triangle to the upper one, so that both are the same to the last bit.
+    /// Copies the lower triangle to the upper one, so that both agree exactly.
     fn finish(mut self) -> SparseMatrix {
         let n = self.starts.len() - 1;
-        // Columns are visited in order, so the entries above the diagonal of each column come in order as well.
+        // Columns are visited in ascending order, so the entries above the diagonal of each column are filled in
+        // ascending order too.
         let mut upper = self.starts.clone();
         for column in 0..n {
             for entry in self.starts[column]..self.starts[column + 1] {
@@ -221,7 +226,7 @@ mod tests {
 
     const STEEL: Material = Material { density_kg_per_m3: 7800.0, young_pa: 210e9, poisson: 0.27 };
 
-    /// A coarse box with a finer one on it, whose lower nodes hang, every inner node pushed aside.
+    /// A coarse box below a finer one with hanging nodes; all inner nodes are displaced, so that bricks are distorted.
     fn two_boxes() -> Structure {
         let mut mesh = Mesh::default();
         let steel = mesh.add_component("steel", STEEL);
@@ -238,7 +243,7 @@ mod tests {
         Structure { mesh, ..Structure::default() }
     }
 
-    /// A displacement at every row.
+    /// The displacement field `u` evaluated at every row.
     fn field(structure: &Structure, rows: &[(usize, usize)], u: impl Fn([f64; 3]) -> [f64; 3]) -> Mat<f64> {
         Mat::from_fn(rows.len(), 1, |row, _| u(structure.mesh.nodes_m[rows[row].0])[rows[row].1])
     }
@@ -255,11 +260,11 @@ mod tests {
             let [x, y, z] = structure.mesh.nodes_m[node];
             let inside = |value: f64, low: f64| value > low + 1e-9 && value < 1.0 - 1e-9;
             if inside(x, 0.0) && inside(y, -1.0) && inside(z, 0.0) {
-                // Equilibrium within: forces of neighbouring bricks cancel to rounding.
+                // Equilibrium inside: the forces of neighbouring bricks cancel to rounding.
                 assert!(forces[(row, 0)].abs() < 1e-12 * largest, "{node} {direction}: {}", forces[(row, 0)]);
             }
         }
-        // ½ ε : D : ε over the volume of 1x2x1.
+        // Expected: ½ ε : D : ε times the volume, 1x2x1.
         let (lambda, shear) = STEEL.lame_pa();
         let strain = |i: usize, j: usize| 0.5 * (gradient[i][j] + gradient[j][i]);
         let trace: f64 = (0..3).map(|i| strain(i, i)).sum();
@@ -286,7 +291,7 @@ mod tests {
     fn springs_and_supports_hold() {
         let mut structure = two_boxes();
         let spring = |node, other, direction| Spring { node, other, direction, stiffness_n_per_m: 3e6 };
-        // A hanging node to the ground, and two corners with each other.
+        // A spring from a hanging node to the ground, and one between two corners.
         let hangs = *structure.mesh.hanging.keys().next().unwrap();
         structure.springs = vec![spring(hangs, None, 1), spring(0, Some(2), 0)];
         let before = two_boxes().assemble().unwrap();
@@ -298,7 +303,7 @@ mod tests {
         let elongation = nodes[0][0].powi(2) - nodes[2][0].powi(2);
         let expected = 0.5 * 3e6 * ((y + z).powi(2) + elongation.powi(2));
         let added = energy(&stiffness) - energy(&before.stiffness);
-        // A difference of energies near 1e11 J, 16 digits each.
+        // A difference of energies near 1e11 J with 16 digits each.
         assert!((added - expected).abs() < 1e-3 && expected > 1e4, "{added} {expected}");
 
         structure.fixed.insert((1, 2));
@@ -313,8 +318,8 @@ mod tests {
         assert_eq!(structure.assemble().unwrap_err(), FemError::Loose { node });
     }
 
-    /// A strip in plane strain, `length` by `2 half`, held along x at both ends, `pieces` bricks along it and a
-    /// `1/8` of that across: its frequencies, Hz.
+    /// Natural frequencies, Hz, of a strip in plane strain, `length` by `2 half`, with x fixed at both ends. The mesh
+    /// has `pieces` bricks along the strip and `pieces / 8` across.
     fn strip_hz(material: Material, length: f64, half: f64, pieces: usize, count: usize) -> Vec<f64> {
         let mut mesh = Mesh::default();
         let component = mesh.add_component("strip", material);
@@ -339,7 +344,7 @@ mod tests {
 
     #[test]
     fn frequencies_converge_with_the_square_of_the_spacing() {
-        // Bending of a strip between planes of symmetry: the lowest antisymmetric wave of Rayleigh and Lamb with half a
+        // Bending of a strip between planes of symmetry: the lowest antisymmetric Rayleigh-Lamb wave with half a
         // wavelength in the length, 4 k² P Q tanh(Q h) = (Q² + k²)² tanh(P h), P² = k² - ω²/c_L², Q² = k² - ω²/c_T².
         let (length, half) = (0.4, 0.025);
         let (lambda, shear) = STEEL.lame_pa();
@@ -357,7 +362,7 @@ mod tests {
             if dispersion(low) * dispersion(middle) <= 0.0 { high = middle } else { low = middle }
         }
         let exact = low / TAU;
-        // The strip also moves up and down as a whole: the second frequency.
+        // The strip also has a rigid-body mode along y, so bending is the second frequency.
         let errors = [32, 64, 128].map(|pieces| strip_hz(STEEL, length, half, pieces, 2)[1] / exact - 1.0);
         eprintln!("bending: {exact} Hz, errors {errors:?}");
         for pair in errors.windows(2) {

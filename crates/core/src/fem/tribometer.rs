@@ -1,4 +1,5 @@
-//! The reference rig: a pad-on-disc tribometer of the kind that a published model reduction was tried on.
+//! The reference rig: a pad-on-disc tribometer like the one of the paper this project implements, used there to test
+//! model reduction.
 //!
 //! ```text
 //!            spring holder        held along x and z at its top, free along y
@@ -11,14 +12,20 @@
 //!   ======== disc ========        clamped between two disc holders
 //! ```
 //!
-//! Components, materials, supports and springs are the published ones, the dimensions are this project's own, tuned so
-//! that the first frequencies agree (upper part 331.44 Hz, lower part 1300.6 Hz, whole at rest 510.91 Hz). They are
-//! within 1 % at the default size, one layer of bricks through the disc; finer meshes are softer, the disc most of all,
-//! which bricks in layers let shear between the faces that hold it: 333.8, 1305.3 and 510.1 Hz with 22 032 degrees of
-//! freedom, 332.1, 1295.6 and 505.5 Hz with 101 908, 331.1, 1275.6 and 503.4 Hz with 220 285. It is a model of that
-//! kind, not its mesh, which cannot be known: it is said to have 904 968 degrees of freedom in 121 864 eight-node
-//! bricks, more than such bricks can have. `y` points up, `y = 0` is the disc's upper face and the disc turns about the
-//! `y` axis; the pad lies around `x = ` [`MEAN_RADIUS_M`].
+//! Components, materials, supports and springs are the published ones. The dimensions are this project's own, tuned to
+//! the published first frequencies: upper part 331.44 Hz, lower part 1300.6 Hz, assembly at rest 510.91 Hz. They agree
+//! within 1 % at the default size, which has one layer of bricks through the disc. Finer meshes are softer, above all
+//! the disc, because several layers of bricks allow shear between the clamped faces:
+//!
+//! * 22 032 degrees of freedom: 333.8, 1305.3 and 510.1 Hz,
+//! * 101 908 degrees of freedom: 332.1, 1295.6 and 505.5 Hz,
+//! * 220 285 degrees of freedom: 331.1, 1275.6 and 503.4 Hz.
+//!
+//! The published mesh itself is unknown. It is reported with 904 968 degrees of freedom in 121 864 eight-node bricks,
+//! more than such bricks can have.
+//!
+//! `y` points up, `y = 0` is the upper face of the disc, and the disc turns about the `y` axis. The pad is centred near
+//! `x = ` [`MEAN_RADIUS_M`].
 //!
 //! # Source
 //! Table 2, Table 3 and section 4 of the paper this project implements; see `README.md`.
@@ -28,9 +35,9 @@ use std::f64::consts::TAU;
 use super::mesh::{divided, pieces};
 use super::{Block, Extent, FemError, Material, Mesh, SOLID, Spring, Structure, stations};
 
-/// Where the middle of the cylinder stands, m from the disc's axis.
+/// Distance of the middle of the cylinder from the axis of the disc, m.
 pub const MEAN_RADIUS_M: f64 = 0.1;
-/// Contact pairs along the radius and along the sliding direction.
+/// Number of contact pairs along the radius and along the sliding direction.
 pub const PATCH: [usize; 2] = [14, 21];
 /// Normal stiffness of each contact pair, N/m.
 pub const CONTACT_STIFFNESS_N_PER_M: f64 = 1.251e7;
@@ -45,18 +52,19 @@ const SPRING_HOLDER: Material = material(7800.0, 196e9, 0.3);
 const DISC: Material = material(7800.0, 210e9, 0.27);
 const DISC_HOLDER: Material = material(7700.0, 200e9, 0.27);
 
-/// In all, along x and along z, spread over the held part of the bracket plate's back, N/m.
+/// Total stiffness along x and along z of the ground springs, spread over the supported part of the back of the bracket
+/// plate, N/m.
 const GROUND_SPRING_N_PER_M: f64 = 1e10;
-/// Along y, between the middles of spring holder and cylinder, N/m.
+/// Stiffness along y of the spring between the middles of spring holder and cylinder, N/m.
 const MIDDLE_SPRING_N_PER_M: f64 = 1e9;
-/// Along x, y and z, between the corners and the middles of the edges of spring holder and cylinder, N/m.
+/// Stiffness along x, y and z of each spring between the corners and edge middles of spring holder and cylinder, N/m.
 const EDGE_SPRING_N_PER_M: [f64; 3] = [1e10, 1e6, 1e10];
 
 const fn material(density_kg_per_m3: f64, young_pa: f64, poisson: f64) -> Material {
     Material { density_kg_per_m3, young_pa, poisson }
 }
 
-/// Lengths of the rig, m. Of the upper part, `x` counts from [`MEAN_RADIUS_M`].
+/// Dimensions of the rig, m. In the upper part, `x` is measured from [`MEAN_RADIUS_M`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dimensions {
     pub pad_x: [f64; 2],
@@ -65,10 +73,10 @@ pub struct Dimensions {
     /// Half widths along x and z.
     pub pad_holder_half: [f64; 2],
     pub pad_holder_height: f64,
-    /// Half widths along x and z of force sensor and sensor holder: lines of the pad.
+    /// Half widths along x and z of force sensor and sensor holder; both are grid lines of the pad.
     pub column_half: [f64; 2],
     pub sensor_height: f64,
-    /// The sensor holder below the bearing, beside it, and above it.
+    /// Height of the sensor holder below the bearing.
     pub shank_height: f64,
     pub bearing_height: f64,
     pub collar_height: f64,
@@ -84,7 +92,8 @@ pub struct Dimensions {
     pub bore_radius: f64,
     pub disc_holder_radius: f64,
     pub disc_holder_height: f64,
-    /// From the patch to the edge of the finely meshed part of the disc, along the radius and along the circumference.
+    /// Distance from the contact patch to the edge of the finely meshed part of the disc, along the radius and along
+    /// the circumference.
     pub margin: [f64; 2],
 }
 
@@ -118,15 +127,16 @@ impl Default for Dimensions {
     }
 }
 
-/// One of the two substructures, its contact interface free.
+/// One of the two substructures, with free contact interface.
 #[derive(Clone, Debug)]
 pub struct Part {
     pub structure: Structure,
-    /// Nodes of the contact patch, along x fastest.
+    /// Nodes of the contact patch; the position along x varies fastest.
     pub interface: Vec<usize>,
 }
 
-/// The rig: what is above the contact, and the disc with its holders. `pad.interface[k]` and `disc.interface[k]` coincide.
+/// The rig: the upper part above the contact, and the disc with its holders. `pad.interface[k]` and `disc.interface[k]`
+/// coincide.
 #[derive(Clone, Debug)]
 pub struct Tribometer {
     pub pad: Part,
@@ -134,16 +144,16 @@ pub struct Tribometer {
 }
 
 impl Tribometer {
-    /// The rig in bricks of about `spacing_m` away from the patch; those of the upper part are smaller, for its column is
-    /// thinner than the disc is wide.
+    /// The rig meshed with bricks of about `spacing_m`, m, away from the contact patch. The upper part is meshed more
+    /// finely, because its column is thinner than the disc is wide.
     pub fn with_spacing(dimensions: &Dimensions, spacing_m: f64) -> Self {
         Self { pad: upper_part(dimensions, 0.6 * spacing_m), disc: lower_part(dimensions, spacing_m) }
     }
 
-    /// The coarsest rig found with at least `dof` degrees of freedom, both parts together.
+    /// The coarsest mesh found with at least `dof` degrees of freedom in both parts together.
     ///
     /// # Errors
-    /// [`FemError::Size`] below what the coarsest mesh has.
+    /// [`FemError::Size`] if `dof` is below the size of the coarsest mesh, rounded down to thousands.
     pub fn with_dof(dimensions: &Dimensions, dof: usize) -> Result<Self, FemError> {
         let (mut coarse, mut fine) = (0.1, 0.1);
         let mut found = Self::with_spacing(dimensions, fine);
@@ -167,7 +177,8 @@ impl Tribometer {
         Ok(found)
     }
 
-    /// Both parts at rest, joined along the normal by a spring per contact pair.
+    /// The assembly at rest: both parts joined by one spring per contact pair along the contact normal,
+    /// `contact_stiffness_n_per_m` each.
     pub fn at_rest(&self, contact_stiffness_n_per_m: f64) -> Structure {
         let mut whole = self.pad.structure.clone();
         let first = whole.append(&self.disc.structure);
@@ -180,28 +191,28 @@ impl Tribometer {
         whole
     }
 
-    /// Degrees of freedom of both parts, without those that are held.
+    /// Number of free degrees of freedom of both parts.
     pub fn dof(&self) -> usize {
         self.pad.structure.dof() + self.disc.structure.dof()
     }
 }
 
-/// Lines of the patch along x, from [`MEAN_RADIUS_M`], and along z.
+/// Grid lines of the contact patch: along x, measured from [`MEAN_RADIUS_M`], and along z.
 fn patch_lines(dimensions: &Dimensions) -> [Vec<f64>; 2] {
     let lines = |from: f64, to: f64, nodes: usize| [from].into_iter().chain(divided(from, to, nodes - 1)).collect();
     let ([inner, outer], half_z) = (dimensions.pad_x, dimensions.pad_half_z);
     [lines(inner, outer, PATCH[0]), lines(-half_z, half_z, PATCH[1])]
 }
 
-/// About every `spacing`-th of some lines, both ends included: coarser lines that the finer ones refine.
+/// A subset of grid lines about `spacing` apart, both ends included; `lines` are a refinement of it.
 fn thinned(lines: &[f64], spacing: f64) -> Vec<f64> {
     let last = lines.len() - 1;
     let count = pieces(lines[last] - lines[0], spacing).min(last);
     (0..=count).map(|piece| lines[(piece * last + count / 2) / count]).collect()
 }
 
-/// Lines of the upper part along x or z: through 0 and `edges` of components; between the edges of the pad they are lines
-/// of its own, so that the pad's mesh refines them.
+/// Grid lines of the upper part along x or z: through 0, the ends of the pad and the `edges` of components. Within the
+/// pad they are a subset of its lines, so that the mesh of the pad refines them.
 fn lines_above(edges: &[f64], pad_lines: &[f64], spacing: f64) -> Vec<f64> {
     let [first, last] = ends(pad_lines);
     let mut edges: Vec<f64> = edges.iter().copied().chain([first, 0.0, last]).collect();
@@ -220,19 +231,19 @@ fn lines_above(edges: &[f64], pad_lines: &[f64], spacing: f64) -> Vec<f64> {
     lines
 }
 
-/// Lengths closer than this are the same, m.
+/// Distance below which two lengths are equal, m.
 const NEAR: f64 = 1e-9;
 
 fn same(a: f64, b: f64) -> bool {
     (a - b).abs() < NEAR
 }
 
-/// The lines from one value to another, both included.
+/// The grid lines from one value to another, both included.
 fn between(lines: &[f64], from: f64, to: f64) -> Vec<f64> {
     lines.iter().copied().filter(|&line| line > from - NEAR && line < to + NEAR).collect()
 }
 
-/// What is above the contact.
+/// The upper part, above the contact.
 fn upper_part(d: &Dimensions, spacing: f64) -> Part {
     let [pad_x, pad_z] = patch_lines(d);
     let (bearing_z, plate_z) = (d.column_half[1] + d.bearing_depth, d.column_half[1] + d.bearing_depth + d.plate_depth);
@@ -258,7 +269,7 @@ fn upper_part(d: &Dimensions, spacing: f64) -> Part {
     let y = stations(&levels, spacing);
 
     let mut mesh = Mesh::default();
-    // A box of half widths along x, between two levels and two depths, on the ones before it.
+    // Adds a box with a half width along x, between two levels and two depths, joined to the blocks `on`.
     let mut add =
         |name: &str, material, half_x: f64, [low, high]: [usize; 2], [front, back]: [f64; 2], on: &[&Block]| {
             let component = mesh.add_component(name, material);
@@ -291,7 +302,8 @@ fn upper_part(d: &Dimensions, spacing: f64) -> Part {
     Part { structure, interface }
 }
 
-/// Springs between the top of the cylinder and the spring holder above it: in the middle, at corners, at middles of edges.
+/// Adds the springs between the top of the cylinder and the spring holder above it: at the middle, the corners and the
+/// edge middles.
 fn join_cylinder(structure: &mut Structure, cylinder: &Block, holder: &Block, height: f64, half: [f64; 2]) {
     let at = |block: &Block, x: f64, z: f64| {
         let weights = block.locate([x, height, z]).expect("a place on both faces");
@@ -314,10 +326,11 @@ fn join_cylinder(structure: &mut Structure, cylinder: &Block, holder: &Block, he
     }
 }
 
-/// Holds the back of the bracket plate where the bearing sits: `y` fixed, `x` and `z` on springs spread over the area.
+/// Supports the back of the bracket plate over the bearing: `y` fixed, `x` and `z` on springs distributed over the
+/// area.
 fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], half_x: f64) {
     let back = plate.counts()[2] - 1;
-    // The length of the held part that belongs to each line.
+    // Length of the supported part that belongs to each grid line.
     let shares = |lines: &[f64], low: f64, high: f64| -> Vec<f64> {
         let clipped = |line: f64| line.clamp(low, high);
         (0..lines.len())
@@ -347,10 +360,10 @@ fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], h
     }
 }
 
-/// The disc between its holders.
+/// The lower part: the disc between its holders.
 fn lower_part(d: &Dimensions, spacing: f64) -> Part {
     let [patch_x, patch_z] = patch_lines(d);
-    // The finely meshed part around the patch: lines of radius and of angle, the outer ones within its margins.
+    // Fine mesh around the contact patch: grid lines of radius and angle, with margins around the patch.
     let with_margins = |patch: &[f64], margin: f64, scale: f64| {
         let (first, last) = (patch[0], patch[patch.len() - 1]);
         let cells = pieces(margin, spacing).min(5);
@@ -382,7 +395,7 @@ fn lower_part(d: &Dimensions, spacing: f64) -> Part {
     };
     let around = Extent { filled: &|cell| !hole(cell), closed: true };
     let ring = mesh.add_block(disc, [r.clone(), y.clone(), angle.clone()], around, &[], polar);
-    // A rectangle within, polar at the edge, blended across the margins.
+    // Rectangular within the patch, polar at the outer edge, blended across the margins.
     let blended = |at: [f64; 3]| {
         let (x, z) = (at[0] - MEAN_RADIUS_M, at[2] * MEAN_RADIUS_M);
         let beyond = |value: f64, lines: &[f64], margin: f64| {
@@ -420,7 +433,7 @@ fn lower_part(d: &Dimensions, spacing: f64) -> Part {
     Part { structure, interface }
 }
 
-/// Nodes of a block on its `j`-th level, along x fastest.
+/// Nodes of a block on its `j`-th level; the position along x varies fastest.
 fn level(block: &Block, j: usize) -> impl Iterator<Item = usize> {
     let [x, _, z] = block.counts();
     (0..z).flat_map(move |k| (0..x).map(move |i| block.node([i, j, k])))
@@ -435,7 +448,7 @@ mod tests {
     use super::*;
     use crate::reduction::lowest_modes;
 
-    /// The `count` lowest natural frequencies, Hz, by this crate's own modes.
+    /// The `count` lowest natural frequencies, Hz, by [`lowest_modes`].
     fn frequencies_hz(structure: &Structure, count: usize) -> Vec<f64> {
         let assembled = structure.assemble().unwrap();
         let modes = lowest_modes("structure", &assembled.mass, &assembled.stiffness, count).unwrap();
@@ -482,7 +495,7 @@ mod tests {
 
     #[test]
     fn the_mass_is_that_of_boxes_and_rings() {
-        // Density times volume of each component, by hand; the polar mesh cuts the corners of its rings.
+        // Density times volume of each component, calculated by hand. The polar mesh approximates rings by polygons.
         let d = Dimensions::default();
         let tribometer = Tribometer::with_dof(&d, 20_000).unwrap();
         let mass_kg = |part: &Part, name: &str| -> f64 {
@@ -494,7 +507,7 @@ mod tests {
                 .map(|brick| {
                     let material = &mesh.components[brick.component].material;
                     let matrices = super::super::brick(&mesh.corners_m(brick), material).unwrap();
-                    // Moved as a whole along x, y and z.
+                    // Mean over translations along x, y and z.
                     (0..24)
                         .flat_map(|i| (i % 3..24).step_by(3).map(move |j| (i, j)))
                         .map(|(i, j)| matrices.mass[i][j])
