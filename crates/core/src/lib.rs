@@ -1,7 +1,7 @@
 //! Complex eigenvalue analysis of a pad in sliding contact with a disc: models, roots, windows of instability, charts,
 //! full finite-element models and their reduction.
 //!
-//! Pure: no file, clock, bus, log or serialisation is in here, and none in the dependency tree.
+//! The crate is pure: there is no file, clock, bus, log or serialisation in it or in its dependency tree.
 
 pub mod fem;
 pub mod physics;
