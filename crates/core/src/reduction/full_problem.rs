@@ -19,8 +19,8 @@ use crate::physics::OperatingPoint;
 const KRYLOV_LIMIT: f64 = 1e-12;
 /// Largest backward error of a root, see [`FullRoot::residual`]. An eigenpair `(θ, x)` of the inverse with residual `e`
 /// has the residual `Q(s) e/θ` in the original problem. That is at most [`KRYLOV_LIMIT`] times the norms at the shift.
-/// They differ from the norms at the root by the mass term only, which weighs no more than the stiffness: a factor of
-/// 2. Linearisation doubles it again, because both halves of the vector contribute.
+/// They differ from the norms at the root by the mass term only, which weighs no more than the stiffness, and so are at
+/// most twice as large. Linearisation doubles the bound again, because both halves of the vector contribute.
 const RESIDUAL_LIMIT: f64 = 4.0 * KRYLOV_LIMIT;
 /// Imaginary part, relative to `|λ|`, below which a root counts as non-oscillating.
 const REAL: f64 = 1e-9;
