@@ -21,12 +21,14 @@ pub struct Component {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Brick {
     pub nodes: [usize; 8],
+    /// Index in [`Mesh::components`].
     pub component: usize,
 }
 
 /// Nodes, bricks, components and hanging nodes.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
+    /// Positions of the nodes, m.
     pub nodes_m: Vec<[f64; 3]>,
     pub bricks: Vec<Brick>,
     pub components: Vec<Component>,

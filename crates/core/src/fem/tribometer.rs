@@ -2,10 +2,10 @@
 //! model reduction.
 //!
 //! ```text
-//!            spring holder        held along x and z at its top, free along y
+//!            spring holder        fixed along x and z at its top, free along y
 //!              : : :              nine springs
 //!            cylinder
-//!            sensor holder == linear bearing == bracket plate    y held, x and z sprung at its back
+//!            sensor holder == linear bearing == bracket plate    y fixed, x and z on springs at its back
 //!            force sensor
 //!            pad holder
 //!            pad
@@ -76,7 +76,8 @@ pub struct Dimensions {
     /// Half widths along x and z of force sensor and sensor holder; both are grid lines of the pad.
     pub column_half: [f64; 2],
     pub sensor_height: f64,
-    /// Height of the sensor holder below the bearing.
+    /// Heights of three sections of the sensor holder: `shank_height` below the bearing, `bearing_height` beside it and
+    /// `collar_height` above it.
     pub shank_height: f64,
     pub bearing_height: f64,
     pub collar_height: f64,
