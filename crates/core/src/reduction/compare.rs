@@ -160,7 +160,9 @@ pub fn reduced_roots(model: &Model, solver: &mut Solver, p: &OperatingPoint) -> 
 pub struct WindowComparison {
     /// Pairs of a full and a reduced window.
     pub pairs: Vec<(Window, Window)>,
+    /// Full windows without a partner.
     pub missed: Vec<Window>,
+    /// Reduced windows without a partner.
     pub invented: Vec<Window>,
 }
 

@@ -51,7 +51,7 @@ impl ModeSelection {
 /// Real modes in ascending order of frequency.
 #[derive(Clone, Debug)]
 pub struct Modes {
-    /// `ω`, rad/s, one per mode.
+    /// `ω`, rad/s, one per mode; 0 for rigid-body modes.
     pub omega_rad_s: Vec<f64>,
     /// `Φ`, degrees of freedom by modes, kg^-1/2, mass-normalised: `Φᵀ M Φ = I`. The largest entry of each column is
     /// positive.

@@ -5,6 +5,11 @@
 //! C(p) = Σ law(p) C_term + (B_n + s μ B_t)ᵀ C_c B_n + dμ/dv B_tᵀ diag(N_0) B_t + μ B_bᵀ diag(N_0 / v) B_b
 //! ```
 //!
+//! `B_n`, `B_t` and `B_b` are the rows of the contact pairs along the normal, the sliding and the lateral direction.
+//! `K_c` and `C_c` hold stiffness and damping of the pairs on their diagonals. `κ(N)` is the load dependence of the
+//! contact stiffness, `s` the sign of the disc speed, `N_0` the normal load per pair and `v` the sliding speed at the
+//! pair. Friction terms vanish without sliding, all contact terms if the contact is open.
+//!
 //! All matrices are sparse. The parts are symmetric and not coupled to each other, terms may have any symmetry, and the
 //! rows `B` of the contact pairs couple the parts. [`FullModel::project`] projects everything on a basis, which gives
 //! an ordinary [`Model`].
@@ -42,8 +47,11 @@ pub type SparseRow = Vec<(usize, f64)>;
 /// Contact pairs over the rows of all parts: relative displacement, pad minus disc, along the triad `n`, `t`, `b`.
 #[derive(Clone, Debug, Default)]
 pub struct FullContact {
+    /// `B_n`: displacement along the contact normal, one row per pair.
     pub normal: Vec<SparseRow>,
+    /// `B_t`: displacement along the sliding direction, one row per pair.
     pub sliding: Vec<SparseRow>,
+    /// `B_b`: displacement along `b = n × t`, one row per pair.
     pub lateral: Vec<SparseRow>,
     /// `k` per pair at the reference load, N/m.
     pub stiffness_n_per_m: Vec<f64>,
@@ -56,10 +64,15 @@ pub struct FullContact {
 /// A full model. The rows of its parts are concatenated in order.
 #[derive(Clone, Debug)]
 pub struct FullModel {
+    /// Pad and disc, or a single system.
     pub parts: Vec<FullPart>,
+    /// Terms of `K` in addition to parts and contact pairs.
     pub stiffness: Vec<SparseTerm>,
+    /// Terms of `C` in addition to contact pairs.
     pub damping: Vec<SparseTerm>,
+    /// Contact pairs; `None` for a model described by terms only.
     pub contact: Option<FullContact>,
+    /// How contact and friction depend on load and speed.
     pub contact_law: ContactLaw,
 }
 
@@ -72,7 +85,9 @@ pub struct Projected {
     pub omega_squared: Vec<f64>,
     /// The contact pairs in the coordinates of the basis.
     pub contact: Option<ContactPairs>,
+    /// Terms of `K` in the coordinates of the basis, without parts and contact pairs.
     pub stiffness: Vec<Term>,
+    /// Terms of `C` in the coordinates of the basis, without contact pairs.
     pub damping: Vec<Term>,
 }
 

@@ -54,8 +54,9 @@ const DENSE_BELOW: usize = 240;
 /// Which eigenvectors to compute.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FullVectors {
+    /// No vectors.
     None,
-    /// `x` and `y`: `(λ² M + λ C + K) x = 0`, `yᴴ (λ² M + λ C + K) = 0`.
+    /// Right vectors `x` and left vectors `y`: `(λ² M + λ C + K) x = 0`, `yᴴ (λ² M + λ C + K) = 0`.
     Both,
 }
 
@@ -64,7 +65,8 @@ pub enum FullVectors {
 pub struct FullRoot {
     /// `λ`, 1/s, with an imaginary part of at least 0.
     pub lambda: c64,
-    /// `|(λ² M + λ C + K) x| / ((|λ|² |M| + |λ| |C| + |K|) |x|)`, 1-norms of matrices and 2-norms of vectors.
+    /// Scaled residual `|(λ² M + λ C + K) x| / ((|λ|² |M| + |λ| |C| + |K|) |x|)`, with 1-norms of matrices and 2-norms
+    /// of vectors.
     pub residual: f64,
 }
 
@@ -169,7 +171,7 @@ impl<'a> FullSolver<'a> {
     /// Every disc is assumed to contribute at least half of the roots wanted around a shift.
     fn vector_bytes(&self, vectors: FullVectors, roots: usize) -> usize {
         let (n, complex) = (self.model.dimension(), size_of::<c64>());
-        // Real of `n`, or complex of `2n`.
+        // Krylov vectors are real of length `n`, or complex of length `2n`.
         let undamped = self.parts.is_some() && self.model.is_undamped();
         let (rows, each) = if undamped { (n, size_of::<f64>() * n) } else { (2 * n, complex * 2 * n) };
         let both = vectors == FullVectors::Both;

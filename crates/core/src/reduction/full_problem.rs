@@ -17,12 +17,12 @@ use crate::physics::OperatingPoint;
 
 /// Largest residual of an eigenpair of the inverse, relative to its `θ`.
 const KRYLOV_LIMIT: f64 = 1e-12;
-/// Largest backward error of a root, see [`FullRoot::residual`]. An eigenpair `(θ, x)` of the inverse with residual `e`
-/// has the residual `Q(s) e/θ` in the original problem. That is at most [`KRYLOV_LIMIT`] times the norms at the shift.
-/// They differ from the norms at the root by the mass term only, which weighs no more than the stiffness, and so are at
-/// most twice as large. Linearisation doubles the bound again, because both halves of the vector contribute.
+/// Largest scaled residual of a root, see [`FullRoot::residual`]. An eigenpair `(θ, x)` of the inverse with residual
+/// `e` has the residual `Q(s) e/θ` in the original problem. That is at most [`KRYLOV_LIMIT`] times the norms at the
+/// shift. They differ from the norms at the root by the mass term only, which weighs no more than the stiffness, and so
+/// are at most twice as large. Linearisation doubles the bound again, because both halves of the vector contribute.
 const RESIDUAL_LIMIT: f64 = 4.0 * KRYLOV_LIMIT;
-/// Imaginary part, relative to `|λ|`, below which a root counts as non-oscillating.
+/// Imaginary part, relative to `|λ|`, below which a root counts as static.
 const REAL: f64 = 1e-9;
 /// `|λ²|`, relative to that of the shift, below which a root is a rigid-body mode and counts as 0.
 const FLOATING: f64 = 1e-10;
@@ -116,7 +116,7 @@ impl<'a> Problem<'a> {
         sum
     }
 
-    /// Backward error of every column, see [`FullRoot::residual`]; with `transposed` matrices for left vectors.
+    /// Scaled residual of every column, see [`FullRoot::residual`]; with `transposed` matrices for left vectors.
     fn residuals(&self, lambdas: &[c64], x: MatRef<'_, c64>, transposed: bool) -> Vec<f64> {
         let mut residuals = vec![];
         let one = c64::new(1.0, 0.0);
@@ -137,7 +137,7 @@ impl<'a> Problem<'a> {
         residuals
     }
 
-    /// Backward error of one solve with a random right-hand side at a shift, relative to `|Q| |x| + |b|`.
+    /// Scaled residual of one solve with a random right-hand side at a shift, relative to `|Q| |x| + |b|`.
     pub fn solve_residual(&self, shifted: &Shifted) -> f64 {
         let s = c64::new(0.0, shifted.square.sqrt());
         let b = random::<c64>(self.model.dimension(), 1, 77);

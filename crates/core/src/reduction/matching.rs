@@ -91,7 +91,7 @@ mod tests {
             [root(-3.0, 100.001), root(1.0, 100.0), root(5.0, 700.0), root(-19.0, 2020.0), root(-1.0, 3000.0)];
         let counted = Counted { band_rad_s: 2010.0, growth_floor_per_s: -20.0 };
         let found = match_roots(&full, &reduced, counted);
-        // The root at 2000 and the one at 2020 are 0.0138 apart: not the same root.
+        // The roots at 2000 and 2020 are 0.0138 apart, too far for a pair.
         assert_eq!(found.missed, [root(0.0, 2000.0), root(2.0, 1000.0)]);
         assert_eq!(found.invented, [root(5.0, 700.0)]);
         assert_eq!(found.errors.len(), 2);

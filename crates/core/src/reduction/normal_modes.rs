@@ -15,7 +15,7 @@ use super::{ReductionError, SparseMatrix, whiten};
 
 /// Largest residual of an eigenpair of `C`, relative to its `θ`.
 const RESIDUAL_LIMIT: f64 = 1e-12;
-/// Largest backward error `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of a mode, with 1-norms of the matrices.
+/// Largest scaled residual `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of a mode, with 1-norms of the matrices.
 const BACKWARD_LIMIT: f64 = 1e-12;
 /// Relative gap of two neighbouring `ω²` that is wide enough for an inertia (Sturm) count between them.
 const GAP: f64 = 1e-7;
@@ -64,7 +64,7 @@ pub struct SparseModes {
     pub omega_squared: Vec<f64>,
     /// `Φ`, degrees of freedom by modes, kg^-1/2, mass-normalised: `Φᵀ M Φ = I`.
     pub phi: Mat<f64>,
-    /// Backward error `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of every mode, with 2-norms of vectors and 1-norms of
+    /// Scaled residual `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of every mode, with 2-norms of vectors and 1-norms of
     /// matrices.
     pub residuals: Vec<f64>,
 }
@@ -82,8 +82,9 @@ pub fn lowest_modes(
     normal_modes(what, mass, stiffness, Wanted::Lowest(count), None, &mut |_| {})
 }
 
-/// The lowest modes of `K φ = ω² M φ` with sparse, symmetric `n×n` matrices: `mass` `M`, kg, positive definite, and
-/// `stiffness` `K`, N/m.
+/// The lowest modes of `K φ = ω² M φ` with sparse, symmetric `n×n` matrices: `mass` `M`, kg, and `stiffness` `K`, N/m.
+/// `M` must be positive definite; for systems that are not solved densely, positive semidefinite with a positive
+/// diagonal is enough.
 ///
 /// `what` names the system in errors. `memory_limit_bytes` limits the memory taken in addition to what is already held;
 /// the estimated need is compared with it before the work starts. `progress` receives the progress.
@@ -235,7 +236,7 @@ const TOGETHER: usize = 24;
 /// permuted back.
 const AT_A_TIME: usize = 4;
 
-/// Modes before their residuals are known.
+/// Modes without residuals yet.
 struct Found {
     omega_squared: Vec<f64>,
     phi: Mat<f64>,
@@ -368,7 +369,7 @@ fn gap_after(squares: &[f64], count: usize) -> Option<usize> {
     (count..squares.len()).find(|&k| squares[k] - squares[k - 1] > GAP * squares[k].abs().max(1e-6 * largest))
 }
 
-/// Normalises signs and computes the backward error of every mode explicitly.
+/// Normalises signs and computes the scaled residual of every mode explicitly.
 ///
 /// # Errors
 /// [`ReductionError::Residual`].

@@ -68,7 +68,9 @@ const MOST_ROUNDS: usize = 4;
 /// Requirements of a parametric basis.
 #[derive(Clone, Debug)]
 pub struct ParametricRequest {
+    /// Box of operating points over which the basis must be valid.
     pub range: OperatingBox,
+    /// Which roots must meet the tolerance.
     pub counted: Counted,
     /// Largest `|Δλ|/|λ|` of a counted root.
     pub tolerance: f64,
@@ -115,9 +117,11 @@ pub struct HeldOut {
 /// A parametric basis and its validation.
 #[derive(Clone, Debug)]
 pub struct ParametricBasis {
+    /// The full model projected on the basis.
     pub projected: Projected,
     /// Points at which the full model was solved for vectors.
     pub sampled: Vec<OperatingPoint>,
+    /// Validation at the held-out points.
     pub held_out: Vec<HeldOut>,
     /// Largest observed ratio of true error to estimate, at least 1.
     pub true_over_estimate: f64,

@@ -23,6 +23,7 @@ pub struct Substructure<'a> {
 /// Modes and residuals kept of a substructure.
 #[derive(Clone, Debug)]
 pub struct Kept {
+    /// The lowest modes.
     pub modes: SparseModes,
     /// Residual flexibility and inertia of the truncated modes, if requested.
     pub residual: Option<Residual>,
