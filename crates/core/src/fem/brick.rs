@@ -6,8 +6,8 @@
 //! transformed accordingly.
 //!
 //! Source: Wilson, Taylor, Doherty, Ghaboussi, "Incompatible displacement models", in Numerical and Computer Methods in
-//! Structural Mechanics (1973) 43-57; Taylor, Beresford, Wilson, "A non-conforming element for stress analysis", Int. J.
-//! Numer. Meth. Engng 10 (1976) 1211-1219.
+//! Structural Mechanics (1973) 43-57; Taylor, Beresford, Wilson, "A non-conforming element for stress analysis", Int.
+//! J. Numer. Meth. Engng 10 (1976) 1211-1219.
 
 use super::Material;
 

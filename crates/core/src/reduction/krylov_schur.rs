@@ -10,7 +10,8 @@
 //! real: the retained subspace is closed under conjugation, so its projector `Re(U Uᴴ)` has a real basis.
 //!
 //! Source: Stewart, "A Krylov-Schur algorithm for large eigenproblems", SIAM J. Matrix Anal. Appl. 23 (2002) 601-614;
-//! Zhou, Saad, "Block Krylov-Schur method for large symmetric eigenvalue problems", Numer. Algorithms 47 (2008) 341-359.
+//! Zhou, Saad, "Block Krylov-Schur method for large symmetric eigenvalue problems", Numer. Algorithms 47 (2008)
+//! 341-359.
 
 use faer::traits::ComplexField;
 use faer::{Mat, MatRef, c64};

@@ -21,8 +21,9 @@ const BACKWARD_LIMIT: f64 = 1e-12;
 const GAP: f64 = 1e-7;
 /// Below this many degrees of freedom a dense solve is at least as fast.
 const DENSE_BELOW: usize = 400;
-/// The first and the largest shift to try, relative to `tr K / tr M`.
+/// The first shift `s` to try, relative to `tr K / tr M`.
 const FIRST_SHIFT: f64 = 1e-8;
+/// Upper limit of the shifts to try, relative to `tr K / tr M`.
 const LARGEST_SHIFT: f64 = 1e5;
 /// Largest ratio of the wanted `θ`. Above it the shift is increased, because small `θ` would lose digits to the
 /// rounding of the largest.
@@ -150,7 +151,8 @@ impl<'a> Analysed<'a> {
     /// The lowest modes; see [`normal_modes`].
     ///
     /// # Errors
-    /// [`ReductionError`]: `ModeCount`, `Memory`, `NoShift`, `NotConverged`, `Residual`, `MissedModes`, `Factorisation`.
+    /// [`ReductionError`]: `ModeCount`, `Memory`, `NoShift`, `NotConverged`, `Residual`, `MissedModes`,
+    /// `Factorisation`.
     pub fn modes(
         &self,
         wanted: Wanted,

@@ -25,8 +25,8 @@
 //! 93, error 2.8e-7.
 //!
 //! # Source
-//! Gräbner, Mehrmann, Quraishi, Schröder, von Wagner, "Numerical methods for parametric model reduction in the simulation
-//! of disk brake squeal", ZAMM 96 (2016) 1388-1405 (right vectors); Benner, Gugercin, Willcox, "A survey of
+//! Gräbner, Mehrmann, Quraishi, Schröder, von Wagner, "Numerical methods for parametric model reduction in the
+//! simulation of disk brake squeal", ZAMM 96 (2016) 1388-1405 (right vectors); Benner, Gugercin, Willcox, "A survey of
 //! projection-based model reduction methods for parametric dynamical systems", SIAM Review 57 (2015) 483-531 (greedy).
 
 use faer::linalg::solvers::Solve;
@@ -44,9 +44,10 @@ use crate::physics::{Model, OperatingPoint, Solver, Spectrum, Vectors};
 /// Fraction of the tolerance that the estimate must meet at training points, so that held-out points meet the
 /// tolerance.
 const TRAINING_SHARE: f64 = 0.3;
-/// Vectors are also taken from roots slightly beyond the band and below the growth floor: such roots may enter the
-/// counted region elsewhere in the box.
+/// Factor on the end of the band up to which vectors are taken: roots slightly beyond it may enter the band elsewhere
+/// in the box.
 const BAND_MARGIN: f64 = 1.02;
+/// Factor on a negative growth floor down to which vectors are taken, for the same reason.
 const FLOOR_MARGIN: f64 = 1.5;
 /// A vector is not added if its component outside the span is below this times the square root of the tolerance.
 const NEGLIGIBLE: f64 = 0.01;
@@ -58,9 +59,10 @@ const ROUNDED: f64 = 1e-7;
 const SHIFT: f64 = 0.05;
 /// Number of columns multiplied with `S` at a time.
 const TOGETHER: usize = 16;
-/// Number of roots whose residuals are computed at a time, and the number of copies of their columns held meanwhile:
-/// the vectors, three products in two memory layouts, two of the residuals, and three during the solve.
+/// Number of roots whose residuals are computed at a time.
 const ROOTS_TOGETHER: usize = 8;
+/// Number of copies of their columns held meanwhile: the vectors, three products in two memory layouts, two of the
+/// residuals, and three during the solve.
 const ESTIMATING: usize = 12;
 /// Largest number of rounds of validation.
 const MOST_ROUNDS: usize = 4;
@@ -96,8 +98,9 @@ pub enum ParametricStep {
     Estimating { done: usize, of: usize },
     /// A solve of the full model at a sampled point starts.
     Sampling { point: OperatingPoint, sample: usize },
-    /// The sampled point has `roots` counted roots, and the span now has `vectors` vectors. `true_over_estimate` is the
-    /// largest ratio of true error to estimate at this point; NaN without estimates.
+    /// The sampled point has `roots` roots within band and growth floor, margins included, and the span now has
+    /// `vectors` vectors. `true_over_estimate` is the largest ratio of true error to estimate at this point; NaN
+    /// without estimates.
     Sampled { roots: usize, vectors: usize, true_over_estimate: f64 },
     /// The error has been estimated at all training points. `worst` is the largest scaled estimate of `|Δλ|/|λ|`.
     Estimated { worst: f64, vectors: usize },
