@@ -1,7 +1,7 @@
-//! The session: a pure step from events to effects.
+//! The session: the state from which predictions follow, advanced one event at a time by a pure step.
 //!
-//! Live and replay drive the same step. It knows no clock: time comes from the stamps of its events. A prediction is a
-//! function of the rig, the settings and the events so far, and of nothing else.
+//! A node and a replay drive the same step. The session reads no clock: time comes from the stamps of its events. A
+//! prediction depends only on the rig, the settings and the events so far.
 
 use std::fmt::Write;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -18,68 +18,68 @@ use crate::rig::Rig;
 use crate::settings::{SettingError, Settings};
 use crate::wire::{self, Header, MAX_MODES, Prediction, Time, level};
 
-/// Something that happened.
+/// An event that advances a session.
 #[derive(Clone, Debug)]
 pub enum Event {
-    /// Conditions to predict for.
+    /// An operating point to predict for.
     Input(wire::OperatingPoint),
-    /// A setting was changed.
+    /// A setting changed.
     Parameter { name: String, value: f64 },
-    /// Nothing was heard for [`Settings::silence_timeout_s`]; the stamp is when that was noticed.
+    /// No input came for [`Settings::silence_timeout_s`]; `stamp` is the time at which that was detected.
     Silence { stamp: Time },
-    /// Windows and identities for a load and speed became ready.
+    /// A stability map was computed: windows and identities at one load and speed.
     MapReady(Arc<StabilityMap>),
-    /// The ends of the windows of the map in force, for another load and speed, became ready.
+    /// The window ends of the map in force were computed at another load and speed.
     EndsReady(Arc<Ends>),
-    /// A chart of the roots became ready.
+    /// The chart of the rig was built.
     ChartReady(Arc<Chart>),
 }
 
-/// What a step leads to.
+/// What the caller has to do after a step.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Effects<'a> {
-    /// Publish (and record) this prediction.
+    /// The prediction to publish and record, if the step made one.
     pub publish: Option<&'a Prediction>,
-    /// This would be used, if somebody computed it.
+    /// What to compute in the background, if later predictions would use it.
     pub want: Option<Want>,
 }
 
-/// What a session would use.
+/// A result that later predictions would use and the session does not compute itself.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Want {
-    /// A stability map for a load and speed.
+    /// A stability map at this load and speed.
     Map(OperatingPoint),
-    /// The ends of the windows of the map in force, for a load and speed.
+    /// The window ends of the map in force, at this load and speed.
     Ends(OperatingPoint),
 }
 
-/// How many predictions were made and how many were saved.
+/// Number of predictions by route, and the work they avoided.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Dense solves.
+    /// Predictions by a dense solve.
     pub solved: u64,
-    /// Predictions read off the chart: dense solves saved.
+    /// Predictions read off the chart, each of which replaced a dense solve.
     pub charted: u64,
     pub reused: u64,
     pub faults: u64,
-    /// Matrices that were not added in dense solves, their coefficients being zero.
+    /// Matrix terms skipped in dense solves because their coefficient is zero.
     pub zero_terms: u64,
-    /// Modes that nothing couples, which dense solves did without.
+    /// Modes excluded from dense solves because no term couples them to others.
     pub decoupled_modes: u64,
-    /// Roots beyond the band that predictions off the chart did without.
+    /// Roots beyond the band that charted predictions did not evaluate.
     pub roots_beyond_band: u64,
 }
 
 impl Counters {
-    /// Predictions that took work: all but those reused.
+    /// Predictions that were computed: solved or charted, not reused.
     pub fn worked(&self) -> u64 {
         self.solved + self.charted
     }
 }
 
-/// Exact enough: what is better known is not asked for again.
+/// Window ends whose error bound is at most this are not recomputed.
 const ENDS_TOLERANCE: f64 = 1e-10;
-/// Ends of windows are asked for at most this often, in the time of the stamps, ns.
+/// Minimum interval between two requests for window ends, measured in stamps, ns.
 const ENDS_EVERY_NS: i64 = 100_000_000;
 
 /// The state of a session.
@@ -90,18 +90,18 @@ pub struct Session {
     traces: Traces,
     scratch: Scratch,
     charted: Vec<Root>,
-    /// Spectra that were worked out beforehand.
+    /// Spectra solved in advance for operating points that are expected.
     beforehand: Vec<Spectrum>,
     summary: Summary,
-    /// Room for the choice of the modes to publish.
+    /// Buffer for selecting the modes to publish.
     order: Vec<usize>,
     chart: Option<Arc<Chart>>,
     map: Option<Arc<StabilityMap>>,
-    /// The ends of the map's windows elsewhere than the map.
+    /// Window ends of the map at a load and speed other than the map's own.
     ends: Option<Arc<Ends>>,
     /// The latest prediction.
     prediction: Prediction,
-    /// The conditions it was worked out for, if it may be reused.
+    /// Operating point of the latest prediction; `None` if that prediction must not be reused.
     last: Option<OperatingPoint>,
     ends_asked: Option<Time>,
     last_stamp: Option<Time>,
@@ -110,7 +110,7 @@ pub struct Session {
     counters: Counters,
 }
 
-/// What the node maps for a rig.
+/// Options of the stability map that a session of `rig` uses.
 pub fn map_options(rig: &Rig) -> MapOptions {
     MapOptions {
         mu_min: 0.0,
@@ -121,7 +121,8 @@ pub fn map_options(rig: &Rig) -> MapOptions {
     }
 }
 
-/// What the node charts for a rig: the whole searched range of friction coefficients, loads and speeds as the rig says.
+/// Options of the chart that a session of `rig` uses: friction coefficients from 0 to `mu_max`, loads and speeds as
+/// given in the rig.
 pub fn chart_options(rig: &Rig) -> ChartOptions {
     let [load_low, load_high] = rig.chart.normal_load_n;
     let [speed_low, speed_high] = rig.chart.disc_speed_rad_s;
@@ -141,15 +142,15 @@ pub fn chart_options(rig: &Rig) -> ChartOptions {
     }
 }
 
-/// Dense solves that the chart of a model of `dimension` coordinates may take: twenty minutes of one core, but for
-/// large models enough for one axis.
+/// Limit on the dense solves for the chart of a model of `dimension` coordinates. It corresponds to about twenty
+/// minutes on one core; large models get at least enough solves to chart one axis.
 fn max_solves(dimension: usize) -> usize {
     let size = dimension.max(20) as f64 / 160.0;
     (12_000.0 / size.powi(3)).clamp(2_000.0, 200_000.0) as usize
 }
 
 impl Session {
-    /// A session that has heard nothing yet.
+    /// A session without events.
     pub fn new(rig: Arc<Rig>, settings: Settings) -> Self {
         let solver = Solver::new(rig.model.dimension());
         Self {
@@ -180,7 +181,7 @@ impl Session {
         &self.settings
     }
 
-    /// What was done and what was saved so far.
+    /// The counters so far.
     pub fn counters(&self) -> Counters {
         self.counters
     }
@@ -190,18 +191,18 @@ impl Session {
         self.map.as_ref()
     }
 
-    /// The map whose windows hold at `point`.
+    /// The map in force, if its windows are valid at `point`.
     pub fn map_at(&self, point: &OperatingPoint) -> Option<&Arc<StabilityMap>> {
         let tolerance = self.settings.map_tolerance;
         self.map.as_ref().filter(|map| map_serves(&self.rig.model, map, point, tolerance))
     }
 
-    /// The map that numbers modes at `point`.
+    /// The map in force, if it gives the identities of modes at `point`.
     pub fn numbering_at(&self, point: &OperatingPoint) -> Option<&Arc<StabilityMap>> {
         self.map.as_ref().filter(|map| numbers(&self.rig.model, map, point))
     }
 
-    /// The ends of the map's windows in force.
+    /// The window ends in force: those computed last, else those of the map.
     pub fn ends(&self) -> Option<&Ends> {
         self.ends.as_deref().or(self.map.as_ref().map(|map| &map.ends))
     }
@@ -211,12 +212,13 @@ impl Session {
         &self.prediction
     }
 
-    /// Whether the prediction for `point` takes no dense solve, unless the chart's own check fails there.
+    /// Whether `point` can be predicted without a dense solve: reused or charted. A dense solve is still needed if the
+    /// chart fails its check there.
     pub fn answers_at_once(&self, point: &OperatingPoint) -> bool {
         self.reuses(point) || self.usable_chart(point).is_some_and(|chart| chart.covers(point))
     }
 
-    /// Whether the prediction for `point`, if it came next, would have no margin for want of a stability map.
+    /// Whether a prediction at `point` would have no margin because no stability map is valid there.
     pub fn lacks_map(&self, point: &OperatingPoint) -> bool {
         self.rig.limits.check(point).is_ok()
             && self.rig.model.contact_state(point) == ContactState::Sliding
@@ -224,19 +226,19 @@ impl Session {
             && self.map_at(point).is_none()
     }
 
-    /// Takes spectra of conditions that it may come to, solved with both vectors; those of before are dropped. Where it comes to
-    /// them it does not solve again: what it predicts is the same.
+    /// Replaces the spectra solved in advance. They must contain left and right eigenvectors. Where an input has
+    /// exactly one of their operating points, that spectrum is used instead of a new solve; the prediction is the same.
     pub fn hand_in(&mut self, spectra: Vec<Spectrum>) {
         self.beforehand = spectra;
     }
 
-    /// Whether the prediction for `point`, if it came next, would be solved.
+    /// Whether a prediction at `point` would need a dense solve now.
     pub fn would_solve(&self, point: &OperatingPoint) -> bool {
         let at_hand = self.beforehand.iter().any(|spectrum| same(&spectrum.point, point));
         !at_hand && !self.answers_at_once(point) && self.rig.limits.check(point).is_ok()
     }
 
-    /// Which of `points` would be solved if they came one after another.
+    /// The operating points among `points` that would need a dense solve if they came in this order.
     pub fn would_solve_among<'a>(&self, points: impl Iterator<Item = &'a OperatingPoint>) -> Vec<OperatingPoint> {
         let mut last = self.last;
         let wanted = points.filter(|point| {
@@ -249,10 +251,10 @@ impl Session {
         wanted.copied().collect()
     }
 
-    /// One step. After the first of its kind a step allocates nothing on the chart's route.
+    /// Advances the session by one event. A charted prediction allocates no memory, except the first of a session.
     ///
     /// # Errors
-    /// [`SettingError`] for a parameter that is unknown or out of range; nothing has changed then.
+    /// [`SettingError`] if a parameter is unknown or its value out of range; the session is then unchanged.
     pub fn step(&mut self, event: Event) -> Result<Effects<'_>, SettingError> {
         match event {
             Event::Input(input) => {
@@ -273,12 +275,12 @@ impl Session {
             Event::EndsReady(ends) => self.ends = Some(ends),
             Event::ChartReady(chart) => self.chart = Some(chart),
         }
-        // What was predicted before may come out otherwise now.
+        // The event may change predictions, so the latest one must not be reused.
         self.last = None;
         Ok(Effects::default())
     }
 
-    /// Makes the prediction for an input, and says what would make the next ones better.
+    /// Predicts for an input; returns what should be computed for later predictions.
     fn input(&mut self, input: wire::OperatingPoint) -> Option<Want> {
         let point = input.point();
         let (header, seq) = (input.header, input.seq);
@@ -320,12 +322,12 @@ impl Session {
         }
     }
 
-    /// Whether better ends than those in force are to be had at `point`.
+    /// Requests new window ends for `point` if those in force were computed elsewhere and are not accurate enough.
     fn want_ends(&mut self, map: &StabilityMap, point: &OperatingPoint, stamp: Time) -> Option<Want> {
         let ends = self.ends.as_deref().unwrap_or(&map.ends);
         let moved = ends.point.with_friction(0.0) != point.with_friction(0.0);
         let lately = self.ends_asked.is_some_and(|asked| stamp.as_ns() - asked.as_ns() < ENDS_EVERY_NS);
-        // Of a rig that knows neither load nor speed the bound is that of rounding anywhere.
+        // If the model depends on neither load nor speed, the ends hold everywhere and their bound is rounding error.
         let worst = ends.at(point).flat_map(|(from, to)| std::iter::once(from).chain(to)).map(|end| end.error);
         let exact = worst.fold(0.0, |a: f64, b| if b.is_nan() { b } else { a.max(b) }) <= ENDS_TOLERANCE;
         let (load, speed) = self.rig.model.depends_on_load_and_speed();
@@ -336,7 +338,7 @@ impl Session {
         Some(Want::Ends(*point))
     }
 
-    /// Solves for `point`; the error is the reason of a FAULT.
+    /// Predicts for `point` by chart or dense solve; `map` is the map valid there. The error is the reason of a FAULT.
     fn predict(
         &mut self,
         header: Header,
@@ -386,13 +388,14 @@ impl Session {
         self.last.is_some_and(|last| within_dead_band(&last, point, &self.settings))
     }
 
-    /// The chart, where it may be asked: it holds one direction of rotation.
+    /// The chart, if it can be used at `point`. It covers one direction of rotation only.
     fn usable_chart(&self, point: &OperatingPoint) -> Option<&Arc<Chart>> {
         let sliding = self.rig.model.contact_state(point) == ContactState::Sliding;
         self.chart.as_ref().filter(|_| sliding && point.disc_speed_rad_s >= 0.0)
     }
 
-    /// Takes what the chart says at `point`; false where there is none, or where it does not answer.
+    /// Evaluates the chart at `point` and stores the modes in `summary`. False without a chart, or if the chart has no
+    /// answer there.
     fn charted_at(&mut self, point: &OperatingPoint) -> bool {
         let Some(chart) = self.usable_chart(point).cloned() else { return false };
         self.charted.clear();
@@ -412,7 +415,7 @@ impl Session {
         true
     }
 
-    /// Takes a dense solve at `point`; the error is the reason of a FAULT.
+    /// Solves the eigenvalue problem at `point` and stores the modes in `summary`. The error is the reason of a FAULT.
     fn solved_at(&mut self, point: &OperatingPoint) -> Result<(), String> {
         let at_hand = self.beforehand.iter().position(|spectrum| same(&spectrum.point, point));
         let at_hand = at_hand.map(|k| self.beforehand.swap_remove(k));
@@ -441,8 +444,9 @@ impl Session {
         }
     }
 
-    /// The level of a prediction; why goes into its reason. Of several modes past the limit the reason names the one that grows
-    /// fastest, and the limit that decides: where squeal begins, or, once it has begun, where it ends.
+    /// Returns the level of a prediction and writes why into its reason. If several modes exceed the damping limit, the
+    /// reason names the fastest growing one. It also names the limit that applies: the one at which squeal begins or,
+    /// if the last prediction was SQUEAL, the one at which squeal ends (hysteresis).
     fn judge(&mut self, friction_margin: Option<f64>) -> u8 {
         let (summary, reason) = (&self.summary, &mut self.prediction.reason);
         let mut because = |text: std::fmt::Arguments<'_>| {
@@ -483,7 +487,7 @@ impl Session {
         }
     }
 
-    /// Makes the prediction a FAULT.
+    /// Replaces the latest prediction by a FAULT with this reason.
     fn fault(&mut self, header: Header, input_seq: u64, reason: std::fmt::Arguments<'_>) {
         self.counters.faults += 1;
         self.last = None;
@@ -502,8 +506,9 @@ impl Session {
     }
 }
 
-/// Whether a map's windows and identities hold at `point`: same way of sliding, and load and speed, where the model
-/// depends on them, within `tolerance` of where it was computed.
+/// Whether the windows and identities of `map` are valid at `point`. The contact must slide in the same direction as on
+/// the map. The load and the speed must be within the relative `tolerance` of the map's, each only if the model depends
+/// on it.
 pub fn map_serves(model: &Model, map: &StabilityMap, point: &OperatingPoint, tolerance: f64) -> bool {
     let (load, speed) = model.depends_on_load_and_speed();
     let near = |a: f64, b: f64| (a - b).abs() <= tolerance * b.abs();
@@ -513,8 +518,8 @@ pub fn map_serves(model: &Model, map: &StabilityMap, point: &OperatingPoint, tol
         && (!speed || near(point.disc_speed_rad_s, map.point.disc_speed_rad_s))
 }
 
-/// Whether modes at `point` are numbered by `map`: it is for the same way of sliding. Its load and speed may be others than
-/// those of `point`: then modes that cross between them may be numbered otherwise than by the map that is being made.
+/// Whether `map` gives the identities of modes at `point`: the contact must slide in the same direction as on the map.
+/// Load and speed may differ. If modes cross in between, their identities may then differ from those of the next map.
 pub fn numbers(model: &Model, map: &StabilityMap, point: &OperatingPoint) -> bool {
     model.contact_state(point) == ContactState::Sliding
         && point.disc_speed_rad_s.signum() == map.point.disc_speed_rad_s.signum()
@@ -526,14 +531,14 @@ fn within_dead_band(from: &OperatingPoint, to: &OperatingPoint, settings: &Setti
         && (from.friction_coefficient - to.friction_coefficient).abs() <= settings.dead_band_friction
 }
 
-/// Whether two points are the same to the last bit.
+/// Whether two operating points are equal bit by bit.
 fn same(a: &OperatingPoint, b: &OperatingPoint) -> bool {
     let bits = |p: &OperatingPoint| [p.normal_load_n, p.disc_speed_rad_s, p.friction_coefficient].map(f64::to_bits);
     bits(a) == bits(b)
 }
 
-/// The modes as published: ascending frequency, and above [`MAX_MODES`] those with the largest growth rates. `order` is
-/// room for sorting.
+/// Copies the modes to publish to `out`, in ascending frequency. Of more than [`MAX_MODES`], those with the largest
+/// growth rates are kept. `order` is a buffer for sorting.
 fn publish_modes(modes: &[Mode], order: &mut Vec<usize>, out: &mut Vec<wire::Mode>) {
     order.clear();
     order.extend(0..modes.len());

@@ -58,7 +58,8 @@ fn levels_follow_margin_and_damping_ratio_with_hysteresis() {
     assert_eq!(level_at(0, 0.30), level::OK);
     assert_eq!(level_at(1, 0.32), level::WARN, "margin 0.036 is below 0.05");
     assert_eq!(level_at(2, 0.40), level::SQUEAL);
-    // Near the merging point ζ = -√(c (μ - μc)): between -1e-3 and -5e-4 it depends on where one comes from.
+    // Near the merging point ζ = -√(c (μ - μc)). Between -1e-3 and -5e-4 the level depends on the previous one
+    // (hysteresis).
     let mut fresh = self::session();
     let between = (0..40_000).map(|k| (k, 0.355928 + 1e-8 * k as f64)).find(|&(k, mu)| {
         let worst = |p: Prediction| p.modes.iter().map(|mode| mode.damping_ratio).fold(f64::INFINITY, f64::min);
@@ -98,7 +99,7 @@ fn conditions_within_the_dead_band_reuse_the_previous_prediction() {
     let second = predict(&mut session, friction(1, 0.3));
     assert!(!first.reused && second.reused);
     assert_eq!(second.input_seq, 1);
-    // As text, for NaN is not equal to itself.
+    // Compared as text, because NaN does not equal itself.
     assert_eq!(format!("{:?}", second.modes), format!("{:?}", first.modes));
     assert!(!predict(&mut session, friction(2, 0.3001)).reused, "the default dead-band is exact equality");
     session.step(Event::Parameter { name: "dead_band_friction".to_owned(), value: 0.01 }).unwrap();
@@ -112,8 +113,8 @@ fn conditions_within_the_dead_band_reuse_the_previous_prediction() {
     assert_eq!((counters.solved, counters.charted, counters.reused, counters.faults), (4, 0, 2, 0));
 }
 
-/// A rig whose contact stiffens with load: between two loads for which the ends of its windows were worked out, the
-/// margin is off by no more than its bound; where they were, it is exact.
+/// The contact of this rig stiffens with load. Between two loads at which the window ends were computed, the error of
+/// the margin is within its bound; at those loads the margin is exact.
 #[test]
 fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
     use crate::physics::synthetic::{Synthetic, rig};
@@ -134,7 +135,7 @@ fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
         let mut asked = None;
         for _ in 0..300 {
             seq += 1;
-            // The friction coefficient moves a little: nothing is reused.
+            // The friction coefficient changes a little, so that no prediction is reused.
             let input = conditions(seq, load, 13.0, 1e-4 * (seq % 10) as f64);
             let effects = session.step(input).unwrap();
             let prediction = effects.publish.unwrap();
@@ -156,7 +157,8 @@ fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
     assert!(largest > 1e-10, "worth testing: extrapolation is off by {largest}");
 }
 
-/// The same conditions read off the chart and solved: same identities, same level, every value within the bounds.
+/// A charted and a solved prediction at the same conditions: same identities, same level, every value within its error
+/// bound.
 #[test]
 fn a_chart_predicts_what_a_solve_does() {
     let (mut solved, mut charted) = (with_map(session()), with_map(session()));
@@ -204,7 +206,8 @@ fn a_contact_that_does_not_slide_is_said_to() {
     assert!(open.reason.contains("contact open") && open.unstable_modes == 0);
 }
 
-/// The level is OK as far as 0.0501 below a window, WARN from 0.0499 on; within it the margin is to its nearest end.
+/// The level is OK down to 0.0501 below a window and WARN from 0.0499 on. The margin is the distance to the nearest
+/// end.
 #[test]
 fn the_margin_warns_below_its_limit_and_not_before() {
     let mut session = with_map(session());
@@ -218,7 +221,7 @@ fn the_margin_warns_below_its_limit_and_not_before() {
     }
 }
 
-/// Critical friction coefficient, margin and error belong to one end: that of the union of windows that is nearest.
+/// Critical friction coefficient, margin and error refer to the same end: the nearest one of the union of windows.
 #[test]
 fn critical_friction_is_the_end_that_the_margin_is_measured_to() {
     let mut session = with_map(session());
@@ -235,7 +238,7 @@ fn critical_friction_is_the_end_that_the_margin_is_measured_to() {
         assert_eq!(found.friction_margin, if in_one { -distance } else { distance }, "mu {mu}");
         let ends = map.windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten();
         let nearest = ends.map(|end| (end - mu).abs()).fold(f64::INFINITY, f64::min);
-        // Ends that another window covers are none.
+        // Ends covered by another window do not count.
         assert!(distance >= nearest - 1e-12, "mu {mu}");
         *(if in_one { &mut inside } else { &mut outside }) += 1;
     }
@@ -248,7 +251,7 @@ fn a_reason_names_the_limit_that_decides() {
     session.step(Event::Parameter { name: "squeal_hysteresis".to_owned(), value: 0.5 }).unwrap();
     let squeals = predict(&mut session, friction(0, 0.4));
     assert!(squeals.level == level::SQUEAL && squeals.reason.ends_with(" below -0.001"), "{}", squeals.reason);
-    // Far below the window nothing grows, but the hysteresis holds it.
+    // Far below the window no mode grows, but the hysteresis keeps the level.
     let held = predict(&mut session, friction(1, 0.2));
     assert!(
         held.level == level::SQUEAL && held.reason.ends_with("damping ratio 0, squeal ends at 0.499"),
@@ -257,10 +260,11 @@ fn a_reason_names_the_limit_that_decides() {
     );
 }
 
-/// Of several modes past the limit the reason names the one that grows fastest, as the prediction does.
+/// If several modes squeal, the reason names the fastest growing one, as the prediction does.
 #[test]
 fn the_reason_names_the_fastest_of_the_modes_that_squeal() {
-    // Growth rates 1, 3 and 2 1/s; the slowest is the lowest and has the most negative damping ratio.
+    // Growth rates 1, 3 and 2 1/s. The slowest growing mode has the lowest frequency and the most negative damping
+    // ratio.
     let mut session = of(decoupled(&[(10.0, -2.0), (1000.0, -6.0), (2000.0, -4.0)]));
     let found = predict(&mut session, friction(0, 0.3));
     assert_eq!(found.level, level::SQUEAL);
@@ -268,7 +272,7 @@ fn the_reason_names_the_fastest_of_the_modes_that_squeal() {
     assert!((found.worst_frequency_hz - 159.15).abs() < 0.01 && (found.max_growth_rate_per_s - 3.0).abs() < 1e-9);
 }
 
-/// A session with a rig of coordinates that nothing couples, `λ² + c λ + ω² = 0`, from `(ω, c)`.
+/// A session whose rig has decoupled coordinates `λ² + c λ + ω² = 0`, given as `(ω, c)`.
 fn decoupled(modes: &[(f64, f64)]) -> Model {
     let n = modes.len();
     let diagonal = |of: &dyn Fn(usize) -> f64| Term {
@@ -285,7 +289,7 @@ fn of(model: Model) -> Session {
     Session::new(rig.clone(), Settings::for_rig(&rig))
 }
 
-/// Of more modes than a message holds the one that decays fastest stays out.
+/// With more modes than a message can hold, the fastest decaying ones are omitted.
 #[test]
 fn above_64_modes_the_slowest_growing_are_left_out() {
     let modes: Vec<(f64, f64)> = (0..66).map(|k| (100.0 + k as f64, if k % 40 == 7 { 5.0 } else { 1.0 })).collect();
@@ -335,7 +339,7 @@ fn beyond_the_searched_range_there_is_no_margin() {
     assert!(beyond.reason.contains("friction coefficient beyond mu_max: no margin"), "{}", beyond.reason);
 }
 
-/// While the load moves, better ends of windows are asked for at most ten times a second of stamps.
+/// While the load changes, new window ends are requested at most ten times per second of stamps.
 #[test]
 fn ends_are_asked_for_at_most_ten_times_a_second() {
     use crate::physics::synthetic::{Synthetic, rig};
@@ -351,7 +355,7 @@ fn ends_are_asked_for_at_most_ten_times_a_second() {
     assert_eq!(asked, [0, 100, 200, 300]);
 }
 
-/// A solver that panics makes a FAULT of that prediction and of no other.
+/// A panic of the solver turns that prediction into a FAULT and no other.
 #[test]
 fn a_panic_of_the_solver_is_a_fault() {
     let law = Law::Custom(CustomLaw {
