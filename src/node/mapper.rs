@@ -1,4 +1,4 @@
-//! Stability maps, ends of windows and sensitivities, computed beside the hot path on a thread of their own.
+//! Computes stability maps, window ends and sensitivities on a background thread.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -17,21 +17,21 @@ use crate::physics::{Chart, Ends, OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
 use crate::session::{chart_options, map_options};
 
-/// A chart on the way is kept this often.
+/// Interval between saves of an unfinished chart.
 const SAVE_EVERY: Duration = Duration::from_secs(20);
 
-/// The map a session uses at the load and speed of `point`.
+/// The stability map that a session uses at the load and speed of `point`.
 ///
 /// # Errors
-/// Why there is none, in words.
+/// Why it cannot be computed, as text.
 pub fn session_map(rig: &Rig, solver: &mut Solver, point: &OperatingPoint) -> Result<StabilityMap, String> {
     StabilityMap::build(&rig.model, solver, point, &map_options(rig)).map_err(|error| error.to_string())
 }
 
-/// The ends of the windows of `map` a session uses at the load and speed of `point`; `None` where another map is due.
+/// The window ends of `map` that a session uses at the load and speed of `point`; `None` if a new map is needed there.
 ///
 /// # Errors
-/// Why there are none, in words.
+/// Why they cannot be computed, as text.
 pub fn session_ends(
     rig: &Rig,
     solver: &mut Solver,
@@ -41,19 +41,21 @@ pub fn session_ends(
     Ends::carried(&rig.model, solver, map, point).map_err(|error| error.to_string())
 }
 
-/// The chart a session uses, the same whatever the number of threads; `go_on` stops the work by saying no.
+/// The chart that a session uses. It does not depend on the number of threads. The build stops when `go_on` returns
+/// false.
 ///
 /// # Errors
-/// Why there is none, in words.
+/// Why it cannot be built, as text.
 pub fn session_chart(rig: &Rig, threads: usize, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
     let options = ChartOptions { threads, ..chart_options(rig) };
     build(&rig.model, &options, &|_| go_on()).map_err(|error| error.to_string())
 }
 
-/// The chart a session uses, from where it is `kept`, or built on from what is; `go_on` stops the work by saying no.
+/// The chart that a session uses, loaded from the file `kept` or continued from an unfinished one there. The build
+/// stops when `go_on` returns false.
 ///
 /// # Errors
-/// Why there is none, in words.
+/// Why it cannot be built, as text.
 pub fn kept_chart(rig: &Rig, kept: &ChartFile, threads: usize, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
     let begun = kept.load().unwrap_or_else(|error| {
         note!("{error}: the rig is charted anew");
@@ -81,17 +83,17 @@ pub fn kept_chart(rig: &Rig, kept: &ChartFile, threads: usize, go_on: &dyn Fn() 
     Ok(chart)
 }
 
-/// SHA-256 of every number of a map that a prediction can depend on, hexadecimal.
+/// SHA-256 of all numbers of a map that can affect predictions, hexadecimal.
 pub fn map_hash(map: &StabilityMap) -> String {
     hash(map.words().into_iter())
 }
 
-/// SHA-256 of every number of ends that a prediction can depend on, hexadecimal.
+/// SHA-256 of all numbers of window ends that can affect predictions, hexadecimal.
 pub fn ends_hash(ends: &Ends) -> String {
     hash(ends.words())
 }
 
-/// SHA-256 of every number of a chart that a prediction can depend on, hexadecimal.
+/// SHA-256 of all numbers of a chart that can affect predictions, hexadecimal.
 pub fn chart_hash(chart: &Chart) -> String {
     hash(chart.words().into_iter())
 }
@@ -104,13 +106,13 @@ fn hash(words: impl Iterator<Item = u64>) -> String {
     hex(&hasher.finalize())
 }
 
-/// Gives the calling thread the lowest priority. Where the system does not allow it, it competes like any thread.
+/// Gives the calling thread the lowest priority. If the system does not allow it, the priority stays as it is.
 pub fn yield_to_predictions() {
     let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
 }
 
-/// Builds the chart on a thread of its own, of the lowest priority: predictions come first. It ends early when nobody
-/// listens any more; with `kept` it is built only once.
+/// Builds the chart on a thread of the lowest priority, so that predictions come first. The build stops early when the
+/// node has ended. With `kept` the chart is stored there and reused by later runs.
 pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming>, stopped: Arc<AtomicBool>) {
     std::thread::spawn(move || {
         yield_to_predictions();
@@ -126,10 +128,10 @@ pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming
     });
 }
 
-/// Nicer than predictions by this much: what is computed beside them gives way.
+/// Niceness of the background thread, relative to the thread that predicts.
 const NICENESS: i32 = 10;
 
-/// Something to compute.
+/// A task for the background thread.
 #[derive(Clone, Debug)]
 enum Work {
     Map(OperatingPoint),
@@ -137,7 +139,7 @@ enum Work {
     Sensitivity { question: Question, map: Option<Arc<StabilityMap>>, ends: Option<Ends> },
 }
 
-/// Computes one thing at a time: maps before ends before sensitivities, of each the newest that was asked for.
+/// Runs one task at a time: maps before ends before sensitivities, and of each kind the newest request.
 pub struct Mapper {
     work: Sender<Work>,
     pending: bool,
@@ -147,11 +149,11 @@ pub struct Mapper {
 }
 
 impl Mapper {
-    /// Starts the thread; it ends when the mapper is gone.
+    /// Starts the thread; it ends when the mapper is dropped.
     pub fn spawn(rig: Arc<Rig>, done: Sender<Incoming>) -> Self {
         let (work, requests) = bounded::<Work>(1);
         std::thread::spawn(move || {
-            // Where the system does not allow it, it competes like any thread.
+            // If the system does not allow it, the priority stays as it is.
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
             let mut solver = Solver::new(rig.model.dimension());
             for work in requests {
@@ -173,8 +175,7 @@ impl Mapper {
         Self { work, pending: false, next_map: None, next_ends: None, given_up: None }
     }
 
-    /// Asks for the map at the load and speed of `point`; while something is being computed, for the newest wish after
-    /// it.
+    /// Requests the map at the load and speed of `point`. While a task runs, only the newest request is kept.
     pub fn want(&mut self, point: OperatingPoint) {
         let same = |other: OperatingPoint| other.with_friction(0.0) == point.with_friction(0.0);
         if self.given_up.is_some_and(same) {
@@ -187,7 +188,7 @@ impl Mapper {
         }
     }
 
-    /// Asks for the ends of the windows of `map` at the load and speed of `point`.
+    /// Requests the window ends of `map` at the load and speed of `point`.
     pub fn want_ends(&mut self, map: Arc<StabilityMap>, point: OperatingPoint) {
         if self.pending {
             self.next_ends = Some((map, point));
@@ -196,7 +197,8 @@ impl Mapper {
         }
     }
 
-    /// Asks for sensitivities, unless something is being computed: there is always another prediction to ask about.
+    /// Requests sensitivities unless a task is running; returns whether it was accepted. Refused requests are not kept,
+    /// since the next prediction does as well.
     pub fn want_sensitivity(&mut self, question: Question, map: Option<Arc<StabilityMap>>, ends: Option<Ends>) -> bool {
         if !self.pending {
             self.start(Work::Sensitivity { question, map, ends });
@@ -209,8 +211,8 @@ impl Mapper {
         self.pending = self.work.try_send(work).is_ok();
     }
 
-    /// What was asked for is there, or cannot be had. Starts on the wish that came meanwhile, unless `served` says that
-    /// the newest map serves it.
+    /// Takes note that a task has ended and starts the next request, unless `served` says that the newest map already
+    /// serves it.
     pub fn done(&mut self, served: impl Fn(&OperatingPoint) -> bool) {
         self.pending = false;
         if let Some(point) = self.next_map.take().filter(|point| !served(point)) {
@@ -221,12 +223,12 @@ impl Mapper {
         }
     }
 
-    /// No map can be had there: it is not asked for again until another was.
+    /// Takes note that the map at `point` cannot be computed. It is not requested again until another point fails.
     pub fn give_up_on(&mut self, point: OperatingPoint) {
         self.given_up = Some(point);
     }
 
-    /// Whether something is being computed.
+    /// Whether a task is running.
     pub fn pending(&self) -> bool {
         self.pending
     }

@@ -1,8 +1,9 @@
-//! The node: hands what it hears to the session and carries out what the session wants.
+//! The node: feeds what it receives to the session and carries out the session's requests.
 //!
-//! One thread at a time has the session and publishes: the node's own, which takes what waits in one bounded channel, or the
-//! one that heard an input which can be answered at once ([`Shortcut`]). Everything that shapes a prediction is recorded in the
-//! order in which the session gets it, so that a replay can feed it the same.
+//! One thread at a time holds the session and publishes. Usually that is the node's own thread, which reads one bounded
+//! channel. An input that can be predicted without a dense solve is handled on the thread that received it
+//! ([`Shortcut`]). Everything that affects predictions is recorded in the order in which the session gets it, so that a
+//! replay can reproduce it.
 
 mod mapper;
 mod outputs;
@@ -44,50 +45,53 @@ use sensitivity::Question;
 use shortcut::Place;
 use statistics::Statistics;
 
-/// What may wait for the node; more inputs than this are lost before they are recorded, and counted.
+/// Capacity of the node's channel. Inputs that do not fit are lost before they are recorded, and counted.
 const QUEUE: usize = 16_384;
-/// A backlog that can be worked off in this time is; of a longer one only the newest input is predicted.
+/// A backlog is predicted completely if that takes at most this time; of a longer one only the newest input is
+/// predicted.
 const CATCH_UP: Duration = Duration::from_millis(100);
-/// No prediction begins later than this after its input was heard, unless it is the newest.
+/// An input older than this is passed over, unless it is the newest.
 const LATEST: Duration = Duration::from_millis(500);
-/// The fastest of so many predictions tells what one takes: on a busy machine any of them may have been interrupted.
+/// The time of a prediction is estimated as the minimum over this many, since on a busy machine any of them may have
+/// been interrupted.
 const TIMED: usize = 16;
-/// Inputs, and measured vibrations, whose stamp and sequence number are remembered, to answer what comes over both buses once.
+/// Number of inputs, and of measured vibrations, whose stamp and sequence number are remembered. A message that arrives
+/// over both buses is recognised by them and handled once.
 const REMEMBERED: usize = 8192;
 const VIBRATIONS_REMEMBERED: usize = 1024;
-/// Time between diagnostics.
+/// Interval between diagnostics.
 const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
-/// Time between sensitivities, at least.
+/// Minimum interval between sensitivities.
 const SENSITIVITY_EVERY: Duration = Duration::from_secs(1);
 
-/// Something the node has to deal with.
+/// An item of the node's channel.
 #[derive(Clone, Debug)]
 pub enum Incoming {
-    /// Conditions came over a bus.
+    /// An operating point received over a bus.
     Input(Heard<wire::OperatingPoint>),
-    /// A measured vibration came over a bus: it is recorded and shown, and shapes nothing.
+    /// A measured vibration received over a bus. It is recorded and shown, and does not affect predictions.
     Vibration(Heard<wire::Vibration>),
-    /// A setting was changed, its value validated.
+    /// A changed setting; its value is already validated.
     Parameter { name: String, value: f64 },
-    /// The stability map that was asked for, or why there is none.
+    /// The requested stability map, or why it could not be computed.
     Map { point: OperatingPoint, map: Result<Arc<StabilityMap>, String> },
-    /// The ends of the windows of `map` that were asked for; the load and speed at which another map is due; or why there
-    /// is nothing.
+    /// The requested window ends of `map`. The inner error is a load and speed at which a new map is needed instead;
+    /// the outer one says why the computation failed.
     Ends { map: Arc<StabilityMap>, ends: Result<Result<Arc<Ends>, OperatingPoint>, String> },
-    /// The sensitivities that were asked for, or why there are none.
+    /// The requested sensitivities, or why they could not be computed.
     Sensitivity(Box<Result<wire::Sensitivity, String>>),
-    /// The chart of the rig, or why there is none.
+    /// The chart of the rig, or why it could not be built.
     Chart(Result<Arc<Chart>, String>),
-    /// Finish.
+    /// End of the run.
     Stop,
 }
 
-/// A channel to a node.
+/// The channel that feeds a node.
 pub fn channel() -> (Sender<Incoming>, Receiver<Incoming>) {
     bounded(QUEUE)
 }
 
-/// A running session with everything around it.
+/// A session with its channel, outputs, background computations and statistics.
 pub struct Node {
     session: Session,
     rig: Arc<Rig>,
@@ -97,27 +101,28 @@ pub struct Node {
     watch: Watch,
     heard_before: Remembered,
     vibration_heard_before: Remembered,
-    /// When the latest input was heard; `None` before the first: nothing is published until then, for nothing has failed.
+    /// When the latest input was received. `None` before the first: silence is only a FAULT after an input.
     last_heard: Option<Instant>,
-    /// Whether the present silence was published.
+    /// Whether the current silence has been published.
     silent: bool,
-    /// What was taken out of the channel and is to be done.
+    /// Items taken from the channel and not yet handled.
     backlog: VecDeque<Incoming>,
-    /// How many of these are inputs.
+    /// Number of inputs in `backlog`.
     inputs_waiting: usize,
     prediction_times: Times,
-    /// The backlog was too long: until it is gone only the newest input is predicted.
+    /// Whether inputs are being passed over: the backlog was too long, and until it is empty only the newest input is
+    /// predicted.
     passing_over: bool,
     next_diagnostics: Instant,
-    /// Where this is while it runs.
+    /// Shared with the [`Shortcut`]; holds the node while it runs.
     place: Place,
-    /// Tells the thread that charts the rig that nobody waits for it any more.
+    /// Set when the node ends; stops the thread that builds the chart.
     stopped: Arc<AtomicBool>,
     next_sensitivity: Instant,
 }
 
 impl Node {
-    /// A node for `rig` that starts with `settings`; `sender` leads to the channel that [`Node::run`] will read.
+    /// A node for `rig` with initial `settings`. `sender` must belong to the channel that [`Node::run`] will read.
     pub fn new(rig: Arc<Rig>, settings: Settings, outputs: Outputs, sender: Sender<Incoming>, watch: Watch) -> Self {
         Self {
             session: Session::new(rig.clone(), settings),
@@ -141,27 +146,27 @@ impl Node {
         }
     }
 
-    /// Charts the rig in the background, or takes the chart that is `kept`; predictions are read off the chart once it is
-    /// there.
+    /// Builds the chart of the rig in the background, or loads it from the file `kept`. Predictions use the chart as
+    /// soon as it is available.
     pub fn with_chart(self, kept: Option<ChartFile>, sender: Sender<Incoming>) -> Self {
         mapper::spawn_chart(self.rig.clone(), kept, sender, self.stopped.clone());
         self
     }
 
-    /// Lets whoever holds `shortcut` have inputs answered past the queue while this runs.
+    /// Lets holders of `shortcut` submit inputs past the channel while the node runs.
     pub fn with_shortcut(mut self, shortcut: &Shortcut) -> Self {
         self.place = shortcut.place.clone();
         self
     }
 
-    /// Runs until [`Incoming::Stop`] or until nobody can send any more, then gives back what it published to.
+    /// Runs until [`Incoming::Stop`] or until all senders are gone, then returns the outputs.
     pub fn run(mut self, incoming: &Receiver<Incoming>) -> Outputs {
         self.begin();
         let place = std::mem::take(&mut self.place);
         let mut next = Next::Wait(self.deadline());
         *place.lock() = Some(self);
         loop {
-            // Not taken out of the channel here: see `Shortcut::input`.
+            // The channel is only waited on here; items are taken out under the lock, see `Shortcut::input`.
             if let Next::Wait(deadline) = next {
                 let mut ready = Select::new();
                 ready.recv(incoming);
@@ -180,7 +185,7 @@ impl Node {
         }
     }
 
-    /// Deals with what waits, until nothing does or diagnostics are due; then with what time brings.
+    /// Handles all items, until none is left or diagnostics are due; then detects silence and publishes diagnostics.
     fn work_off(&mut self, incoming: &Receiver<Incoming>) -> Next {
         loop {
             while self.backlog.len() < QUEUE {
@@ -216,30 +221,31 @@ impl Node {
             self.next_diagnostics = Instant::now() + DIAGNOSTICS_EVERY;
             self.diagnose(self.backlog.len() + incoming.len());
         }
-        // Nothing is waited for while something is left to do: diagnostics interrupt a backlog.
+        // Diagnostics may have interrupted a backlog: wait only if it is empty.
         if self.backlog.is_empty() { Next::Wait(self.deadline()) } else { Next::GoOn }
     }
 
-    /// When there is something to do even if nothing comes.
+    /// The time of the next diagnostics or silence.
     fn deadline(&self) -> Instant {
         self.silence_deadline().map_or(self.next_diagnostics, |silence| silence.min(self.next_diagnostics))
     }
 
-    /// Whether an input can be predicted as fast as another thread is woken, with nothing before it. The first of all and the first
-    /// after a silence wake the thread that will notice the next silence.
+    /// Whether `input` can be predicted on the receiving thread: nothing waits before it and it needs no dense solve.
+    /// The first input, and the first after a silence, are queued instead: they wake the node's thread, which then
+    /// watches for the next silence.
     fn answers_at_once(&self, input: &wire::OperatingPoint) -> bool {
         let heard_lately = self.last_heard.is_some() && !self.silent;
         self.backlog.is_empty() && heard_lately && self.session.answers_at_once(&input.point())
     }
 
-    /// Predicts for an input that never waited.
+    /// Predicts for an input on the thread that received it.
     fn answer(&mut self, heard: Heard<wire::OperatingPoint>) {
         if self.is_new(&heard) {
             self.input(heard);
         }
     }
 
-    /// Says what the session starts from, and asks for the map of the reference conditions.
+    /// Publishes the rig, records the initial settings and requests the map at the reference conditions.
     fn begin(&mut self) {
         self.outputs.rig_info(&rig_info(&self.rig));
         let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
@@ -250,8 +256,8 @@ impl Node {
         self.mapper.want(self.rig.reference);
     }
 
-    /// Queues what has come. What came over the other bus already is dropped here: were it queued, the input it
-    /// repeats would be passed over for it.
+    /// Appends an item to the backlog. Duplicates from the other bus are dropped here: once queued, a duplicate would
+    /// count as a newer input, and the original would be passed over for it.
     fn admit(&mut self, next: Incoming) {
         if let Incoming::Input(heard) = &next {
             if !self.is_new(heard) {
@@ -262,15 +268,14 @@ impl Node {
         self.backlog.push_back(next);
     }
 
-    /// Whether an input did not come over the other bus already.
+    /// Whether the input has not already come over the other bus.
     fn is_new(&mut self, heard: &Heard<wire::OperatingPoint>) -> bool {
         let is_new = self.heard_before.is_new(heard.bus, heard.message.header.stamp, heard.message.seq);
         self.statistics.duplicates += u64::from(!is_new);
         is_new
     }
 
-    /// Predicts for an input; or, once the inputs behind it were more than can be worked off, passes all but the
-    /// newest over.
+    /// Predicts for an input. If it is too old, or too many inputs wait behind it, it is recorded but passed over.
     fn input(&mut self, heard: Heard<wire::OperatingPoint>) {
         self.last_heard = Some(Instant::now());
         self.silent = false;
@@ -295,9 +300,11 @@ impl Node {
         }
     }
 
-    /// Hands a vibration on. The session does not get it, so that a session is the same with and without.
+    /// Shows and records a measured vibration. The session does not get it, so predictions are the same with and
+    /// without.
     fn vibration(&mut self, heard: Heard<wire::Vibration>) {
-        // It has no number: what comes over both buses has the same stamp and bits.
+        // A vibration has no sequence number. The copies that come over both buses have the same stamp and the same
+        // frequency bit by bit.
         let vibration = heard.message;
         if self.vibration_heard_before.is_new(heard.bus, vibration.header.stamp, vibration.frequency_hz.to_bits()) {
             self.watch.vibration(heard.at.wall_ns, &vibration);
@@ -332,7 +339,7 @@ impl Node {
 
     fn ends(&mut self, map: &Arc<StabilityMap>, ends: Result<Result<Arc<Ends>, OperatingPoint>, String>) {
         self.mapper.done(|_| false);
-        // Ends belong to their map; those of one that is no longer in force are of no use.
+        // Ends belong to their map: discard those of a map that is no longer in force.
         let in_force = self.session.map().is_some_and(|other| Arc::ptr_eq(other, map));
         match ends {
             Ok(Ok(ends)) if in_force => {
@@ -347,7 +354,8 @@ impl Node {
         }
     }
 
-    /// Asks for the sensitivities of the prediction for `point`, once in a while and if somebody wants them.
+    /// Requests the sensitivities of the prediction at `point`, at most every [`SENSITIVITY_EVERY`] and only if they
+    /// are subscribed to or recorded.
     fn sensitivity_due(&mut self, point: OperatingPoint) {
         let now = Instant::now();
         if now < self.next_sensitivity {
@@ -389,7 +397,7 @@ impl Node {
         }
     }
 
-    /// When the silence since the latest input is too long; `None` before the first and where that was published.
+    /// When the current silence exceeds its timeout; `None` before the first input and once the silence is published.
     fn silence_deadline(&self) -> Option<Instant> {
         let timeout = Duration::try_from_secs_f64(self.session.settings().silence_timeout_s).ok()?;
         self.last_heard.filter(|_| !self.silent)?.checked_add(timeout)
@@ -405,13 +413,13 @@ impl Node {
         self.step(Event::Silence { stamp }, None);
     }
 
-    /// Records and publishes an event of the session, before the session gets it.
+    /// Records and publishes a session event, before the session gets it.
     fn note(&mut self, event: SessionEvent) {
         self.outputs.session_event(event);
     }
 
-    /// One step of the session, of `input` if it is one. Whoever waits for the prediction over shared memory gets it before
-    /// anything else is done with it; input and prediction are recorded in this order.
+    /// Feeds an event to the session; `input` is the received message if the event is one. The prediction is first sent
+    /// over shared memory, since a reader waits for it there. Then input and prediction are recorded, in this order.
     fn step(&mut self, event: Event, input: Option<Heard<wire::OperatingPoint>>) {
         match self.session.step(event) {
             Ok(effects) => {
@@ -449,14 +457,14 @@ impl Node {
     }
 }
 
-/// What the thread of a node does next.
+/// What the node's thread does next.
 enum Next {
     Wait(Instant),
     GoOn,
     Stop,
 }
 
-/// What the latest predictions took.
+/// Durations of the latest predictions.
 #[derive(Default)]
 struct Times {
     latest: [Duration; TIMED],
@@ -469,13 +477,13 @@ impl Times {
         self.count += 1;
     }
 
-    /// The least of them; zero without any.
+    /// The shortest of them; zero if there are none.
     fn least(&self) -> Duration {
         self.latest[..self.count.min(TIMED)].iter().min().copied().unwrap_or_default()
     }
 }
 
-/// What a node tells about its rig.
+/// The message that describes the rig of a node.
 pub fn rig_info(rig: &Rig) -> RigInfo {
     RigInfo {
         name: rig.name.clone(),
@@ -491,19 +499,19 @@ fn now_header() -> Header {
     Header { stamp: Time::from_ns(clock::now_ns()), frame_id: String::new() }
 }
 
-/// The event of something that became ready for a load and speed.
+/// The session event for a result computed at a load and speed.
 pub fn at_load_and_speed(kind: u8, point: &OperatingPoint, hash: String) -> SessionEvent {
     let OperatingPoint { normal_load_n, disc_speed_rad_s, .. } = *point;
     SessionEvent { header: now_header(), kind, normal_load_n, disc_speed_rad_s, hash, ..Default::default() }
 }
 
-/// The event of a setting that was changed.
+/// The session event for a changed setting.
 pub fn parameter_event(header: Header, name: &str, value: f64) -> SessionEvent {
     let name = name.to_owned();
     SessionEvent { header, kind: event_kind::PARAMETER, name, value, ..Default::default() }
 }
 
-/// The stamps and sequence numbers heard lately, each with the bus it came over first.
+/// Recent stamps and sequence numbers, each with the bus that delivered it first.
 struct Remembered {
     count: usize,
     bus: HashMap<(Time, u64), Bus>,
@@ -511,13 +519,14 @@ struct Remembered {
 }
 
 impl Remembered {
-    /// Remembers the latest `count`, in memory that is there from the beginning: twice the room, so that the map clears up
-    /// behind what was forgotten instead of growing.
+    /// Remembers the latest `count`. All memory is allocated here. Twice the capacity is reserved, so that the map
+    /// reuses the slots of removed entries instead of growing.
     fn new(count: usize) -> Self {
         Self { count, bus: HashMap::with_capacity(2 * (count + 1)), order: VecDeque::with_capacity(count + 1) }
     }
 
-    /// Whether this was not heard over another bus lately. What the same bus repeats is new: a recording played again.
+    /// Whether this was not recently received over another bus. A repetition over the same bus counts as new: a
+    /// recording may be played again.
     fn is_new(&mut self, bus: Bus, stamp: Time, seq: u64) -> bool {
         let key = (stamp, seq);
         if let Some(&first) = self.bus.get(&key) {
@@ -557,7 +566,7 @@ mod tests {
             assert!(heard.is_new(Bus::Shm, Time::from_ns(0), seq));
             assert_eq!(seq >= 100, heard.is_new(Bus::Ros2, Time::from_ns(0), seq.saturating_sub(100)), "{seq}");
         }
-        // A map with traces of what was forgotten says less than it has.
+        // Slots of removed entries reduce the capacity that a map reports.
         assert!(heard.bus.capacity() <= room.0 && heard.order.capacity() == room.1);
     }
 
@@ -582,7 +591,7 @@ mod tests {
         sender.try_send(Incoming::Stop).expect("room");
         let watch = Watch::default();
         let mut node = Node::new(rig, settings, Outputs::default(), sender, watch.clone());
-        // Of a rig that takes as long, not more than ten may wait.
+        // Pretend that a prediction takes 10 ms: at most ten inputs may then wait.
         node.prediction_times.note(Duration::from_millis(10));
         node.run(&receiver);
         let seen = watch.snapshot();
@@ -591,8 +600,8 @@ mod tests {
         assert_eq!((seen.counters.solved, seen.passed_over), (1, COUNT - 1));
     }
 
-    /// With a chart, inputs are answered on the thread that heard them; what has to be solved is queued, and nothing that comes
-    /// later overtakes it.
+    /// With a chart, inputs are predicted on the thread that received them. Inputs that need a dense solve are queued,
+    /// and later inputs do not overtake them.
     #[test]
     fn an_input_is_answered_past_the_queue_but_overtakes_none() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
@@ -618,7 +627,8 @@ mod tests {
             assert!(shortcut.input(Heard::now(Bus::Shm, message), seq % 7 == 0));
             seq += 1;
             at_once += u32::from(watch.snapshot().prediction.is_some_and(|answer| answer.input_seq == seq - 1));
-            // No more than a few wait, so that none is passed over; now and then none, so that the next can be answered at once.
+            // Only a few inputs wait, so that none is passed over. Now and then none waits, so that the next can be
+            // predicted at once.
             let may_wait = if seq % 3 == 0 { 0 } else { 20 };
             while all.len() + may_wait < seq as usize {
                 assert_eq!(watch.take_samples(&mut samples), 0);
@@ -627,11 +637,11 @@ mod tests {
             }
             at_once
         };
-        // On a busy machine the node's own thread may hold it whenever it is asked: it is asked until it did not.
+        // On a busy machine the node's thread may hold the lock at every attempt, so try until it does not.
         let begun = Instant::now();
         let mut asked = 0;
         while ask(if asked % 10 == 9 { -13.0 } else { 13.0 }) <= 100 || asked < 1000 {
-            // Every tenth turns the other way: off the chart.
+            // Every tenth input has the opposite direction of rotation, which the chart does not cover.
             asked += 1;
             assert!(begun.elapsed() < Duration::from_secs(60), "hardly any was answered at once");
         }
@@ -642,7 +652,8 @@ mod tests {
         assert!(all.iter().map(|sample| sample.input_seq).eq(0..seq), "{} of {seq} answered in order", all.len());
     }
 
-    /// Before the first input nothing is published; afterwards a silence is published once, as a FAULT, and the next input ends it.
+    /// Before the first input nothing is published. Later a silence is published once, as a FAULT, and the next input
+    /// ends it.
     #[test]
     fn silence_is_a_fault_once_after_the_first_input_and_none_before() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
@@ -675,7 +686,7 @@ mod tests {
             };
             sender.send(Incoming::Input(Heard::now(Bus::Shm, point))).expect("it runs");
         };
-        // Many times the limit of silence.
+        // Several times the silence timeout.
         std::thread::sleep(Duration::from_millis(200));
         input(7);
         assert_eq!(wait_for(2), [(Status::Ok, 7), (Status::NoData, 7)], "the input is the first that is published");
@@ -687,7 +698,7 @@ mod tests {
         thread.join().expect("it ended");
     }
 
-    /// Of inputs that are older than half a second all but the newest are passed over.
+    /// Inputs older than half a second are passed over, except the newest.
     #[test]
     fn old_inputs_are_passed_over_but_for_the_newest() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));

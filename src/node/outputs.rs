@@ -1,4 +1,4 @@
-//! Where the node's messages go. What a bus refuses is counted, never waited for.
+//! The buses and the recorder that a node publishes to. A message that a bus refuses is counted; the node never waits.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
@@ -13,7 +13,7 @@ use crate::io::ros2::process::{Health, Ros2Process};
 use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
 use crate::wire::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
 
-/// The buses and the recorder of a node; any of them may be missing.
+/// The buses and the recorder of a node; each is optional.
 #[derive(Default)]
 pub struct Outputs {
     pub shm: Option<ShmOutput>,
@@ -23,20 +23,20 @@ pub struct Outputs {
     pub ros2: Option<Ros2Process>,
     pub recorder: Option<RecorderHandle>,
     pub node_name: NodeName,
-    /// Inputs that came into a full queue.
+    /// Inputs lost because the channel was full.
     pub lost_inputs: Arc<AtomicU64>,
-    /// Messages a bus refused, and what it said last since the last report.
+    /// Messages that could not be published, and the latest reason since the last report.
     pub failures: u64,
     pub last_failure: Option<String>,
-    /// The ROS 2 side at the last report.
+    /// State of the ROS 2 side at the last report.
     pub ros2_before: Health,
-    /// Predictions that were not encoded for ROS 2, since nobody heard them there.
+    /// Predictions that were not encoded for ROS 2 because they had no reader there.
     pub encodings_skipped: u64,
     /// Whether predictions have readers on ROS 2.
     pub ros2_readers: Readers,
 }
 
-/// The name of a node in its diagnostics.
+/// The name of a node in diagnostics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeName(String);
 
@@ -57,14 +57,14 @@ impl Default for NodeName {
     }
 }
 
-/// How many readers a topic of ROS 2 has, asked for now and then: the answer takes locks.
+/// Whether a ROS 2 topic has readers. The answer is cached, since asking takes locks.
 #[derive(Default)]
 pub struct Readers {
     asked: Option<Instant>,
     any: bool,
 }
 
-/// A reader that has just come may miss what is published until it is looked for again.
+/// How long the answer is cached. A new reader may miss what is published in this time.
 const LOOK_FOR_READERS_EVERY: Duration = Duration::from_millis(20);
 
 impl Readers {
@@ -77,16 +77,17 @@ impl Readers {
 }
 
 impl Outputs {
-    /// Records a message heard or made at a moment: logged at the time that passes evenly, published by the wall clock.
+    /// Records a message that was received or made at `at`. Its log time is the monotonic one, its publish time the
+    /// wall clock.
     pub fn record(&self, at: Reading, payload: Payload) {
         if let Some(recorder) = &self.recorder {
             let publish_time_ns = u64::try_from(at.wall_ns).unwrap_or(0);
-            // A message the recorder has no room for is in its own count.
+            // A message that does not fit the recorder's queue is counted there.
             recorder.record(Message { log_time_ns: at.log_ns(), publish_time_ns, payload });
         }
     }
 
-    /// Publishes a prediction over shared memory, where it is waited for.
+    /// Publishes a prediction over shared memory.
     pub fn prediction_to_shm(&mut self, prediction: &Prediction) {
         if let Some(Err(error)) = self.shm.as_ref().map(|shm| shm.publish(prediction)) {
             self.failed(&error);
@@ -121,7 +122,7 @@ impl Outputs {
         self.record(Reading::now(), Payload::RigInfo(info.clone()));
     }
 
-    /// Whether somebody hears sensitivities, or records them.
+    /// Whether sensitivities have a reader or are recorded.
     pub fn want_sensitivities(&self) -> bool {
         self.recorder.is_some()
             || self.shm_sensitivity.as_ref().is_some_and(|shm| shm.readers() > 0)
@@ -145,7 +146,7 @@ impl Outputs {
         self.record(Reading::now(), Payload::Diagnostics(diagnostics));
     }
 
-    /// That others publish predictions over shared memory too: readers cannot tell them apart.
+    /// A warning if other nodes publish predictions over shared memory too: readers cannot tell them apart.
     pub fn other_nodes(&self) -> Option<String> {
         let shm = self.shm.as_ref()?;
         let others = shm.other_writers();
@@ -158,14 +159,14 @@ impl Outputs {
         })
     }
 
-    /// What the listening side of each bus counted.
+    /// Counts of the receiving side of each bus.
     pub fn counts(&self) -> Vec<(&'static str, Counts)> {
         let shm = self.shm_input.as_ref().map(|shm| ("shm", shm.counts()));
         let ros2 = self.ros2.as_ref().map(|ros2| ("ros2", ros2.counts()));
         shm.into_iter().chain(ros2).collect()
     }
 
-    /// How the ROS 2 side has fared so far, and what was wrong with it since the last report.
+    /// State of the ROS 2 side, and its problems since the last report.
     pub fn ros2_health(&mut self) -> Option<(Health, Vec<String>)> {
         let now = self.ros2.as_ref()?.health();
         let before = std::mem::replace(&mut self.ros2_before, now.clone());

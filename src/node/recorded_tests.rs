@@ -1,4 +1,4 @@
-//! A node with a recorder: what time brings, what is passed over, and what of it is in the recording.
+//! Tests of a node with a recorder: silences, inputs passed over, sensitivities, and what the recording holds of them.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -8,10 +8,10 @@ use super::*;
 use crate::io::recorder::{QUEUE_MESSAGES, Recorder, RecorderConfig};
 use crate::io::recording::{Recorded, Recording};
 
-/// Longer than anything takes on any machine.
+/// Longer than any step takes on any machine.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// A node on a thread of its own that records.
+/// A recording node on its own thread.
 struct Recorded9Dof {
     sender: Sender<Incoming>,
     watch: Watch,
@@ -21,7 +21,7 @@ struct Recorded9Dof {
 }
 
 impl Recorded9Dof {
-    /// Starts with `waiting` in its queue.
+    /// Starts the node with `waiting` in its channel.
     fn start(change: impl FnOnce(&mut Settings), waiting: Vec<Incoming>) -> Self {
         let folder = tempfile::tempdir().expect("a folder");
         let recorder = Recorder::start(RecorderConfig::new(folder.path())).expect("a recorder");
@@ -44,7 +44,7 @@ impl Recorded9Dof {
         self.watch.snapshot().prediction.map(|prediction| prediction.level)
     }
 
-    /// Waits until something holds.
+    /// Waits until a condition holds.
     #[track_caller]
     fn until(&self, what: &str, holds: impl Fn(&Self) -> bool) {
         let began = Instant::now();
@@ -54,7 +54,7 @@ impl Recorded9Dof {
         }
     }
 
-    /// Ends it; what it recorded, in order.
+    /// Stops the node and returns what it recorded, in order.
     fn recorded(self) -> Vec<Payload> {
         self.send(Incoming::Stop);
         self.node.join().expect("it ended");
@@ -104,7 +104,7 @@ fn silence_is_a_fault_once_and_the_next_input_ends_it() {
     let change = |settings: &mut Settings| settings.silence_timeout_s = TIMEOUT.as_secs_f64();
     let node = Recorded9Dof::start(change, vec![heard_now(0)]);
     node.until("a fault", fault);
-    // That nothing more comes of it cannot be waited for otherwise.
+    // The absence of further messages can only be checked by waiting.
     std::thread::sleep(6 * TIMEOUT);
     node.send(heard_now(1));
     node.until("a prediction", |node| !fault(node));
@@ -131,7 +131,7 @@ fn inputs_that_waited_too_long_are_passed_over_and_recorded() {
     let old = |seq| aged(seq, LATEST + LATEST / 10);
     let node = Recorded9Dof::start(|_| (), vec![old(0), old(1), old(2)]);
     node.until("the newest", |node| node.watch.snapshot().prediction.is_some_and(|p| p.input_seq == 2));
-    // A new one and one that waited but is the newest are predicted.
+    // A new input is predicted, and an old one if it is the newest.
     node.send(heard_now(3));
     node.until("a new one", |node| node.watch.snapshot().prediction.is_some_and(|p| p.input_seq == 3));
     node.send(old(4));
@@ -145,7 +145,7 @@ fn inputs_that_waited_too_long_are_passed_over_and_recorded() {
 fn sensitivities_are_computed_once_a_second_at_most() {
     let began = Instant::now();
     let node = Recorded9Dof::start(|_| (), vec![]);
-    // Inputs for more than a second, so that there are two: every one of them could have had its own.
+    // Inputs for more than one second, so that two sensitivities are due; each input could have had its own.
     let mut seq = 0;
     while began.elapsed() < SENSITIVITY_EVERY * 3 / 2 {
         node.send(heard_now(seq));
@@ -158,7 +158,7 @@ fn sensitivities_are_computed_once_a_second_at_most() {
     assert!((1..=most).contains(&sensitivities.into()), "{sensitivities} in {:?}, {seq} inputs", began.elapsed());
 }
 
-/// Logged at the time that passes, published at the time that the wall clock showed, which was set back and forth.
+/// The wall clock is set back and forth: log times stay evenly spaced, publish times follow the wall clock.
 #[test]
 fn a_clock_that_is_set_does_not_bend_a_recording() {
     const SECOND: i64 = 1_000_000_000;
@@ -183,7 +183,8 @@ fn a_clock_that_is_set_does_not_bend_a_recording() {
     assert_eq!(entries.len(), steps.len());
 }
 
-/// After a stop shared memory and ROS 2 hand over what they kept at once, and each input is recorded with its answer.
+/// After a stop, shared memory and ROS 2 deliver the inputs they kept all at once. Each is recorded with its
+/// prediction.
 #[test]
 fn the_recorder_has_room_for_what_the_buses_keep_twice_over() {
     use crate::wire::shm::{Form, OperatingPointForm};

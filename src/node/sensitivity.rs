@@ -1,11 +1,11 @@
-//! The message that says how a prediction changes with conditions and contact.
+//! The message with the sensitivities of a prediction to conditions and contact.
 
 use crate::physics::sensitivity::{Change, of_roots};
 use crate::physics::{End, Ends, OperatingPoint, Solver, StabilityMap, Vectors};
 use crate::rig::Rig;
 use crate::wire::{Derivatives, Header, ModeSensitivity, PairSensitivity, Prediction, Sensitivity, sensitivity_law};
 
-/// What sensitivities are asked for.
+/// A request for the sensitivities of a prediction.
 #[derive(Clone, Debug)]
 pub struct Question {
     pub header: Header,
@@ -16,17 +16,17 @@ pub struct Question {
 }
 
 impl Question {
-    /// About a prediction made for `point`.
+    /// A request for `prediction`, made at `point`.
     pub fn new(prediction: &Prediction, point: OperatingPoint) -> Self {
         let ids = prediction.modes.iter().map(|mode| mode.id).collect();
         Self { header: prediction.header.clone(), input_seq: prediction.input_seq, point, ids }
     }
 }
 
-/// Answers it by a dense solve; `map` numbers the modes, windows end at `ends`.
+/// Computes the requested sensitivities by a dense solve. `map` gives the identities of modes, `ends` the window ends.
 ///
 /// # Errors
-/// Why there is no answer, in words.
+/// Why they cannot be computed, as text.
 pub fn answer(
     rig: &Rig,
     solver: &mut Solver,
@@ -102,7 +102,7 @@ pub fn answer(
     Ok(message)
 }
 
-/// How an end of a window moves, as the wire has it.
+/// The derivatives of a window end, as the message carries them.
 pub fn end_derivatives(rig: &Rig, end: &End) -> Derivatives {
     let [load, speed, stiffness, damping] = end.slope;
     let contact = |slope: f64| if rig.model.is_linear_in_contact() { slope } else { f64::NAN };

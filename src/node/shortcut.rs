@@ -1,5 +1,5 @@
-//! A way past the queue: an input that can be answered at once is answered on the thread that heard it. To wake another
-//! thread takes as long as to predict.
+//! A path past the channel: an input that needs no dense solve is predicted on the thread that received it. Waking
+//! another thread would take as long as the prediction itself.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -9,7 +9,7 @@ use super::{Incoming, Node};
 use crate::io::heard::Heard;
 use crate::wire;
 
-/// Where a node is while it runs, for whoever holds the lock.
+/// Holds the node while it runs; whoever has the lock may use it.
 #[derive(Clone, Default)]
 pub(super) struct Place(Arc<Mutex<Option<Node>>>);
 
@@ -19,7 +19,7 @@ impl Place {
     }
 }
 
-/// A queue to a node, and the way past it.
+/// The sending side of a node's channel, with the path past it.
 #[derive(Clone)]
 pub struct Shortcut {
     queue: Sender<Incoming>,
@@ -27,16 +27,17 @@ pub struct Shortcut {
 }
 
 impl Shortcut {
-    /// For the node that will read the other end of `queue` and is made with [`Node::with_shortcut`].
+    /// A shortcut to the node that reads the other end of `queue` and is built with [`Node::with_shortcut`].
     pub fn new(queue: Sender<Incoming>) -> Self {
         Self { queue, place: Place::default() }
     }
 
-    /// Has an input predicted on this thread if nothing waits before it, nor on the bus behind it (`more_waits`), the node is
-    /// idle, and the prediction takes no dense solve; otherwise queues it. Never waits. False where the queue is full: the
+    /// Predicts for an input on this thread if it needs no dense solve, the node is idle, and no input waits in the
+    /// channel or on the bus (`more_waits`). Otherwise queues it. Never blocks. False if the channel is full and the
     /// input is lost.
     pub fn input(&self, heard: Heard<wire::OperatingPoint>, more_waits: bool) -> bool {
-        // What waits in the queue is taken out of it under the lock alone, so that no input overtakes another.
+        // Items are only taken out of the channel under this lock. If the channel is empty here, no input can be
+        // overtaken.
         if !more_waits
             && let Ok(mut place) = self.place.0.try_lock()
             && self.queue.is_empty()

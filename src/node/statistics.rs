@@ -1,4 +1,4 @@
-//! How the node does, as diagnostics.
+//! The node's counters and prediction times, reported as diagnostics.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -19,7 +19,7 @@ mod diagnostic_level {
     pub const ERROR: u8 = 2;
 }
 
-/// What was counted since the start, and the prediction times since the last report.
+/// Counts since the start, and prediction times since the last report.
 #[derive(Default)]
 pub struct Statistics {
     heard_shm: u64,
@@ -37,21 +37,21 @@ pub struct Statistics {
     pub refused: Option<String>,
     inputs: Inputs,
     level: Option<u8>,
-    /// What had been lost at the last report.
+    /// The losses counted at the last report.
     lost_before: Lost,
     times: Vec<Duration>,
 }
 
-/// What was lost since the start.
+/// Losses since the start.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Lost {
     passed_over: u64,
-    /// Inputs that came into a full queue.
+    /// Inputs lost because the channel was full.
     overflowed: u64,
-    /// Messages that a bus refused, and what it said last.
+    /// Messages that could not be published, and the latest reason.
     unpublished: u64,
     why_unpublished: Option<String>,
-    /// What the listening side of each bus counted.
+    /// Counts of the receiving side of each bus.
     buses: Vec<(&'static str, Counts)>,
 }
 
@@ -66,7 +66,7 @@ impl Lost {
         }
     }
 
-    /// What was lost since `before`, in words.
+    /// One warning for each kind of loss since `before`.
     fn since(&self, before: &Self) -> Vec<String> {
         let mut warnings = vec![];
         let mut warn = |count: u64, what: &str| {
@@ -79,7 +79,7 @@ impl Lost {
         for (bus, counts) in &self.buses {
             let of_bus = before.buses.iter().find(|(other, _)| other == bus);
             let before = of_bus.map(|(_, counts)| *counts).unwrap_or_default();
-            // A bus that was started again counts from 0.
+            // The counts of a bus begin at 0 after a restart.
             warn(counts.missed.saturating_sub(before.missed), &format!("inputs missed on {bus}"));
             warn(counts.malformed.saturating_sub(before.malformed), &format!("malformed inputs on {bus}"));
             warn(counts.failures.saturating_sub(before.failures), &format!("failures of {bus}"));
@@ -103,7 +103,7 @@ impl Statistics {
         }
     }
 
-    /// Nothing was heard for too long.
+    /// Takes note of a silence.
     pub fn silence(&mut self) {
         self.inputs.silence();
     }
@@ -112,7 +112,7 @@ impl Statistics {
         self.chart = Some((chart.leaf_count(), chart.size_bytes()));
     }
 
-    /// The latest prediction has this level.
+    /// Takes note of the level of the latest prediction.
     pub fn published(&mut self, level: u8) {
         self.level = Some(level);
     }
@@ -121,7 +121,7 @@ impl Statistics {
         self.times.push(took);
     }
 
-    /// The diagnostics of the time since the last report.
+    /// The diagnostics message for the time since the last report.
     pub fn report(
         &mut self,
         header: Header,
@@ -199,7 +199,7 @@ impl Statistics {
             pair("window_ends", self.ends),
             pair("sensitivities", self.sensitivities),
             pair("stability_map_pending", map_pending),
-            // What the situation did not need. A prediction off the chart is a dense solve and its vectors saved.
+            // Work avoided. A charted prediction also avoids a dense solve with its vectors.
             pair("skipped_zero_terms", counters.zero_terms),
             pair("skipped_decoupled_modes", counters.decoupled_modes),
             pair("skipped_roots_beyond_band", counters.roots_beyond_band),
@@ -214,7 +214,8 @@ impl Statistics {
     }
 }
 
-/// Squeal is worth a warning, though the node itself does well; without inputs or with unusable ones nothing is predicted.
+/// The diagnostic level of a status. Squeal is a warning, since the node itself works. Without usable inputs there is
+/// no prediction, which is an error.
 fn level_of(status: Status) -> u8 {
     match status {
         Status::Ok => diagnostic_level::OK,
@@ -268,7 +269,7 @@ mod tests {
             Self { statistics: Statistics::default(), outputs: Outputs::default(), rig }
         }
 
-        /// Level and message of the predictions.
+        /// Level and message of the next report.
         fn report(&mut self) -> (u8, String) {
             let Self { statistics, outputs, rig } = self;
             let mut array = statistics.report(Header::default(), rig, Counters::default(), 0, false, outputs);
@@ -298,7 +299,7 @@ mod tests {
         assert_eq!(reporter.report(), (diagnostic_level::ERROR, "NO DATA".to_owned()));
     }
 
-    /// Every loss raises the level of the report after it, and of that one alone.
+    /// A loss raises the level of the next report only.
     #[test]
     fn losses_and_failures_raise_the_level_once() {
         let mut reporter = Reporter::new();

@@ -1,5 +1,5 @@
-//! What every surface says first about a node: one status, the mode it is about, the window its margin is measured to,
-//! and one sentence. Page, terminal, log, events and reports take it from here.
+//! What every surface shows first of a node: its status, the fastest growing mode, the window its margin refers to, and
+//! one sentence. Page, terminal, log, events and reports take all of it from here.
 
 use std::fmt::Write;
 
@@ -10,21 +10,21 @@ use crate::number::significant;
 use crate::physics::{Ends, OperatingPoint as Point, StabilityMap};
 use crate::wire::{OperatingPoint, Prediction, level};
 
-/// How a node does, in one word.
+/// The status of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Status {
-    /// No input was ever heard.
+    /// No input has been received yet.
     Waiting,
     Ok,
     Warn,
     Squeal,
     Fault,
-    /// Inputs were heard and have stopped.
+    /// Inputs were received and have stopped.
     NoData,
 }
 
-/// Whether inputs come.
+/// Whether inputs arrive.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Inputs {
     heard: bool,
@@ -32,17 +32,17 @@ pub struct Inputs {
 }
 
 impl Inputs {
-    /// An input came.
+    /// Takes note of an input.
     pub fn came(&mut self) {
         *self = Self { heard: true, silent: false };
     }
 
-    /// The node noticed that no input comes.
+    /// Takes note of a silence.
     pub fn silence(&mut self) {
         self.silent = true;
     }
 
-    /// A prediction was made: of an input, even if that was not seen, unless the silence was noticed before.
+    /// Takes note of a prediction. Unless a silence was noted, it implies an input, even if that was not seen.
     pub fn predicted(&mut self) {
         self.heard |= !self.silent;
     }
@@ -52,7 +52,7 @@ impl Status {
     /// Every status.
     pub const ALL: [Self; 6] = [Self::Waiting, Self::Ok, Self::Warn, Self::Squeal, Self::Fault, Self::NoData];
 
-    /// The status of the latest prediction, which has `level`; `None` before the first.
+    /// The status for the latest prediction's `level`; `None` before the first prediction.
     pub fn new(level: Option<u8>, inputs: Inputs) -> Self {
         match (level, inputs) {
             (None, _) | (_, Inputs { heard: false, silent: true }) => Self::Waiting,
@@ -64,7 +64,7 @@ impl Status {
         }
     }
 
-    /// As people read it.
+    /// The status as displays show it.
     pub fn name(self) -> &'static str {
         match self {
             Self::Waiting => "WAITING",
@@ -76,7 +76,7 @@ impl Status {
         }
     }
 
-    /// The level of the message; `None` where nothing was predicted for want of inputs.
+    /// The level of messages with this status; `None` without data.
     pub fn level(self) -> Option<u8> {
         match self {
             Self::Waiting | Self::NoData => None,
@@ -87,7 +87,7 @@ impl Status {
         }
     }
 
-    /// Whether anything is known of the rig's stability.
+    /// Whether the stability of the rig is known.
     pub fn is_known(self) -> bool {
         match self {
             Self::Ok | Self::Warn | Self::Squeal => true,
@@ -96,10 +96,10 @@ impl Status {
     }
 }
 
-/// The end of a window of instability that the margin is measured to.
+/// The end of a window of instability that the margin refers to.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct NextSqueal {
-    /// The pair that merges, or the mode that begins to grow; none for a static divergence.
+    /// The two modes that merge, or the mode that becomes unstable; empty for a static divergence.
     pub ids: Vec<u32>,
     /// Frequency at the end, Hz; 0 for a static divergence.
     pub frequency_hz: f64,
@@ -107,14 +107,15 @@ pub struct NextSqueal {
     pub mu: f64,
     /// The published margin: the distance to this end, negative inside the window.
     pub margin: f64,
-    /// Bound of the error of both; NaN where none is known.
+    /// Error bound of `mu` and `margin`; NaN if unknown.
     pub error: f64,
     /// Whether the friction coefficient is inside the window.
     pub inside: bool,
 }
 
 impl NextSqueal {
-    /// The end that the margin of `prediction`, made at `point`, is measured to; `map` and `ends` were in force then.
+    /// The end that the margin of `prediction` refers to. The prediction was made at `point` while `map` and `ends`
+    /// were in force.
     pub fn new(prediction: &Prediction, point: &Point, map: &StabilityMap, ends: &Ends) -> Option<Self> {
         let margin = Some(prediction.friction_margin).filter(|margin| margin.is_finite())?;
         let next = map.next_window(ends, point)?;
@@ -128,7 +129,7 @@ impl NextSqueal {
         })
     }
 
-    /// Who squeals: a pair or a mode and its frequency.
+    /// The modes and their frequency, as text.
     pub fn modes(&self) -> String {
         let ids: Vec<String> = self.ids.iter().map(u32::to_string).collect();
         match ids.as_slice() {
@@ -138,33 +139,33 @@ impl NextSqueal {
         }
     }
 
-    /// Where, and how far that is.
+    /// The friction coefficient of the end and the distance to it, as text.
     pub fn place(&self) -> String {
         let what = if self.inside { "ends at" } else { "at" };
         format!("{what} friction coefficient {:.4}, {:.4} away", self.mu, self.margin.abs())
     }
 }
 
-/// What is said first.
+/// What every surface shows first of a node.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Assessment {
     pub status: Status,
-    /// One sentence for people. It holds no number that ages.
+    /// One sentence for people, without values that become outdated.
     pub message: String,
-    /// The mode that grows fastest; `None` where none grows.
+    /// The fastest growing mode; `None` if no mode grows.
     pub fastest: Option<UnstableMode>,
     /// `None` where no margin is known.
     pub next: Option<NextSqueal>,
 }
 
 impl Assessment {
-    /// Before anything is known.
+    /// The assessment before the first input.
     pub fn waiting() -> Self {
         let message = "no input was heard yet".to_owned();
         Self { status: Status::Waiting, message, fastest: None, next: None }
     }
 
-    /// Of `prediction`, made for `input`, while `map` and `ends` were in force.
+    /// The assessment of `prediction`, made for `input` while `windows` were in force.
     pub fn new(
         status: Status,
         prediction: &Prediction,
@@ -195,7 +196,7 @@ impl Assessment {
     }
 }
 
-/// What grows, of `unstable` modes and static roots.
+/// A sentence about what grows: `unstable` counts modes and static roots.
 fn growing(fastest: Option<UnstableMode>, unstable: u32) -> String {
     let Some(mode) = fastest else { return "static divergence: a root that does not oscillate grows".to_owned() };
     let (hz, growth) = (significant(mode.frequency_hz, 5), significant(mode.growth_rate_per_s, 3));
@@ -206,20 +207,20 @@ fn growing(fastest: Option<UnstableMode>, unstable: u32) -> String {
     text
 }
 
-/// What a node listens to, and what can be started in place of a rig.
+/// Where a node expects its inputs, and how to simulate them.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct InputSources {
-    /// Topic of ROS 2, as remapped, and its domain; `None` off ROS 2.
+    /// Topic on ROS 2, as remapped, and its domain; `None` without ROS 2.
     pub topic: Option<String>,
     pub domain: Option<u16>,
-    /// Service of shared memory; `None` off shared memory.
+    /// Service in shared memory; `None` without shared memory.
     pub service: Option<String>,
-    /// The command that publishes simulated conditions there.
+    /// The command that publishes simulated operating points there.
     pub start: Option<String>,
 }
 
 impl InputSources {
-    /// For whoever waits for the first input.
+    /// A sentence for a user whose node waits for the first input.
     pub fn sentence(&self) -> String {
         let ros2 = self.topic.as_ref().map(|topic| match self.domain {
             Some(domain) => format!("{topic} (ROS 2, domain {domain})"),
@@ -310,7 +311,7 @@ mod tests {
         }
     }
 
-    /// The margin of a prediction is measured to the window that is named: windows and margin come from the same map.
+    /// The window shown is the one the margin refers to: both come from the same map.
     #[test]
     fn the_window_named_is_the_one_the_margin_is_measured_to() {
         let rig = Rig::load("nine-dof-case-2").expect("embedded");

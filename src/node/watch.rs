@@ -1,4 +1,4 @@
-//! The latest state of a node, for whoever looks at it. Never waited for by the node for longer than a copy takes.
+//! The latest state of a node for displays and terminals. The node never waits for them longer than a copy takes.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
@@ -11,31 +11,31 @@ use crate::physics::{Ends, NextWindow, StabilityMap};
 use crate::session::Counters;
 use crate::wire::{OperatingPoint, Prediction, Vibration};
 
-/// What there is to see.
+/// The state of a node as displays show it.
 #[derive(Clone, Debug, Default)]
 pub struct Snapshot {
-    /// The conditions of [`Snapshot::prediction`].
+    /// The input of [`Snapshot::prediction`].
     pub input: Option<OperatingPoint>,
     pub prediction: Option<Prediction>,
-    /// When the last input was heard.
+    /// When the last input was received.
     pub heard: Option<Instant>,
-    /// Whether inputs come.
+    /// Whether inputs arrive.
     pub inputs: Inputs,
     pub map: Option<Arc<StabilityMap>>,
-    /// The ends of the map's windows at another load and speed than the map's.
+    /// Window ends of the map at a load and speed other than the map's own.
     pub ends: Option<Arc<Ends>>,
-    /// The margin below which the node warns now; `None` before it began.
+    /// The margin below which the node warns at present; `None` before it started.
     pub warn_margin: Option<f64>,
     pub counters: Counters,
     pub passed_over: u64,
-    /// How often the ROS 2 side fell and was started again.
+    /// Number of restarts of the ROS 2 side.
     pub ros2_falls: u64,
-    /// Why not everything is recorded.
+    /// Why some messages are not recorded.
     pub recording_problem: Option<String>,
 }
 
 impl Snapshot {
-    /// What is said first of it.
+    /// Status, message, fastest mode and next window of this state.
     pub fn assessment(&self) -> Assessment {
         let Some(prediction) = &self.prediction else { return Assessment::waiting() };
         let status = Status::new(Some(prediction.level), self.inputs);
@@ -44,7 +44,7 @@ impl Snapshot {
         Assessment::new(status, prediction, self.input.as_ref(), windows)
     }
 
-    /// The window of instability that the margin of the prediction is measured to; `None` where there is no margin.
+    /// The window whose end the margin of the prediction refers to; `None` without a margin.
     pub fn next_window(&self) -> Option<NextWindow<'_>> {
         let prediction = self.prediction.as_ref().filter(|prediction| !prediction.friction_margin.is_nan())?;
         let input = self.input.as_ref().filter(|input| input.seq == prediction.input_seq)?;
@@ -53,20 +53,20 @@ impl Snapshot {
     }
 }
 
-/// Unstable modes kept of a [`Sample`].
+/// Number of unstable modes kept in a [`Sample`].
 pub const SAMPLE_MODES: usize = 4;
-/// Samples that may wait for whoever follows them; what comes after is lost to them, not to the node.
+/// Capacity for samples that the follower has not taken yet. Samples beyond it are lost to the follower only.
 const MOST_SAMPLES: usize = 1 << 16;
 
-/// What became of one input, small enough to keep many of.
+/// The outcome of one input, compact enough to keep many.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
-    /// When it was predicted, ns since the epoch.
+    /// Time of the prediction, ns since the epoch.
     pub time_ns: i64,
     /// Stamp of the prediction, ns since the epoch.
     pub stamp_ns: i64,
     pub input_seq: u64,
-    /// The conditions; NaN where they are not known.
+    /// The operating point; NaN where unknown.
     pub normal_load_n: f64,
     pub disc_speed_rad_s: f64,
     pub friction_coefficient: f64,
@@ -75,11 +75,11 @@ pub struct Sample {
     pub max_growth_rate_per_s: f64,
     pub critical_friction: f64,
     pub friction_margin: f64,
-    /// The fastest growing unstable modes, fastest first.
+    /// The fastest growing unstable modes, in descending order of growth rate.
     pub unstable: [Option<UnstableMode>; SAMPLE_MODES],
 }
 
-/// A growing mode.
+/// An unstable mode.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct UnstableMode {
     pub id: u32,
@@ -87,10 +87,10 @@ pub struct UnstableMode {
     pub growth_rate_per_s: f64,
 }
 
-/// The fastest growing unstable modes of a prediction, fastest first.
+/// The fastest growing unstable modes of a prediction, in descending order of growth rate.
 pub fn fastest_modes(prediction: &Prediction) -> [Option<UnstableMode>; SAMPLE_MODES] {
     let mut unstable = [None; SAMPLE_MODES];
-    // Roots that do not oscillate count as unstable too but are not among the modes.
+    // Static roots count as unstable too but are not among the modes.
     let kept = SAMPLE_MODES.min(prediction.unstable_modes as usize);
     for mode in prediction.modes.iter().filter(|mode| mode.growth_rate_per_s > 0.0) {
         let mut candidate = Some(UnstableMode {
@@ -129,10 +129,10 @@ impl Sample {
     }
 }
 
-/// A measured vibration, small enough to keep many of.
+/// A measured vibration, compact enough to keep many.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VibrationSample {
-    /// When it was heard, ns since the epoch.
+    /// When it was received, ns since the epoch.
     pub time_ns: i64,
     pub frequency_hz: f64,
     pub level_db: f64,
@@ -145,20 +145,20 @@ impl VibrationSample {
     }
 }
 
-/// A shared view of the latest state, and of the samples since somebody began to follow them.
+/// Shared access to the latest state, and to the samples since a follower began to take them.
 #[derive(Clone, Default)]
 pub struct Watch(Arc<Mutex<Watched>>);
 
 #[derive(Default)]
 struct Watched {
     snapshot: Snapshot,
-    /// The latest input, which may not be predicted yet.
+    /// The latest input; it may not be predicted yet.
     input: Option<OperatingPoint>,
-    /// Whether it came after the latest prediction.
+    /// Whether that input came after the latest prediction.
     is_new: bool,
-    /// `None` while nobody follows.
+    /// `None` without a follower.
     samples: Option<Vec<Sample>>,
-    /// Of the same follower.
+    /// The measured vibrations for the same follower.
     vibrations: Vec<VibrationSample>,
     lost: u64,
 }
@@ -169,8 +169,8 @@ impl Watch {
         self.with(|watched| watched.snapshot.clone())
     }
 
-    /// The samples since the last call, oldest first, in place of what `samples` held; and how many were lost so far
-    /// because nobody took them. The first call begins to follow.
+    /// Replaces the content of `samples` by the samples since the last call, oldest first. Returns how many were lost
+    /// so far because they were not taken in time. The first call starts the collection.
     pub fn take_samples(&self, samples: &mut Vec<Sample>) -> u64 {
         samples.clear();
         self.with(|watched| {
@@ -179,7 +179,8 @@ impl Watch {
         })
     }
 
-    /// As [`Watch::take_samples`], of the measured vibration. It begins to follow with the samples.
+    /// As [`Watch::take_samples`], for measured vibrations. The first call of [`Watch::take_samples`] starts their
+    /// collection too.
     pub fn take_vibrations(&self, vibrations: &mut Vec<VibrationSample>) {
         vibrations.clear();
         self.with(|watched| std::mem::swap(&mut watched.vibrations, vibrations));
@@ -189,7 +190,7 @@ impl Watch {
         action(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// An input came.
+    /// Takes note of an input.
     pub fn input(&self, input: &OperatingPoint) {
         self.with(|watched| {
             watched.snapshot.heard = Some(Instant::now());
@@ -198,12 +199,12 @@ impl Watch {
         });
     }
 
-    /// The node noticed that no input comes; its prediction follows.
+    /// Takes note of a silence; its prediction follows.
     pub fn silence(&self) {
         self.with(|watched| watched.snapshot.inputs.silence());
     }
 
-    /// A prediction was made.
+    /// Takes note of a prediction.
     pub fn prediction(&self, prediction: &Prediction) {
         self.with(|watched| {
             let Watched { snapshot, input, is_new, samples, lost, .. } = watched;
@@ -219,7 +220,7 @@ impl Watch {
                 }
             }
             snapshot.input.clone_from(input);
-            // In the memory it has.
+            // Reuses the memory of the previous prediction.
             snapshot.prediction.get_or_insert_default().clone_from(prediction);
         });
     }
@@ -279,7 +280,7 @@ mod tests {
         assert!(sample.normal_load_n.is_nan());
     }
 
-    /// A node that hears nothing waits; it is no fault, before the first input or after the last.
+    /// A node without inputs is WAITING before the first and NO DATA after the last, never FAULT.
     #[test]
     fn the_status_follows_inputs_and_silence() {
         let watch = Watch::default();
