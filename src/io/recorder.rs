@@ -1,12 +1,12 @@
-//! Records messages on a thread of its own: nobody waits for the disk.
+//! Records messages on a background thread, so that no sender waits for the disk.
 //!
-//! A recording is a rosbag2 directory `DIR/squealcast_<UTC time>/` of MCAP files `squealcast_<UTC time>_0.mcap`, `_1` ...
-//! and `metadata.yaml`. Each file carries the rig files as attachments and a metadata record, and begins with the rig, settings,
-//! stability map, ends of windows and chart in force, so that it can be replayed alone. While it is written a file is named
-//! `*.mcap.active`. If the directory is moved, its files are finished where they are now; if it is removed, they are counted as
-//! lost; either way the recording goes on in a new directory.
+//! A recording is a rosbag2 directory `DIR/squealcast_<UTC time>/` of MCAP files `squealcast_<UTC time>_0.mcap`, `_1`
+//! ... and `metadata.yaml`. Each file contains the rig files as attachments and a metadata record. It begins with the
+//! rig, settings, stability map, window ends and chart in force, so that it can be replayed alone. While a file is
+//! being written it is named `*.mcap.active`. If the directory is moved, its files are finished at their new place. If
+//! it is removed, their messages are counted as lost. In both cases the recording continues in a new directory.
 //!
-//! Messages are logged at [`super::clock::Reading::log_ns`], which setting the clock does not change.
+//! The log time of a message is [`super::clock::Reading::log_ns`], which does not jump when the wall clock is set.
 
 mod worker;
 
@@ -33,43 +33,44 @@ use super::{
 use crate::rig::RigFile;
 use worker::Worker;
 
-/// The name of the metadata record each file carries. Its keys: `session_id`, `squealcast_version`, `rig_name`,
+/// Name of the metadata record in each file. Its keys: `session_id`, `squealcast_version`, `rig_name`,
 /// `rig_content_hash`, `split_index`, `started_utc`.
 pub const METADATA_NAME: &str = "squealcast";
 
-/// Messages that may wait for the disk. A node that was stopped and goes on gets at once what shared memory and ROS 2 kept for it,
-/// at most 4096 inputs each, and answers each: 16 384 messages. This is twice that; the largest predictions take 4 KiB each.
+/// Capacity of the queue to the recorder, in messages. A node that was stopped and continues receives up to 4096 inputs
+/// each from shared memory and ROS 2 at once, and predicts for each of them: 16 384 messages. The capacity is twice
+/// that. The largest predictions take 4 KiB each.
 pub const QUEUE_MESSAGES: usize = 1 << 15;
 
-/// What to record, where, and how.
+/// Configuration of a recorder.
 #[derive(Clone, Debug)]
 pub struct RecorderConfig {
-    /// The recording's directory is made in this one, which is made too if need be.
+    /// The directory in which the recording's own directory is created; created itself if missing.
     pub directory: PathBuf,
     pub rig_name: String,
     pub rig_content_hash: String,
     /// Attached to every file.
     pub rig_files: Vec<RigFile>,
-    /// Tells recordings of one run from others.
+    /// Identifies the recordings of one run.
     pub session_id: String,
-    /// A file that has grown to this size, bytes, is followed by another.
+    /// File size after which the next file is begun, bytes.
     pub split_bytes: u64,
-    /// A file that spans this much log time is followed by another.
+    /// Log time spanned by a file after which the next file is begun.
     pub split_duration: Duration,
-    /// Messages that may wait for the disk; more are dropped and counted.
+    /// Capacity of the queue to the recorder; messages beyond it are dropped and counted.
     pub queue_messages: usize,
-    /// A killed process loses this much at most.
+    /// Interval between flushes: the most that is lost if the process is killed.
     pub flush_interval: Duration,
-    /// A power failure loses this much at most.
+    /// Interval between `fdatasync` calls: the most that is lost in a power failure.
     pub sync_interval: Duration,
-    /// After a failure a new file is tried this often.
+    /// Interval between attempts to begin a new file after a failure.
     pub retry_interval: Duration,
-    /// Where bytes go.
+    /// The disk that is written to; tests replace it.
     pub disk: Arc<dyn Disk>,
 }
 
 impl RecorderConfig {
-    /// The usual settings: files of 1 GiB or an hour, flush every 0.5 s, fdatasync every 2 s.
+    /// The default settings: files of at most 1 GiB or one hour, a flush every 0.5 s, `fdatasync` every 2 s.
     pub fn new(directory: impl Into<PathBuf>) -> Self {
         Self {
             directory: directory.into(),
@@ -88,7 +89,7 @@ impl RecorderConfig {
     }
 }
 
-/// Why nothing is recorded, or not everything was.
+/// Why recording is impossible or incomplete.
 #[derive(Debug, thiserror::Error)]
 pub enum RecorderError {
     #[error("cannot record into {}: {source}", .path.display())]
@@ -105,51 +106,51 @@ pub enum RecorderError {
     Panicked,
 }
 
-/// Whether messages reach the disk.
+/// Whether messages are being written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum State {
     Recording,
-    /// They do not, and why. A new file is begun as soon as possible.
+    /// Messages are not being written, and why. The recorder keeps trying to begin a new file.
     Failed(String),
     Finished,
 }
 
-/// How the recorder does.
+/// Status of a recorder.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Status {
     pub state: State,
-    /// The recording's directory; before it could be made, the one it is to be made in.
+    /// The recording's directory; until that could be created, the record directory.
     pub directory: PathBuf,
-    /// Messages in the files; those of the last half second may still be in memory.
+    /// Messages in the files. Those of the last half second may still be in memory.
     pub messages_written: u64,
     /// Bytes in the files.
     pub bytes_written: u64,
-    /// Messages that found the queue full.
+    /// Messages dropped because the queue was full.
     pub dropped_queue_full: u64,
-    /// Messages lost because they could not be written or their file was removed, and those since the last flush before a failure,
-    /// of which some may be in what is recovered.
+    /// Messages lost because they could not be written or because their file was removed. Messages since the last flush
+    /// before a failure count too, although a recovery may restore some of them.
     pub dropped_failed: u64,
-    /// Messages that wait for the disk, and how many may.
+    /// Messages in the queue, and its capacity.
     pub queued: usize,
     pub queue_capacity: usize,
-    /// The longest time the disk has kept messages waiting.
+    /// The longest time for which a disk operation held up the queue.
     pub longest_stall: Duration,
-    /// What was last wrong, past failures included.
+    /// The latest error, even if recording has resumed since.
     pub last_error: Option<String>,
-    /// Files that a failure cut short; [`recover`](super::recover) finishes them.
+    /// Files cut short by a failure; [`recover`](super::recover) finishes them.
     pub interrupted: Vec<PathBuf>,
-    /// Leftovers of earlier recordings in the record directory that were repaired, and why others were not.
+    /// Interrupted recordings in the record directory: those that were repaired, and the errors of those that were not.
     pub recovered: Vec<Recovery>,
     pub unrecovered: Vec<String>,
 }
 
 impl Status {
-    /// All messages that are in no file.
+    /// Number of messages that are in no file.
     pub fn dropped(&self) -> u64 {
         self.dropped_queue_full + self.dropped_failed
     }
 
-    /// Why messages are in no file; `None` if all are in one.
+    /// Why messages are in no file; `None` if none is missing.
     pub fn why_dropped(&self) -> Option<String> {
         let (full, failed) = (self.dropped_queue_full, self.dropped_failed);
         let full = (full > 0).then(|| {
@@ -167,7 +168,7 @@ impl Status {
         (!reasons.is_empty()).then(|| reasons.join("; "))
     }
 
-    /// What whoever watches a recording must know now; `None` while all is well.
+    /// The current problem to show to users; `None` if there is none.
     pub fn problem(&self) -> Option<String> {
         match (&self.state, self.why_dropped()) {
             (State::Failed(why), _) => Some(format!("not recording: {why}")),
@@ -177,7 +178,7 @@ impl Status {
     }
 }
 
-/// What a finished recording consists of.
+/// A finished recording.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Finished {
     pub directory: PathBuf,
@@ -186,7 +187,7 @@ pub struct Finished {
     pub status: Status,
 }
 
-/// What the recorder's thread says to others.
+/// State shared between the recorder's thread and its handles.
 #[derive(Debug)]
 struct Shared {
     messages_written: AtomicU64,
@@ -239,12 +240,12 @@ impl Shared {
 }
 
 enum Command {
-    // On the heap: most places of the queue are empty.
+    // Boxed, because most slots of the queue are empty.
     Record(Box<Message>),
     Finish,
 }
 
-/// Takes messages for the recorder; clone it freely.
+/// Passes messages to the recorder; cheap to clone.
 #[derive(Clone, Debug)]
 pub struct RecorderHandle {
     queue: Sender<Command>,
@@ -261,8 +262,8 @@ impl std::fmt::Debug for Command {
 }
 
 impl RecorderHandle {
-    /// Hands a message to the recorder and never waits: when the queue is full, or the recorder has finished, the
-    /// message is dropped and counted. Whether it was taken.
+    /// Passes a message to the recorder without waiting. If the queue is full or the recorder has finished, the message
+    /// is dropped and counted. Returns whether it was accepted.
     pub fn record(&self, message: Message) -> bool {
         let dropped = match self.queue.try_send(Command::Record(Box::new(message))) {
             Ok(()) => return true,
@@ -273,7 +274,7 @@ impl RecorderHandle {
         false
     }
 
-    /// How the recorder does.
+    /// The current status.
     pub fn status(&self) -> Status {
         let condition = self.shared.condition();
         Status {
@@ -294,7 +295,8 @@ impl RecorderHandle {
     }
 }
 
-/// A recording in progress. Dropped without [`finish`](Self::finish) it still ends in order, but nobody hears of errors.
+/// A recording in progress. If it is dropped without [`finish`](Self::finish), the files are still finished but errors
+/// are not reported.
 #[derive(Debug)]
 pub struct Recorder {
     handle: RecorderHandle,
@@ -303,22 +305,22 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Makes the recording's directory and first file, and starts the thread. Leftovers of interrupted recordings in
-    /// the record directory are repaired on another thread meanwhile; see [`Status::recovered`].
+    /// Creates the recording's directory and first file, and starts the thread. Meanwhile another thread repairs
+    /// interrupted recordings in the record directory; see [`Status::recovered`].
     ///
     /// # Errors
     ///
-    /// A directory or first file that cannot be written.
+    /// The directory or the first file cannot be written.
     pub fn start(config: RecorderConfig) -> Result<Self, RecorderError> {
         Self::start_unless(config, |_| true)
     }
 
-    /// As [`start`](Self::start); but where the disk is full or may not be written to, begins as soon as it may. Until then
-    /// messages are counted as lost.
+    /// As [`start`](Self::start), but a full or read-only disk is not an error: recording begins as soon as it is
+    /// possible. Until then messages are counted as lost.
     ///
     /// # Errors
     ///
-    /// A directory or first file that cannot be written for any other reason.
+    /// The directory or the first file cannot be written for any other reason.
     pub fn start_when_possible(config: RecorderConfig) -> Result<Self, RecorderError> {
         Self::start_unless(config, |error| !may_pass(error))
     }
@@ -342,7 +344,7 @@ impl Recorder {
                 Ok(files) => drop(done_sender.send(files)),
                 Err(_) => {
                     ended.failed("internal error in the recorder".to_owned());
-                    // Not dropped: that would write again.
+                    // Not dropped: dropping would write again.
                     let _ = catch_unwind(AssertUnwindSafe(|| worker.abandon()));
                 }
             })
@@ -355,7 +357,7 @@ impl Recorder {
         Ok(Self { handle: RecorderHandle { queue, shared }, done, thread: Some(thread) })
     }
 
-    /// Something to record with from elsewhere.
+    /// A handle through which other threads record.
     pub fn handle(&self) -> RecorderHandle {
         self.handle.clone()
     }
@@ -370,16 +372,16 @@ impl Recorder {
         self.handle.status()
     }
 
-    /// Writes what is queued and finishes the files, within `limit`.
+    /// Writes the queued messages and finishes the files, within `limit`.
     ///
     /// # Errors
     ///
-    /// Recording has failed and not resumed, something could not be finished, or it took longer than `limit`; what was
-    /// written is there, and can be recovered if need be.
+    /// Recording has failed and not resumed, a file could not be finished, or `limit` was exceeded. What was written
+    /// remains and can be recovered if necessary.
     pub fn finish(mut self, limit: Duration) -> Result<Finished, RecorderError> {
         let deadline = Instant::now() + limit;
         match self.handle.queue.send_timeout(Command::Finish, limit) {
-            // Disconnected: the thread has ended; below that shows.
+            // Disconnected: the thread has ended, which is detected below.
             Ok(()) | Err(SendTimeoutError::Disconnected(_)) => {}
             Err(SendTimeoutError::Timeout(_)) => {
                 self.thread = None;
@@ -409,14 +411,14 @@ impl Recorder {
 impl Drop for Recorder {
     fn drop(&mut self) {
         let Some(thread) = self.thread.take() else { return };
-        // Does nothing when `finish` was called: then the thread has ended.
+        // Has no effect after `finish`, since the thread has then ended.
         if self.handle.queue.send_timeout(Command::Finish, Duration::from_secs(1)).is_ok() || thread.is_finished() {
             let _ = thread.join();
         }
     }
 }
 
-/// Whether a disk that refuses now may accept later, by itself or because somebody tidies up.
+/// Whether a disk error may be temporary, for example because somebody frees space.
 fn may_pass(error: &RecorderError) -> bool {
     use io::ErrorKind::{FileTooLarge, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
     const EIO: i32 = 5;
@@ -431,7 +433,8 @@ fn may_pass(error: &RecorderError) -> bool {
     false
 }
 
-/// `DIR/squealcast_<UTC time>`, and its name. A second recording within the second gets `-2` behind it.
+/// Creates `DIR/squealcast_<UTC time>` and returns it with its name. A second recording within the same second gets the
+/// suffix `-2`.
 fn make_directory(record_directory: &Path) -> Result<(PathBuf, String), RecorderError> {
     let failed = |path: &Path| {
         let path = path.to_owned();
@@ -455,7 +458,7 @@ fn make_directory(record_directory: &Path) -> Result<(PathBuf, String), Recorder
 }
 
 fn recover_leftovers(directory: &Path, shared: &Shared) {
-    // It could not be made yet: then nothing is left in it.
+    // The directory could not be created yet, so nothing can be left in it.
     if !directory.exists() {
         return;
     }
@@ -463,7 +466,7 @@ fn recover_leftovers(directory: &Path, shared: &Shared) {
     let mut condition = shared.condition();
     match result {
         Ok(report) => {
-            // In use: our own file, or another process's.
+            // In use: our own file, or that of another process.
             let recoveries = report.recoveries.into_iter();
             condition.recovered.extend(recoveries.filter(|recovery| recovery.outcome != Outcome::InUse));
             condition.unrecovered.extend(report.errors.iter().map(|error| chain(error)));
@@ -472,7 +475,7 @@ fn recover_leftovers(directory: &Path, shared: &Shared) {
     }
 }
 
-/// An error with its causes.
+/// The message of an error with those of its causes.
 fn chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();

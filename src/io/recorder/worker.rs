@@ -1,4 +1,4 @@
-//! The recorder's thread: takes messages from the queue and writes them into one file after another.
+//! The recorder's thread: writes the messages of the queue into successive files.
 
 use std::{
     collections::BTreeMap,
@@ -21,10 +21,10 @@ use crate::io::{
 };
 use crate::wire::{event_kind, schema::Topic};
 
-/// A new file after a failure wants this much space, so that it does not fail at once again.
+/// Free space required before a new file is begun after a failure, bytes, so that it does not fail again at once.
 const WANTED_FREE_BYTES: u64 = 32 << 20;
 
-/// A message that each file begins with.
+/// A message that is repeated at the beginning of each file.
 #[derive(Clone, Debug)]
 struct Repeated {
     topic: Topic,
@@ -32,14 +32,14 @@ struct Repeated {
     cdr: Vec<u8>,
 }
 
-/// What a replay has to know before the first input, in the order in which a session gets it. The newest message of each is
-/// repeated at the start of each file.
+/// What a replay must know before the first input, in the order in which a session gets it. The newest message of each
+/// kind is repeated at the beginning of each file.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum InForce {
     Rig,
     Setting(String),
     StabilityMap,
-    /// Of the windows of that map.
+    /// The window ends of that map.
     WindowEnds,
     Chart,
 }
@@ -53,7 +53,7 @@ impl InForce {
                 event_kind::STABILITY_MAP => Some(Self::StabilityMap),
                 event_kind::WINDOW_ENDS => Some(Self::WindowEnds),
                 event_kind::CHART => Some(Self::Chart),
-                // A silence is over with the next input.
+                // A silence ends with the next input.
                 _ => None,
             },
             Payload::OperatingPoint(_)
@@ -65,7 +65,7 @@ impl InForce {
     }
 }
 
-/// A file that is not written to any more.
+/// A file that is no longer written to.
 #[derive(Clone, Debug)]
 struct Closed {
     path: PathBuf,
@@ -74,19 +74,19 @@ struct Closed {
     finished: bool,
 }
 
-/// What the thread works with.
+/// State of the recorder's thread.
 pub(super) struct Worker {
     config: RecorderConfig,
     shared: Arc<Shared>,
-    /// The recording's directory and its name, once it is made.
+    /// The recording's directory and its name, once created.
     directory: Option<(PathBuf, String)>,
     file: Option<RecordingFile>,
     next_split: u32,
-    /// The finished files of `directory`.
+    /// The finished files of `directory`, listed in its `metadata.yaml`.
     listed: Vec<FileSummary>,
     /// The files of all directories, in order.
     closed: Vec<Closed>,
-    /// Messages in `file` that a failure would lose.
+    /// Messages in `file` since the last flush; a failure would lose them.
     unflushed: u64,
     unsynced: bool,
     last_log_time_ns: Option<u64>,
@@ -94,7 +94,7 @@ pub(super) struct Worker {
     file_start_ns: Option<u64>,
     sequences: BTreeMap<Topic, u32>,
     in_force: BTreeMap<InForce, Repeated>,
-    /// `file` has no message yet.
+    /// Whether `file` contains no message yet.
     begins: bool,
 }
 
@@ -118,7 +118,7 @@ impl Worker {
         }
     }
 
-    /// Takes commands until the one to finish; the finished files.
+    /// Handles commands until [`Command::Finish`]; returns the finished files.
     pub(super) fn run(&mut self, commands: &Receiver<Command>) -> Vec<PathBuf> {
         let mut next_flush = Instant::now() + self.config.flush_interval;
         let mut next_sync = Instant::now() + self.config.sync_interval;
@@ -154,7 +154,7 @@ impl Worker {
         self.closed.iter().filter(|closed| closed.finished).map(|closed| closed.path.clone()).collect()
     }
 
-    /// Writes nothing more, as if the process had been killed.
+    /// Stops writing, as if the process had been killed.
     pub(super) fn abandon(&mut self) {
         self.file.take().map(RecordingFile::abandon);
     }
@@ -174,7 +174,7 @@ impl Worker {
                 return;
             }
         };
-        // A prediction stays with its input.
+        // A prediction stays in the file of its input.
         if topic != Topic::Prediction && self.split_is_due(message.log_time_ns) {
             self.finish_file();
             if self.shared.condition().state == State::Recording {
@@ -185,7 +185,7 @@ impl Worker {
             self.repeat(message.log_time_ns);
         }
         if let Some(kind) = InForce::of(&message.payload) {
-            // Ends belong to their map.
+            // Window ends belong to their map.
             if kind == InForce::StabilityMap {
                 self.in_force.remove(&InForce::WindowEnds);
             }
@@ -207,7 +207,7 @@ impl Worker {
         })
     }
 
-    /// Begins a file that follows others with what is in force.
+    /// Repeats the messages in force at the beginning of a file that follows others.
     fn repeat(&mut self, log_time_ns: u64) {
         for Repeated { topic, publish_time_ns, cdr } in self.in_force.values().cloned().collect::<Vec<_>>() {
             if self.file.is_some() {
@@ -216,7 +216,7 @@ impl Worker {
         }
     }
 
-    /// Writes a message with a log time later than that of the one before.
+    /// Writes a message. Its log time is raised if necessary, so that log times increase strictly.
     fn append(&mut self, topic: Topic, log_time_ns: u64, publish_time_ns: u64, cdr: &[u8]) {
         let log_time_ns = match self.last_log_time_ns {
             Some(last) => log_time_ns.max(last.saturating_add(1)),
@@ -265,7 +265,7 @@ impl Worker {
         self.count_bytes();
     }
 
-    /// Puts what was flushed on the disk, and looks whether it can still be found there.
+    /// Syncs the flushed data to the disk and checks that the file is still at its place.
     fn sync(&mut self) {
         if !std::mem::take(&mut self.unsynced) {
             return;
@@ -287,10 +287,10 @@ impl Worker {
         }
     }
 
-    /// Begins the next file, in a new directory if there is none: attachments and metadata first, so that they survive whatever
-    /// happens later.
+    /// Begins the next file, in a new directory if there is none. Attachments and metadata are written first, so that
+    /// they survive a later failure.
     pub(super) fn open(&mut self) -> Result<(), RecorderError> {
-        // What came before the first file is lost: as if that had been a file.
+        // Messages before the first file are lost: number the files as if those had been one.
         if self.next_split == 0 && !self.in_force.is_empty() {
             self.next_split = 1;
         }
@@ -315,7 +315,7 @@ impl Worker {
             }
             Err(error) => {
                 if made {
-                    // There is nothing in it.
+                    // The directory is empty.
                     let _ = fs::remove_dir(&directory);
                 } else {
                     self.directory = Some((directory, base));
@@ -331,7 +331,7 @@ impl Worker {
         match self.write_head(&mut file) {
             Ok(()) => Ok(file),
             Err(error) => {
-                // There is nothing in it worth recovering.
+                // The file contains nothing worth recovering.
                 let _ = fs::remove_file(file.abandon());
                 Err(error)
             }
@@ -363,7 +363,7 @@ impl Worker {
         file.flush()
     }
 
-    /// Finishes the open file, wherever its directory was moved, and lists it in `metadata.yaml` there.
+    /// Finishes the open file, even if its directory was moved, and lists it in the `metadata.yaml` there.
     fn finish_file(&mut self) {
         let Some(file) = self.file.take() else { return };
         let at = file.whereabouts();
@@ -401,7 +401,7 @@ impl Worker {
         }
     }
 
-    /// The recording's directory was moved, with all its files: the next file begins another.
+    /// Leaves the recording's directory, which was moved with all its files; the next file is begun in a new one.
     fn leave(&mut self, to: &Path) {
         let Some((from, _)) = self.directory.take() else { return };
         for closed in &mut self.closed {
@@ -415,7 +415,8 @@ impl Worker {
         self.shared.condition().last_error = Some(what);
     }
 
-    /// The file is in no directory any more: what it held is lost, and so are others of the recording that went with it.
+    /// Counts the messages of a removed file as lost, with those of other files of the recording that were removed with
+    /// it.
     fn removed(&mut self, file: RecordingFile) {
         let (messages, path) = (file.summary().messages() - self.unflushed, file.abandon());
         let (there, gone): (Vec<_>, Vec<_>) = self.closed.drain(..).partition(|closed| closed.path.exists());
@@ -428,7 +429,7 @@ impl Worker {
         self.give_up(format!("{} was removed while it was recorded", path.display()));
     }
 
-    /// Gives the open file up, as it is, until another can be begun.
+    /// Abandons the open file as it is. A new one is begun as soon as possible.
     fn fail(&mut self, error: &WriteError) {
         if let Some(file) = self.file.take() {
             if file.whereabouts().is_ok_and(|at| at == Whereabouts::Removed) {
@@ -445,7 +446,7 @@ impl Worker {
         self.closed.push(Closed { path, messages, bytes, finished: false });
     }
 
-    /// Counts what was not flushed as lost, and says why nothing is recorded.
+    /// Counts unflushed messages as lost and sets the reason why recording has failed.
     fn give_up(&mut self, reason: String) {
         let unflushed = std::mem::take(&mut self.unflushed);
         self.shared.messages_written.fetch_sub(unflushed, Relaxed);
@@ -455,7 +456,7 @@ impl Worker {
         self.shared.failed(reason);
     }
 
-    /// Begins another file if there is space for one.
+    /// Begins a new file if there is enough free space.
     fn retry(&mut self) {
         let there = self.config.directory.ancestors().find(|path| path.is_dir());
         let there = there.unwrap_or(Path::new("."));
