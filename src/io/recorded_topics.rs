@@ -1,8 +1,9 @@
-//! Which topic of a recording is which of the node's: decided by the topic's name, for several topics can have one type.
+//! Decides which topics of a recording are read as which of the node's topics. The topic's name decides, because
+//! several topics may have the same type.
 //!
-//! In order: a topic the user chose, which its type assigns; the node's own name; that name in one namespace
-//! (`/cell2/squealcast/prediction`). A topic of the right type under any other name is not read, and the reason says how
-//! to choose it.
+//! In order of precedence: a topic chosen by the user, assigned by its type; the node's own name; that name in one
+//! namespace (`/cell2/squealcast/prediction`). A topic of the right type under any other name is not read; the reason
+//! explains how to choose it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -31,7 +32,7 @@ fn names_are(topics: &[String]) -> String {
     format!("{} {}", topics.join(", "), if topics.len() == 1 { "is" } else { "are" })
 }
 
-/// A wrong choice of topics.
+/// Why the user's choice of topics is invalid.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ChoiceError {
     #[error("holds no topic {topic} of a type squealcast reads; it holds {}", if .known.is_empty() { "none".to_owned() } else { .known.join(", ") })]
@@ -40,7 +41,7 @@ pub enum ChoiceError {
     Twice { topic: &'static str, first: String, second: String },
 }
 
-/// The topics of a recording that are read.
+/// The topics of a recording that are read, and those that are not.
 #[derive(Clone, Debug, Default)]
 pub struct RecordedTopics {
     names: BTreeMap<Topic, String>,
@@ -48,7 +49,8 @@ pub struct RecordedTopics {
 }
 
 impl RecordedTopics {
-    /// Decides for all `channels` of a recording. `chosen` topics are read in place of the node's own of their type.
+    /// Decides for all `channels` of a recording. Topics in `chosen` are read instead of the node's own topics of the
+    /// same types.
     ///
     /// # Errors
     /// [`ChoiceError`].
@@ -56,7 +58,7 @@ impl RecordedTopics {
         let mut decided = Self::default();
         let mut known = BTreeSet::new();
         for topic in Topic::ALL {
-            // Another of the node's topics by its name, which has the wrong type there, is no candidate.
+            // A topic that has the name of another of the node's topics, with the wrong type, is not a candidate.
             let candidate = |name: &str| Topic::ALL.into_iter().all(|own| own == topic || own.name() != name);
             let of_type: BTreeSet<&str> = channels
                 .iter()
@@ -83,14 +85,14 @@ impl RecordedTopics {
         Ok(decided)
     }
 
-    /// Which of the node's topics a channel is; `None` for another program's.
+    /// Which of the node's topics a channel is read as; `None` for other topics.
     ///
     /// # Errors
-    /// It is the node's by its name and cannot be read, or only by its type.
+    /// The channel has the name of one of the node's topics but cannot be read, or has its type only.
     pub fn read_as(&self, channel: &Channel) -> Result<Option<Topic>, Unread> {
         let topic = || channel.topic.clone();
         let Some((&read_as, _)) = self.names.iter().find(|(_, name)| **name == channel.topic) else {
-            // A name of the node's with another program's type.
+            // One of the node's names with a type of another program.
             return match Topic::ALL.into_iter().find(|own| own.name() == channel.topic) {
                 Some(own) if !self.names.contains_key(&own) => Err(Unread::Type {
                     topic: topic(),
@@ -115,12 +117,12 @@ impl RecordedTopics {
         }
     }
 
-    /// The recorded name of one of the node's topics; `None` where the recording does not hold it.
+    /// The recorded name of one of the node's topics; `None` if the recording does not contain it.
     pub fn name_of(&self, topic: Topic) -> Option<&str> {
         self.names.get(&topic).map(String::as_str)
     }
 
-    /// What is not read, and why.
+    /// The topics that are not read, and why.
     pub fn unread(&self) -> &[Unread] {
         &self.unread
     }
@@ -130,7 +132,7 @@ fn type_name(channel: &Channel) -> &str {
     channel.schema.as_ref().map_or("", |schema| &schema.name)
 }
 
-/// The one of the topics `of_type` that is `topic`; `None` where there is none.
+/// The topic among `of_type` that is read as `topic`; `None` if there is none.
 fn choose<'a>(
     topic: Topic,
     of_type: &BTreeSet<&'a str>,
@@ -154,7 +156,7 @@ fn choose<'a>(
     Ok(match (&in_namespace[..], of_type.is_empty()) {
         ([one], _) => Ok(Some(one)),
         ([], true) => Ok(None),
-        // Everybody's diagnostics have this type.
+        // Other programs publish diagnostics of this type too.
         ([], false) if !topic.is_own_type() => Ok(None),
         ([], false) => {
             let topics = of_type.iter().map(|&name| name.to_owned()).collect();
@@ -255,7 +257,7 @@ mod tests {
         };
         assert!(with_text("float64 friction_margin_error\n", "").contains("lacks `float64 friction_margin_error`"));
         assert!(with_text("bool reused\n", "bool reused\nbool extra\n").contains("has `bool extra`"));
-        // A message within the message.
+        // A message nested in the message.
         assert!(with_text("float64 pad_participation\n", "").contains("Mode lacks `float64 pad_participation`"));
         let json = Channel { message_encoding: "json".to_owned(), ..prediction() };
         assert!(read(json).expect("not cdr").contains("\"json\""));

@@ -1,4 +1,4 @@
-//! Reads recordings: finished, interrupted, cut or damaged, our own or another ROS 2 program's.
+//! Reads recordings: finished, interrupted, truncated or damaged; from this program or other ROS 2 programs.
 
 use std::{
     collections::VecDeque,
@@ -22,15 +22,15 @@ use super::{
 use crate::input_file;
 use crate::wire::schema::Topic;
 
-/// Messages read at a time, at most of chunks that unpack to the second number of bytes, and how many times ahead of their
-/// use.
+/// Messages are read ahead in batches: the largest number of messages in a batch, the unpacked bytes after which a
+/// batch ends, and the number of batches kept ahead.
 const BATCH: usize = 512;
 const BATCH_BYTES: u64 = 8 << 20;
 const BATCHES_AHEAD: usize = 2;
-/// What the attachments of a recording may take together, each counted once.
+/// Limit on all attachments of a recording together, each counted once, bytes.
 const MAX_ATTACHMENT_BYTES: usize = 2 << 30;
 
-/// First bytes of files and messages that others write.
+/// First bytes of files and messages in other formats.
 const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
 const ZSTD_MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
 const LZ4_MAGIC: [u8; 4] = [0x04, 0x22, 0x4d, 0x18];
@@ -56,10 +56,10 @@ pub enum RecordingError {
     Choice { path: PathBuf, source: ChoiceError },
 }
 
-/// How a recording is read.
+/// Options for reading a recording.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReadOptions {
-    /// Topics that are read in place of the node's own of their type; see [`RecordedTopics`].
+    /// Recorded topics to read instead of the node's own topics of the same types; see [`RecordedTopics`].
     pub topics: Vec<String>,
 }
 
@@ -71,23 +71,23 @@ pub struct Entry {
     pub sequence: u32,
     pub log_time_ns: u64,
     pub publish_time_ns: u64,
-    /// As recorded, encapsulation header included.
+    /// CDR bytes as recorded, including the encapsulation header.
     pub cdr: Bytes,
     pub message: Recorded,
 }
 
-/// What an [`Entry`] holds.
+/// The content of an [`Entry`].
 #[derive(Clone, Debug, PartialEq)]
 pub enum Recorded {
     /// One of the node's messages.
     Known(Payload),
-    /// One of the node's messages by its type, but it cannot be decoded, and why.
+    /// A message that has the type of one of the node's but cannot be decoded, and why.
     Unreadable(String),
     /// Anything else.
     Other,
 }
 
-/// Damage, and the file that has it.
+/// Damage, with the file it was found in.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{}: {damage}", .file.display())]
 pub struct FileDamage {
@@ -95,7 +95,7 @@ pub struct FileDamage {
     pub damage: Damage,
 }
 
-/// A recording: one file, or a directory of the files it was split into.
+/// A recording: a single file, or the files of a split recording in a directory.
 #[derive(Debug)]
 pub struct Recording {
     files: Vec<PathBuf>,
@@ -106,17 +106,17 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Opens a file or directory.
+    /// Opens a recording: a file or a directory.
     ///
     /// # Errors
     ///
-    /// A path that cannot be read, holds no recording, or is no MCAP file. Damage is no error: see [`Self::damage`]. Neither
-    /// is a topic that cannot be read: see [`Self::topics`].
+    /// The path cannot be read, contains no recording, or is not an MCAP file. Damage is not an error, see
+    /// [`Self::damage`]; nor is a topic that cannot be read, see [`Self::topics`].
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         Self::open_with(path, ReadOptions::default())
     }
 
-    /// Opens a file or directory with options.
+    /// Opens a recording with options.
     ///
     /// # Errors
     ///
@@ -130,7 +130,7 @@ impl Recording {
             let mut walker = open_walker(file, Depth::Structure)?;
             for item in walker.by_ref() {
                 match item {
-                    // Every file of a split recording carries them again.
+                    // Every file of a split recording repeats the attachments.
                     Item::Attachment(attachment) => {
                         let known = |other: &Attachment| {
                             (&other.name, &other.media_type, &other.data)
@@ -158,7 +158,7 @@ impl Recording {
                 }
             }
             recording.damage.extend(located(file, walker.damage()));
-            // Without a summary the channels are known once all chunks were read.
+            // Without a summary the channels are only known after reading all chunks.
             if !walker.damage().is_empty() || walker.channels().next().is_none() {
                 walker = open_walker(file, Depth::Messages)?;
                 walker.by_ref().for_each(drop);
@@ -180,43 +180,45 @@ impl Recording {
         &self.files
     }
 
-    /// Which of its topics are read as which of the node's, and what is not read.
+    /// Which recorded topics are read as which of the node's topics, and which are not read.
     pub fn topics(&self) -> &RecordedTopics {
         &self.topics
     }
 
-    /// The files within it, such as those of the rig; each once, in the order they were written.
+    /// The attachments, such as the rig files; each once, in recorded order.
     pub fn attachments(&self) -> &[Attachment] {
         &self.attachments
     }
 
-    /// Its metadata records, in order.
+    /// The metadata records, in recorded order.
     pub fn metadata(&self) -> &[Metadata] {
         &self.metadata
     }
 
-    /// A value of the metadata the recorder writes (see [`super::recorder::METADATA_NAME`]), of the first file.
+    /// A value of the recorder's metadata record (see [`super::recorder::METADATA_NAME`]) in the first file that has
+    /// one.
     pub fn session_metadata(&self, key: &str) -> Option<&str> {
         let record = self.metadata.iter().find(|record| record.name == super::recorder::METADATA_NAME)?;
         record.metadata.get(key).map(String::as_str)
     }
 
-    /// What opening found wrong: a file that was not finished, was cut, or has unreadable attachments. Damage inside
-    /// chunks is found by reading them: [`Messages::damage`].
+    /// Damage found on opening: an unfinished or truncated file, or unreadable attachments. Damage inside chunks is
+    /// found when messages are read: [`Messages::damage`].
     pub fn damage(&self) -> &[FileDamage] {
         &self.damage
     }
 
-    /// Whether opening found every file finished.
+    /// Whether opening found no damage.
     pub fn is_complete(&self) -> bool {
         self.damage.is_empty()
     }
 
-    /// All messages in the order they were written, which for our own recordings is ascending log time.
+    /// All messages in recorded order. In recordings of this program their log times ascend.
     pub fn messages(&self) -> Messages<'_> {
         let (batches, received) = bounded(BATCHES_AHEAD);
         let files = self.files.clone();
-        // Chunks are decompressed there while messages are decoded and used here. It ends when nobody receives.
+        // This thread decompresses chunks while the caller decodes and uses messages. It ends when the receiver is
+        // dropped.
         let reader = std::thread::spawn(move || read_ahead(&files, &batches));
         Messages {
             recording: self,
@@ -230,7 +232,7 @@ impl Recording {
     }
 }
 
-/// Messages that follow each other, and what was found wrong before, between and behind them.
+/// Consecutive messages, and the damage found before, between and after them.
 #[derive(Debug, Default)]
 struct Batch {
     raw: VecDeque<RawMessage>,
@@ -259,7 +261,7 @@ fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
                     Some(Item::Message(message)) => raw.push_back(message),
                     Some(Item::Attachment(_) | Item::Metadata(_)) => {}
                 }
-                // Messages hold the memory of their chunks.
+                // Messages keep the memory of their chunks alive.
                 if raw.len() == BATCH || walker.unpacked_bytes() - before >= BATCH_BYTES {
                     break false;
                 }
@@ -276,23 +278,23 @@ fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
     }
 }
 
-/// The messages of a [`Recording`], as far as they can be read.
+/// Iterator over the readable messages of a [`Recording`].
 #[derive(Debug)]
 pub struct Messages<'a> {
     recording: &'a Recording,
     reader: Option<JoinHandle<()>>,
     batches: Receiver<Batch>,
     raw: VecDeque<RawMessage>,
-    /// What was found of each channel: comparing its fields with ours for every message would take most of the time.
+    /// What each channel was found to be. Comparing its fields for every message would take most of the time.
     judged: Vec<(Arc<Channel>, Result<Option<Topic>, Unread>)>,
-    /// How many messages could not be decoded, and what was wrong with the first.
+    /// Number of messages that could not be decoded, and the error of the first.
     undecoded: Option<(u64, String)>,
     damage: Vec<FileDamage>,
 }
 
 impl Messages<'_> {
-    /// What was found wrong so far; complete once the iterator has ended. Messages are given out up to the damage, and
-    /// from behind it where a single chunk is damaged.
+    /// Damage found so far; complete once the iterator has ended. If a single chunk is damaged, the messages before and
+    /// after it are returned.
     pub fn damage(&self) -> &[FileDamage] {
         &self.damage
     }
@@ -313,7 +315,7 @@ impl Messages<'_> {
                     Recorded::Unreadable(reason)
                 }
             },
-            // Said once for the whole recording.
+            // Reported once for the whole recording.
             Err(unread) => Recorded::Unreadable(unread.to_string()),
         };
         Entry {
@@ -372,7 +374,7 @@ pub(super) fn open_walker(path: &Path, depth: Depth) -> Result<RecordWalker, Rec
     }
 }
 
-/// What a file is that is no MCAP file.
+/// The error for a file that is not MCAP, by what it appears to be.
 fn not_mcap(path: &Path) -> RecordingError {
     let mut head = Vec::new();
     let read = input_file::open(path, input_file::ANY_SIZE).and_then(|file| file.take(16).read_to_end(&mut head));
@@ -385,10 +387,10 @@ fn not_mcap(path: &Path) -> RecordingError {
     }
 }
 
-/// Whether a file is a recording, by its first bytes; else it may be a log.
+/// Whether a file is a recording, according to its first bytes; otherwise it may be a log.
 ///
 /// # Errors
-/// It cannot be read, or is a recording of another format, or only by its name one.
+/// The file cannot be read, is a recording in another format, or is one by its name only.
 pub fn is_recording(path: &Path) -> Result<bool, RecordingError> {
     let io_error = |source| RecordingError::Io { path: path.to_owned(), source };
     let mut head = Vec::new();
@@ -403,11 +405,11 @@ pub fn is_recording(path: &Path) -> Result<bool, RecordingError> {
     }
 }
 
-/// The recordings at a path: itself if it is a file or the directory of one recording's files; else those of the directories,
-/// or the single files, directly in it, by name.
+/// The recordings at a path. A file, or a directory with the files of one recording, is itself one recording. Otherwise
+/// these are the recordings in its subdirectories, or the single files directly in it, in order of name.
 ///
 /// # Errors
-/// A path that cannot be read or holds no recording.
+/// The path cannot be read or contains no recording.
 pub fn recordings_at(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let io_error = |source| RecordingError::Io { path: path.to_owned(), source };
     if !std::fs::metadata(path).map_err(io_error)?.is_dir() {
@@ -417,7 +419,7 @@ pub fn recordings_at(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     if !own.is_empty() {
         let mut bases: Vec<String> = own.iter().filter_map(|file| split_name(file)).map(|(base, _)| base).collect();
         bases.dedup();
-        // Files of several names, which nothing declares to be one recording.
+        // Files with different names and without `metadata.yaml` are separate recordings.
         let apart = bases.len() == own.len() && !path.join(bag::METADATA_FILE).exists();
         return Ok(if apart { own } else { vec![path.to_owned()] });
     }
@@ -432,7 +434,7 @@ pub fn recordings_at(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     if below.is_empty() { Err(no_files(path)) } else { Ok(below) }
 }
 
-/// Why a directory holds no recording.
+/// The error for a directory without a recording.
 pub(super) fn no_files(path: &Path) -> RecordingError {
     let entries = std::fs::read_dir(path).into_iter().flatten().filter_map(Result::ok).map(|entry| entry.path());
     let foreign = entries.filter(|file| file.is_file()).map(|file| not_mcap(&file));
@@ -441,7 +443,7 @@ pub(super) fn no_files(path: &Path) -> RecordingError {
     foreign.into_iter().find(known).unwrap_or(RecordingError::NoFiles { path: path.to_owned() })
 }
 
-/// The files of a recording in order: itself, or the MCAP files of a directory by their split number.
+/// The files of a recording: the file itself, or the MCAP files of a directory in order of split number.
 fn files_of(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     let io_error = |source| RecordingError::Io { path: path.to_owned(), source };
     if !std::fs::metadata(path).map_err(io_error)?.is_dir() {
@@ -451,7 +453,7 @@ fn files_of(path: &Path) -> Result<Vec<PathBuf>, RecordingError> {
     if files.is_empty() { Err(no_files(path)) } else { Ok(files) }
 }
 
-/// The name of a recording and the number of a file of it; `None` for other files.
+/// The name of the recording that a file belongs to, and its split number; `None` for other files.
 fn split_name(path: &Path) -> Option<(String, u64)> {
     let name = path.file_name()?.to_str()?;
     let stem = name.strip_suffix(".active").unwrap_or(name).strip_suffix(".mcap")?;
@@ -461,7 +463,7 @@ fn split_name(path: &Path) -> Option<(String, u64)> {
     })
 }
 
-/// The `*.mcap` and `*.mcap.active` files of a directory in the order of their split numbers, then of their names.
+/// The `*.mcap` and `*.mcap.active` files of a directory, ordered by split number, then by name.
 pub(super) fn mcap_files(directory: &Path) -> io::Result<Vec<PathBuf>> {
     let mut files = Vec::new();
     for entry in std::fs::read_dir(directory)? {

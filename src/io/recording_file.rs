@@ -1,4 +1,4 @@
-//! One MCAP file as it is written: under a temporary name and locked, in whole chunks, renamed when finished.
+//! Writes one MCAP file: under a temporary name and locked, in whole chunks, and renamed when finished.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -24,10 +24,10 @@ use super::{
 };
 use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
 
-/// A chunk is closed by the first message after this many bytes; with that message it stays below 768 KiB.
+/// A chunk is closed by the first message after this many bytes; including that message it stays below 768 KiB.
 const CHUNK_BYTES: u64 = 640 << 10;
 
-/// The key of a channel's metadata that carries its quality of service.
+/// Metadata key of a channel for its quality of service.
 const QOS_KEY: &str = "offered_qos_profiles";
 
 /// Why a file cannot be written.
@@ -49,7 +49,7 @@ impl WriteError {
     }
 }
 
-/// Where bytes go; replaced in tests by a disk that is full.
+/// The disk that is written to; tests replace it, for example by a full one.
 pub trait Disk: fmt::Debug + Send + Sync {
     /// Writes some of `bytes`.
     ///
@@ -58,7 +58,7 @@ pub trait Disk: fmt::Debug + Send + Sync {
     /// As [`Write::write`].
     fn write(&self, file: &File, bytes: &[u8]) -> io::Result<usize>;
 
-    /// Puts what was written on the disk.
+    /// Makes the written data survive a power failure.
     ///
     /// # Errors
     ///
@@ -67,15 +67,15 @@ pub trait Disk: fmt::Debug + Send + Sync {
         file.sync_data()
     }
 
-    /// How much may still be written below a directory.
+    /// Free space on the file system of a directory, bytes.
     ///
     /// # Errors
     ///
-    /// What asking the file system yields.
+    /// The file system cannot be queried.
     fn free_bytes(&self, directory: &Path) -> io::Result<u64>;
 }
 
-/// The file system.
+/// The file system of the machine.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct FileSystem;
 
@@ -90,7 +90,7 @@ impl Disk for FileSystem {
     }
 }
 
-/// A file on a [`Disk`] that counts what was written.
+/// A file on a [`Disk`] that counts the bytes written.
 #[derive(Debug)]
 struct CountedFile {
     file: File,
@@ -114,28 +114,29 @@ impl Write for CountedFile {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct ChannelId(u16);
 
-/// Whether the temporary name of a file being written still leads to it.
+/// Whether the temporary name still refers to the file being written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Whereabouts {
     InPlace,
-    /// Its directory was moved: there now.
+    /// Its directory was moved to this path.
     Moved(PathBuf),
-    /// It was removed: what was and will be written is lost.
+    /// The file was removed: everything written to it is lost.
     Removed,
 }
 
-/// How a file gets its name.
+/// How the file gets its final name.
 enum Naming {
-    /// It has its temporary name, which others look for; the directory it was made in.
+    /// It has its temporary name, under which others can find it, in this directory.
     Active(File),
-    /// It has no name that others know.
+    /// It has no visible name until it is finished.
     Whole(WholeFile),
 }
 
 /// A file being written.
 ///
-/// Chunks are gathered in memory and written whole: a killed process leaves whole chunks, not the open one of length
-/// `u64::MAX` that seeking writers leave. The file is locked (`flock`) while it is written, so that nobody recovers it.
+/// Chunks are collected in memory and written as a whole. A process that is killed therefore leaves complete chunks,
+/// and not an open one of length `u64::MAX` as seeking writers do. The file is locked (`flock`) while it is written, so
+/// that no other process recovers it.
 pub struct RecordingFile {
     writer: Writer<NoSeek<BufWriter<CountedFile>>>,
     file: File,
@@ -155,12 +156,12 @@ impl fmt::Debug for RecordingFile {
 }
 
 impl RecordingFile {
-    /// Begins a file that will be named `path` when it is finished, and `path` + `suffix` until then, so that what is there can be
-    /// read and recovered before it is finished.
+    /// Begins a file that is named `path` + `suffix` until it is finished and `path` afterwards. It can thus be read
+    /// and recovered before it is finished.
     ///
     /// # Errors
     ///
-    /// [`WriteError::Exists`] when either exists, and what writing yields.
+    /// [`WriteError::Exists`] if either name is taken; errors of writing.
     pub fn create(path: &Path, suffix: &str, disk: Arc<dyn Disk>) -> Result<Self, WriteError> {
         let temporary = with_suffix(path, suffix);
         for taken in [path, &temporary] {
@@ -168,7 +169,7 @@ impl RecordingFile {
                 return Err(WriteError::Exists { path: taken.to_owned() });
             }
         }
-        // Locked before it has the name others look for.
+        // Locked before it gets the name that others look for.
         let file = WholeFile::create(&temporary)?.name_unfinished()?;
         let folder = folder_of(path);
         let directory = File::open(folder).map_err(|source| WriteError::io(folder, source))?;
@@ -176,11 +177,11 @@ impl RecordingFile {
         begun.inspect_err(|_| drop(fs::remove_file(&temporary)))
     }
 
-    /// Begins a file on the file system that appears under its name, in the place of what has it, when it is finished.
+    /// Begins a file that appears as `path` when it is finished, replacing any file of that name.
     ///
     /// # Errors
     ///
-    /// What writing yields.
+    /// Errors of writing.
     pub(super) fn create_whole(path: &Path) -> Result<Self, WriteError> {
         let whole = WholeFile::create(path)?;
         let file = whole.as_file().try_clone().map_err(|source| WriteError::io(path, source))?;
@@ -211,11 +212,11 @@ impl RecordingFile {
         Ok(Self { writer, file, disk, bytes, temporary, path, naming, topics, summary })
     }
 
-    /// Whether what is written can still be found.
+    /// Whether the file is still at its place.
     ///
     /// # Errors
     ///
-    /// What asking the file system yields.
+    /// The file system cannot be queried.
     pub fn whereabouts(&self) -> io::Result<Whereabouts> {
         let own = self.file.metadata()?;
         let same = match fs::symlink_metadata(&self.temporary) {
@@ -226,12 +227,12 @@ impl RecordingFile {
         Ok(match (own.nlink(), same) {
             (0, None | Some(false)) => Whereabouts::Removed,
             (_, None) => Whereabouts::Moved(self.directory()),
-            // Numbers of files are not steady on every file system.
+            // Inode numbers are not stable on every file system.
             (_, Some(_)) => Whereabouts::InPlace,
         })
     }
 
-    /// The directory it is in, wherever that was moved.
+    /// The current path of its directory, even if that was moved.
     fn directory(&self) -> PathBuf {
         let moved = match &self.naming {
             Naming::Active(directory) => {
@@ -242,26 +243,26 @@ impl RecordingFile {
         moved.unwrap_or_else(|| folder_of(&self.path).to_owned())
     }
 
-    /// The name it has while it is written.
+    /// The temporary name.
     pub fn temporary(&self) -> &Path {
         &self.temporary
     }
 
-    /// What it holds so far.
+    /// Summary of the content so far.
     pub fn summary(&self) -> &FileSummary {
         &self.summary
     }
 
-    /// Bytes written so far; the open chunk is not among them.
+    /// Bytes written so far, without the open chunk.
     pub fn bytes_written(&self) -> u64 {
         self.bytes.load(std::sync::atomic::Ordering::Relaxed)
     }
 
-    /// Adds a file within the file. Call before the first message, so that a file cut short still has it.
+    /// Adds an attachment. To be called before the first message, so that a truncated file still contains it.
     ///
     /// # Errors
     ///
-    /// What writing yields.
+    /// Errors of writing.
     pub fn attach(&mut self, attachment: &Attachment) -> Result<(), WriteError> {
         let Attachment { log_time_ns, create_time_ns, name, media_type, data } = attachment;
         let attachment = mcap::Attachment {
@@ -278,16 +279,16 @@ impl RecordingFile {
     ///
     /// # Errors
     ///
-    /// What writing yields.
+    /// Errors of writing.
     pub fn write_metadata(&mut self, metadata: &Metadata) -> Result<(), WriteError> {
         self.writer.write_metadata(metadata).map_err(|source| located(&self.temporary, source))
     }
 
-    /// The channel of one of the node's own topics; made at its first use.
+    /// The channel of one of the node's own topics, created on first use.
     ///
     /// # Errors
     ///
-    /// What writing yields.
+    /// Errors of writing.
     pub fn own_channel(&mut self, topic: Topic) -> Result<ChannelId, WriteError> {
         let metadata = BTreeMap::from([(QOS_KEY.to_owned(), topic.qos_profiles())]);
         let schema = Some((topic.type_name(), SCHEMA_ENCODING, topic.schema()));
@@ -295,11 +296,11 @@ impl RecordingFile {
         self.channel(topic.name(), schema, MESSAGE_ENCODING, &metadata)
     }
 
-    /// A channel; the same for the same arguments. `schema` is name, encoding and text.
+    /// The channel with these properties, created on first use. `schema` is name, encoding and text.
     ///
     /// # Errors
     ///
-    /// What writing yields, and more than 65535 channels or schemas.
+    /// Errors of writing; more than 65535 channels or schemas.
     pub fn channel(
         &mut self,
         topic: &str,
@@ -326,7 +327,7 @@ impl RecordingFile {
     ///
     /// # Errors
     ///
-    /// What writing yields.
+    /// Errors of writing.
     pub fn write(
         &mut self,
         channel: ChannelId,
@@ -344,34 +345,35 @@ impl RecordingFile {
         Ok(())
     }
 
-    /// Closes the chunk and hands everything to the operating system: a killed process does not lose it.
+    /// Closes the chunk and passes all data to the operating system, so that they survive the end of the process.
     ///
     /// # Errors
     ///
-    /// What writing yields.
+    /// Errors of writing.
     pub fn flush(&mut self) -> Result<(), WriteError> {
         self.writer.flush().map_err(|source| located(&self.temporary, source))
     }
 
-    /// Puts what was flushed on the disk: a power failure does not lose it.
+    /// Syncs the flushed data to the disk, so that they survive a power failure.
     ///
     /// # Errors
     ///
-    /// What `fdatasync` yields.
+    /// Errors of `fdatasync`.
     pub fn sync(&self) -> Result<(), WriteError> {
         self.disk.sync(&self.file).map_err(|source| WriteError::io(&self.temporary, source))
     }
 
-    /// Writes the summary, puts everything on the disk and gives the file its name, wherever its directory was moved.
+    /// Writes the summary, syncs all data to the disk and gives the file its final name, even if its directory was
+    /// moved.
     ///
     /// # Errors
     ///
-    /// What writing yields; then the file keeps its temporary name, and is not locked any more.
+    /// Errors of writing. The file then keeps its temporary name and is unlocked.
     pub fn finish(self) -> Result<FileSummary, WriteError> {
         self.finish_after(|| Ok(()))
     }
 
-    /// As [`finish`](Self::finish), with something done when everything but the name is there.
+    /// As [`finish`](Self::finish), calling `before_naming` when the file is complete except for its name.
     ///
     /// # Errors
     ///
@@ -381,7 +383,7 @@ impl RecordingFile {
         before_naming: impl FnOnce() -> Result<(), WriteError>,
     ) -> Result<FileSummary, WriteError> {
         let finished = self.writer.finish().map(drop);
-        // Not `Drop`: it would try again and keep silent.
+        // Not dropped: `Drop` would try again and ignore errors.
         let mut buffered = self.writer.into_inner().into_inner();
         if let Err(source) = finished.and_then(|()| Ok(buffered.flush()?)) {
             drop(buffered.into_parts());
@@ -401,7 +403,7 @@ impl RecordingFile {
         Ok(self.summary)
     }
 
-    /// Lets go of the file as it is on the disk, writing nothing more. It keeps its temporary name if it has one.
+    /// Closes the file as it is on the disk, without writing more. It keeps its temporary name if it has one.
     pub fn abandon(self) -> PathBuf {
         drop(self.writer.into_inner().into_inner().into_parts());
         self.temporary
@@ -415,7 +417,7 @@ fn located(path: &Path, source: McapError) -> WriteError {
     }
 }
 
-/// `path` with more behind its name.
+/// `path` with `suffix` appended to its name.
 pub(super) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name: OsString = path.as_os_str().to_owned();
     name.push(suffix);
