@@ -1,6 +1,6 @@
-//! The messages of `msgs/`, as they go over ROS 2 and into recordings, and their shared-memory forms.
+//! The messages of `msgs/`: their form on ROS 2 and in recordings, and their shared-memory forms.
 //!
-//! The structs below are the `.msg` files field for field; serde gives their CDR form.
+//! The structs below match the `.msg` files field by field; serde gives their CDR encoding.
 
 pub mod schema;
 pub mod shm;
@@ -11,32 +11,32 @@ use crate::physics;
 
 /// Topic names in recordings, and on ROS 2 for a node in the namespace `/`.
 pub mod topic {
-    /// Conditions in.
+    /// Operating points, received by the node.
     pub const OPERATING_POINT: &str = "/rig/operating_point";
-    /// Measured vibration in; it shapes no prediction.
+    /// Measured vibration, received by the node; it does not affect predictions.
     pub const VIBRATION: &str = "/rig/vibration";
-    /// Predictions out.
+    /// Predictions, published by the node.
     pub const PREDICTION: &str = "/squealcast/prediction";
-    /// What the node predicts for; transient local.
+    /// Description of the node's rig; transient local.
     pub const RIG: &str = "/squealcast/rig";
-    /// What else shaped the predictions; transient local is not needed, it is for recordings.
+    /// Session events. They are meant for recordings and need not be transient local.
     pub const SESSION_EVENT: &str = "/squealcast/session_event";
-    /// How predictions change with conditions and contact.
+    /// Sensitivities of predictions to conditions and contact.
     pub const SENSITIVITY: &str = "/squealcast/sensitivity";
-    /// How the node does.
+    /// Diagnostics of the node.
     pub const DIAGNOSTICS: &str = "/diagnostics";
 
-    /// How many messages a publisher keeps; one on [`RIG`].
+    /// History depth of a publisher, in messages; 1 on [`RIG`].
     pub const DEPTH: i32 = 64;
 
-    /// The name by which a node asks ROS 2 for a topic: relative to the node's namespace. Only diagnostics are one topic for the
-    /// nodes of all namespaces, by the convention of ROS.
+    /// The topic name relative to the node's namespace, as the node requests it from ROS 2. Diagnostics alone stay
+    /// absolute: by ROS convention they are one topic for all namespaces.
     pub fn relative(topic: &str) -> &str {
         if topic == DIAGNOSTICS { topic } else { topic.trim_start_matches('/') }
     }
 }
 
-/// At most this many modes in a [`Prediction`].
+/// Largest number of modes in a [`Prediction`].
 pub const MAX_MODES: usize = 64;
 
 /// `builtin_interfaces/Time`.
@@ -231,7 +231,7 @@ pub struct KeyValue {
 }
 
 impl Derivatives {
-    /// Nothing is known.
+    /// All derivatives unknown (NaN).
     pub const UNKNOWN: Self = Self {
         by_friction_coefficient: f64::NAN,
         by_normal_load_n: f64::NAN,
@@ -265,7 +265,7 @@ impl Derivatives {
 }
 
 impl Time {
-    /// From nanoseconds since the epoch; beyond what the message can hold it saturates.
+    /// From nanoseconds since the epoch; saturates outside the range of the message.
     pub fn from_ns(ns: i64) -> Self {
         let sec = ns.div_euclid(1_000_000_000);
         Self { sec: sec.clamp(i32::MIN.into(), i32::MAX.into()) as i32, nanosec: ns.rem_euclid(1_000_000_000) as u32 }
@@ -278,7 +278,7 @@ impl Time {
 }
 
 impl OperatingPoint {
-    /// What the physics needs of it.
+    /// The operating point as the physics uses it.
     pub fn point(&self) -> physics::OperatingPoint {
         physics::OperatingPoint {
             normal_load_n: self.normal_load_n,
@@ -288,14 +288,14 @@ impl OperatingPoint {
     }
 }
 
-/// The CDR bytes of a message: encapsulation header `00 01 00 00`, then little-endian CDR.
+/// The CDR encoding of a message: encapsulation header `00 01 00 00`, then little-endian CDR.
 pub fn to_cdr<M: Serialize>(message: &M) -> Result<Vec<u8>, cdr_encoding::Error> {
     let mut bytes = vec![];
     write_cdr(message, &mut bytes)?;
     Ok(bytes)
 }
 
-/// Writes what [`to_cdr`] makes into `bytes`, in place of what they held and in the memory they have.
+/// Replaces the content of `bytes` by the encoding of [`to_cdr`], reusing their memory.
 ///
 /// # Errors
 /// As [`to_cdr`].
@@ -305,7 +305,7 @@ pub fn write_cdr<M: Serialize>(message: &M, bytes: &mut Vec<u8>) -> Result<(), c
     cdr_encoding::to_writer::<_, byteorder::LittleEndian, _>(bytes, message)
 }
 
-/// A message from its CDR bytes, encapsulation header included; either byte order.
+/// Decodes a message from CDR bytes with encapsulation header, in either byte order.
 pub fn from_cdr<M: for<'de> Deserialize<'de>>(bytes: &[u8]) -> Result<M, cdr_encoding::Error> {
     match bytes {
         [0, 0, _, _, payload @ ..] => Ok(cdr_encoding::from_bytes::<M, byteorder::BigEndian>(payload)?.0),

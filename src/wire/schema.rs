@@ -1,11 +1,11 @@
-//! The `ros2msg` schemas of the messages, as recordings carry them.
+//! The `ros2msg` schemas of the messages, as stored in recordings.
 //!
-//! A schema is the text of the `.msg` file, then for every message it refers to a line of 80 `=`, a line
-//! `MSG: package/Type` and that message's text, as `ros2 bag record` writes it.
+//! As `ros2 bag record` writes it, a schema is the text of the `.msg` file followed by every message it refers to. Each
+//! of those is preceded by a line of 80 `=` and a line `MSG: package/Type`.
 
 use super::topic;
 
-/// A topic the node records, with what a recording must say of it.
+/// A topic that the node records, with its type, schema and quality of service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Topic {
     /// [`topic::OPERATING_POINT`]
@@ -44,7 +44,7 @@ const KEY_VALUE: (&str, &str) = ("diagnostic_msgs/KeyValue", "string key\nstring
 const DIAGNOSTIC_ARRAY: &str = "std_msgs/Header header\nDiagnosticStatus[] status\n";
 
 impl Topic {
-    /// All of them, in the order recordings list them.
+    /// All topics, in the order in which recordings list them.
     pub const ALL: [Self; 7] = [
         Self::OperatingPoint,
         Self::Prediction,
@@ -68,7 +68,7 @@ impl Topic {
         }
     }
 
-    /// The ROS 2 name of its messages, `package/msg/Type`.
+    /// The ROS 2 name of the message type, `package/msg/Type`.
     pub fn type_name(self) -> &'static str {
         match self {
             Self::OperatingPoint => "squealcast_msgs/msg/OperatingPoint",
@@ -81,17 +81,17 @@ impl Topic {
         }
     }
 
-    /// Whether the type of its messages is the project's own, and nobody else's.
+    /// Whether the message type belongs to this project.
     pub fn is_own_type(self) -> bool {
         self.type_name().starts_with("squealcast_msgs/")
     }
 
-    /// Whether a late subscriber gets the last message (`TRANSIENT_LOCAL`).
+    /// Whether late subscribers get the last message (`TRANSIENT_LOCAL`).
     pub fn is_latched(self) -> bool {
         self == Self::RigInfo
     }
 
-    /// The text of its messages' own `.msg` file.
+    /// The text of the `.msg` file of the topic's type.
     pub fn definition(self) -> &'static str {
         match self {
             Self::OperatingPoint => include_str!("../../msgs/msg/OperatingPoint.msg"),
@@ -104,7 +104,7 @@ impl Topic {
         }
     }
 
-    /// The messages it refers to: `package/Type` and text.
+    /// The messages it refers to, as `package/Type` and text.
     fn dependencies(self) -> &'static [(&'static str, &'static str)] {
         match self {
             Self::OperatingPoint | Self::SessionEvent | Self::Vibration => &[HEADER, TIME],
@@ -115,7 +115,7 @@ impl Topic {
         }
     }
 
-    /// The whole schema, encoding [`SCHEMA_ENCODING`].
+    /// The complete schema, in the encoding [`SCHEMA_ENCODING`].
     pub fn schema(self) -> String {
         let mut text = self.definition().to_owned();
         for (name, definition) in self.dependencies() {
@@ -124,8 +124,8 @@ impl Topic {
         text
     }
 
-    /// The quality of service it is offered with, in the form channels and `metadata.yaml` carry. Integers, since
-    /// older `rosbags` and `ros2 bag` read no names; the two places must agree.
+    /// The quality of service of the publisher, in the form that channels and `metadata.yaml` require; the two must
+    /// agree. Values are integers, since older versions of `rosbags` and `ros2 bag` do not read names.
     pub fn qos_profiles(self) -> String {
         let durability = if self.is_latched() { 1 } else { 2 };
         let depth = if self.is_latched() { 1 } else { topic::DEPTH };
@@ -138,14 +138,14 @@ impl Topic {
     }
 }
 
-/// The encoding of [`Topic::schema`], as MCAP names it.
+/// MCAP name of the encoding of [`Topic::schema`].
 pub const SCHEMA_ENCODING: &str = "ros2msg";
-/// The encoding of the messages, as MCAP names it.
+/// MCAP name of the encoding of messages.
 pub const MESSAGE_ENCODING: &str = "cdr";
 
-/// How the fields of `theirs` differ from those of `ours`, two `ros2msg` schemas; `None` where they are the same.
-/// Comments, blank lines, spacing and constants are no fields. Of the messages they refer to, the project's own count:
-/// those of ROS 2 do not change, but are written in several ways.
+/// How the fields of `theirs` differ from those of `ours`, both `ros2msg` schemas; `None` if they are the same.
+/// Comments, blank lines, spacing and constants are ignored. Of the nested messages only the project's own are
+/// compared: those of ROS 2 do not change but are written in several ways.
 pub fn field_difference(ours: &str, theirs: &str) -> Option<String> {
     let theirs = messages(theirs);
     for (name, fields) in messages(ours) {
@@ -171,7 +171,7 @@ pub fn field_difference(ours: &str, theirs: &str) -> Option<String> {
     None
 }
 
-/// The messages of a schema, each with its name, which the first has not, and its fields.
+/// The messages of a schema with their names and fields; the first one has no name.
 fn messages(text: &str) -> Vec<(&str, Vec<String>)> {
     let mut found: Vec<(&str, Vec<String>)> = vec![("", vec![])];
     for line in text.lines().map(|line| line.split('#').next().unwrap_or_default().trim()) {
@@ -179,12 +179,12 @@ fn messages(text: &str) -> Vec<(&str, Vec<String>)> {
             found.push((name.trim(), vec![]));
             continue;
         }
-        // A constant, or the line between two messages.
+        // A constant, or the separator between two messages.
         if line.contains('=') {
             continue;
         }
         let mut words: Vec<&str> = line.split_whitespace().collect();
-        // `std_msgs/Header`, `std_msgs/msg/Header` and `Header` are one type.
+        // `std_msgs/Header`, `std_msgs/msg/Header` and `Header` are the same type.
         let Some(kind) = words.first_mut() else { continue };
         *kind = kind.rsplit('/').next().unwrap_or(kind);
         if let Some((_, fields)) = found.last_mut() {

@@ -1,7 +1,7 @@
-//! Fixed-size forms of the messages for shared memory, field for field; `frame_id` is not carried.
+//! Fixed-size shared-memory forms of the messages, field by field, without `frame_id`.
 //!
-//! Any peer, in any language, may map these bytes, so the layout is part of the interface: native byte order, no
-//! implicit padding, and a type name that ends in a version. A change of layout is a new version.
+//! Peers in any language may map these bytes, so the layout is part of the interface: native byte order, no implicit
+//! padding, and a type name that ends in a version. Every change of the layout increases the version.
 //!
 //! | `squealcast/OperatingPoint/1` | offset | type |
 //! |---|---|---|
@@ -66,7 +66,8 @@
 //! | `pairs` (zero-filled) | 5728 | pair sensitivity × 32 |
 //! | *size 12384, alignment 8* | | |
 //!
-//! Derivatives are by friction coefficient, normal load, disc speed, contact stiffness and contact damping, in this order.
+//! Derivatives are with respect to friction coefficient, normal load, disc speed, contact stiffness and contact
+//! damping, in this order.
 //!
 //! | mode sensitivity | offset | type |
 //! |---|---|---|
@@ -96,13 +97,13 @@ use super::{
     Time, Vibration, level, sensitivity_law,
 };
 
-/// At most this many pairs of a sensitivity are carried: as many as there can be of its modes.
+/// Largest number of pairs in a sensitivity: the most that its modes can form.
 pub const MAX_PAIRS: usize = MAX_MODES / 2;
 
-/// At most this many bytes of [`Prediction::reason`] are carried.
+/// Bytes of [`Prediction::reason`] that are carried; longer reasons are truncated.
 pub const REASON_BYTES: usize = 128;
 
-/// A message that does not fit its shared-memory form, or bytes that are no message.
+/// A message that does not fit its shared-memory form, or bytes that are not a message.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum FormError {
     #[error("stamp_ns {0} is beyond what a message stamp can hold (seconds as i32)")]
@@ -127,27 +128,26 @@ pub enum FormError {
 
 /// A shared-memory form of a message.
 pub trait Form: ZeroCopySend + Copy + std::fmt::Debug + Send + 'static {
-    /// The message it is a form of.
+    /// The message type of the form.
     type Message: Clone + Send + 'static;
-    /// The service that carries it; its event service has the same name.
+    /// The service that carries the form; its event service has the same name.
     const SERVICE: &'static str;
-    /// Samples that may wait for a reader before the oldest are lost to it: at least a tenth of a second of the
-    /// highest rate.
+    /// Samples that may wait for a reader before it loses the oldest: at least a tenth of a second at the highest rate.
     const WAITING_SAMPLES: usize;
 
-    /// The form of a message.
+    /// Converts a message to its form.
     ///
     /// # Errors
-    /// What does not fit; a long reason is cut, not refused.
+    /// The message does not fit. A long reason is truncated, which is not an error.
     fn from_message(message: &Self::Message) -> Result<Self, FormError>;
 
-    /// The message of a form.
+    /// Converts a form to its message.
     ///
     /// # Errors
-    /// Whatever in it is not a value of the message.
+    /// A field does not hold a valid value of the message.
     fn to_message(&self) -> Result<Self::Message, FormError>;
 
-    /// The sequence number that readers look for gaps in; always the same where a message has none.
+    /// The sequence number by which readers detect gaps; constant if the message has none.
     fn seq(&self) -> u64;
 }
 
@@ -214,7 +214,7 @@ pub struct PredictionForm {
 impl Form for OperatingPointForm {
     type Message = OperatingPoint;
     const SERVICE: &'static str = "rig/operating_point";
-    // A rig that was held up sends what it measured meanwhile all at once.
+    // A rig that was held up sends all measurements of that time at once.
     const WAITING_SAMPLES: usize = 4096;
 
     fn from_message(message: &OperatingPoint) -> Result<Self, FormError> {
@@ -511,7 +511,8 @@ impl Form for SensitivityForm {
     }
 }
 
-/// A header with this stamp. One that the message cannot hold is refused: it would come back as another time.
+/// A header with this stamp. A stamp beyond the range of the message is refused, since it would come back as another
+/// time.
 fn header(stamp_ns: i64) -> Result<Header, FormError> {
     let stamp = Time::from_ns(stamp_ns);
     if stamp.as_ns() != stamp_ns {
@@ -520,7 +521,7 @@ fn header(stamp_ns: i64) -> Result<Header, FormError> {
     Ok(Header { stamp, frame_id: String::new() })
 }
 
-/// The longest start of `text` that has at most `limit` bytes and ends between characters.
+/// The longest prefix of `text` with at most `limit` bytes that ends at a character boundary.
 fn cut_at_char(text: &str, limit: usize) -> &str {
     let end = (0..=limit.min(text.len())).rev().find(|&end| text.is_char_boundary(end)).unwrap_or(0);
     text.get(..end).unwrap_or_default()
@@ -553,7 +554,8 @@ mod tests {
         }
     }
 
-    /// Peers in other languages map these bytes: sizes and offsets are those of the module's tables.
+    /// Peers in other languages map these bytes: sizes and offsets must be those of the tables in the module
+    /// documentation.
     #[test]
     fn layout_is_the_documented_one() {
         assert_eq!((size_of::<OperatingPointForm>(), align_of::<OperatingPointForm>()), (40, 8));
@@ -695,7 +697,7 @@ mod tests {
 
     #[test]
     fn a_long_reason_is_cut_between_characters() {
-        // 127 bytes, then a character of two: it does not fit into 128.
+        // 127 bytes, then a character of two bytes that does not fit into 128.
         let reason = format!("{}ä tail", "x".repeat(127));
         let form = PredictionForm::from_message(&prediction(0, &reason)).expect("fits");
         assert_eq!(form.reason_len, 127);
