@@ -1,9 +1,9 @@
-//! Files that people hand over: opened with a ceiling on their size, so that no file, whatever it claims, takes the memory
-//! or the time of the machine.
+//! Opens files from users with a size limit, so that no file can exhaust the memory or time of the machine, whatever it
+//! claims to contain.
 //!
-//! Every reader of files opens them here. What is no regular file (a directory, a named pipe, a device such as `/dev/zero`)
-//! and what is larger than its ceiling is refused before anything is read. What a file *claims* to hold is checked against
-//! what is there before memory is allocated for it; the readers state how much memory they take at most:
+//! Every reader of files opens them here. Anything that is not a regular file (a directory, a named pipe, a device such
+//! as `/dev/zero`) or exceeds its limit is refused before it is read. Sizes that a file *claims* are checked against
+//! the bytes present before memory is allocated for them. The readers use at most this much memory:
 //!
 //! | file | ceiling | memory of its reader, at most |
 //! |---|---|---|
@@ -16,7 +16,7 @@
 //! | tribometer log | [`LOG`] | about 12 times the file; lines of 64 KiB |
 //! | target frequencies | [`TARGETS`] | about 10 times the file |
 //! | chart | [`CHART`] | 3 times the file |
-//! | recording (MCAP) | none: read piece by piece | 256 MiB beside an attachment, see [`crate::io::record_walker`] |
+//! | recording (MCAP) | none: read in pieces | 256 MiB and an attachment, see [`crate::io::record_walker`] |
 
 use std::fs::{File, FileType, OpenOptions};
 use std::io::{self, Read};
@@ -27,20 +27,20 @@ use std::path::Path;
 pub const TOML: u64 = 1 << 20;
 /// ROS parameter files.
 pub const PARAMETERS: u64 = 1 << 20;
-/// What a rig file refers to; an attachment of a recording, which may be one.
+/// Files that a rig file refers to, and attachments of recordings, which may be such files.
 pub const RIG_PART: u64 = 512 << 20;
-/// What a full model refers to: it is read line by line.
+/// Files that a full model refers to; they are read line by line.
 pub const FULL_MODEL_PART: u64 = 16 << 30;
 /// Logs of a tribometer.
 pub const LOG: u64 = 512 << 20;
-/// Natural frequencies that a rig is fitted to.
+/// Natural frequencies to which a rig is fitted.
 pub const TARGETS: u64 = 1 << 20;
 /// Charts on disk.
 pub const CHART: u64 = 1 << 30;
-/// For files that are read piece by piece.
+/// For files that are read in pieces.
 pub const ANY_SIZE: u64 = u64::MAX;
 
-/// Why a file is not read. It comes as the inner error of an [`io::Error`]: the caller names the file.
+/// Why a file is refused. It is the inner error of an [`io::Error`]; the caller names the file.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     #[error("is {0}, expected a regular file")]
@@ -55,10 +55,11 @@ impl From<Refused> for io::Error {
     }
 }
 
-/// Opens a regular file of at most `limit` bytes. Never waits: a named pipe nobody writes to is refused like any other.
+/// Opens a regular file of at most `limit` bytes. Never blocks: a named pipe without a writer is refused like any
+/// other.
 ///
 /// # Errors
-/// What opening yields; [`Refused`].
+/// Errors of opening; [`Refused`].
 pub fn open(path: &Path, limit: u64) -> io::Result<File> {
     let flags = rustix::fs::OFlags::NONBLOCK | rustix::fs::OFlags::NOCTTY;
     let file = OpenOptions::new().read(true).custom_flags(flags.bits() as i32).open(path)?;
@@ -70,10 +71,10 @@ pub fn open(path: &Path, limit: u64) -> io::Result<File> {
     if bytes > limit { Err(Refused::TooLong { bytes, limit }.into()) } else { Ok(file) }
 }
 
-/// The bytes of a regular file of at most `limit` bytes, also of one that grows while it is read.
+/// Reads a regular file of at most `limit` bytes, even if it grows meanwhile.
 ///
 /// # Errors
-/// What opening and reading yields; [`Refused`].
+/// Errors of opening and reading; [`Refused`].
 pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let file = open(path, limit)?;
     let mut bytes = Vec::with_capacity(file.metadata()?.len().min(limit) as usize);
@@ -82,10 +83,10 @@ pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     if length > limit { Err(Refused::TooLong { bytes: length, limit }.into()) } else { Ok(bytes) }
 }
 
-/// The same as text.
+/// As [`read`], as text.
 ///
 /// # Errors
-/// Those of [`read`], and bytes that are not UTF-8.
+/// As [`read`], and bytes that are not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     String::from_utf8(read(path, limit)?)
         .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error.utf8_error()))
@@ -118,7 +119,7 @@ mod tests {
         std::fs::write(&path, b"12345").unwrap();
         assert_eq!(read(&path, 5).unwrap(), b"12345");
         assert_eq!(refusal(&path, 4), "is 5 bytes long, expected at most 4");
-        // A hole of 8 TiB takes no disk, and must take no memory.
+        // A sparse file of 8 TiB takes no disk space and must take no memory.
         let hole = folder.path().join("hole");
         std::fs::File::create(&hole).unwrap().set_len(8 << 40).unwrap();
         assert_eq!(refusal(&hole, RIG_PART), "is 8796093022208 bytes long, expected at most 536870912");
@@ -128,7 +129,7 @@ mod tests {
         rustix::fs::mkfifoat(rustix::fs::CWD, &pipe, rustix::fs::Mode::RWXU).unwrap();
         assert_eq!(refusal(&pipe, 4), "is a named pipe, expected a regular file");
         assert_eq!(read(&folder.path().join("none"), 4).unwrap_err().kind(), io::ErrorKind::NotFound);
-        // The size of a file of /proc is 0, whatever it holds.
+        // Files of /proc have size 0, whatever they contain.
         assert_eq!(refusal(Path::new("/proc/self/environ"), 0), "is 1 bytes long, expected at most 0");
     }
 }

@@ -1,6 +1,6 @@
 //! Predicts friction-induced instability of a pad-on-disc tribometer from its operating conditions.
 
-/// A line on standard error, as [`notes::line`] writes it.
+/// Writes a line to standard error through [`notes::line`].
 macro_rules! note {
     ($($text:tt)*) => { $crate::notes::line(format_args!($($text)*)) };
 }

@@ -1,4 +1,5 @@
-//! Lines on standard error. A live table covers the terminal: lines wait until it is gone, so that none is written across it.
+//! Lines on standard error. While a live table covers the terminal, lines are kept back, so that none is written across
+//! it.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -7,7 +8,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::terminal::{self, printable};
 
-/// Lines that may wait; of more the oldest are dropped, and their number is written.
+/// Number of lines kept back; beyond it the oldest are dropped, and their number is written.
 const MOST_LINES: usize = 200;
 
 static WAITING: Mutex<Option<Waiting>> = Mutex::new(None);
@@ -37,7 +38,7 @@ fn waiting() -> MutexGuard<'static, Option<Waiting>> {
     WAITING.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Writes a line, or keeps it while a [`Hold`] lives.
+/// Writes a line, or keeps it back while a [`Hold`] exists.
 pub fn line(text: fmt::Arguments<'_>) {
     match waiting().as_mut() {
         Some(waiting) => waiting.push(printable(&text.to_string()).into_owned()),
@@ -45,11 +46,11 @@ pub fn line(text: fmt::Arguments<'_>) {
     }
 }
 
-/// Lines wait as long as this lives; then they are written.
+/// Keeps lines back while it exists, and writes them when it is dropped.
 pub struct Hold(());
 
 impl Hold {
-    /// Lets lines wait; `None` where standard error is no terminal, so that nothing can be covered.
+    /// Begins to keep lines back; `None` if standard error is not a terminal, where nothing can be covered.
     pub fn begin() -> Option<Self> {
         std::io::stderr().is_terminal().then(Self::always)
     }
@@ -59,7 +60,7 @@ impl Hold {
         Self(())
     }
 
-    /// The latest line that waits.
+    /// The latest line that is kept back.
     pub fn latest() -> Option<String> {
         waiting().as_ref()?.lines.back().cloned()
     }
