@@ -1,6 +1,6 @@
 //! A full model on a parametric basis to a rig file: pad and disc on shared coordinates, or a system of small matrices.
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use faer::Mat;
 use sha2::{Digest, Sha256};
 
@@ -117,8 +117,20 @@ fn system_rig(
         for (index, term) in terms.into_iter().enumerate().filter(|(_, term)| term.matrix.norm_max() != 0.0) {
             let mut keys = toml::Table::new();
             keys.insert("matrix".to_owned(), write(&format!("{key}-{index}"), &term.matrix)?);
-            if let Law::Custom(law) = &term.law {
-                keys.insert("scale".to_owned(), law.text.as_str().into());
+            match &term.law {
+                Law::Constant => {}
+                Law::Custom(law) => {
+                    keys.insert("scale".to_owned(), law.text.as_str().into());
+                }
+                law @ (Law::ContactStiffness
+                | Law::FrictionStiffness
+                | Law::ContactDamping
+                | Law::FrictionDamping
+                | Law::FrictionSlope
+                | Law::LateralFriction
+                | Law::FrictionChebyshev { .. }) => {
+                    bail!("{key} term {index} follows {law:?}; expected a constant or an expression in a [system]");
+                }
             }
             list.push(toml::Value::from(keys));
         }
@@ -131,7 +143,7 @@ fn system_rig(
     table.extend(common.clone());
     table.insert("system".to_owned(), system.into());
     let mut text: String = remarks.iter().map(|line| format!("# {line}\n")).collect();
-    text += &toml::to_string(&table).context("the rig cannot be put into words of TOML")?;
+    text += &toml::to_string(&table).context("the rig cannot be written as TOML")?;
     files.insert(0, RigFile { name: file.to_owned(), bytes: text.into_bytes() });
     Ok(files)
 }

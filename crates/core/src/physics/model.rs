@@ -474,34 +474,55 @@ impl Model {
         Ok(())
     }
 
-    /// Derivative of the value of `law` at `p`.
+    /// Derivative of the value of `law` at `p` with respect to `parameter`: per unit of friction coefficient, N or rad/s, or
+    /// relative to the contact's stiffness or damping.
     pub(super) fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
         use Parameter::{ContactDamping, ContactStiffness, Friction, Load, Speed};
-        if let Law::Custom(custom) = law {
-            return self.custom_derivative(custom, law, p, parameter);
-        }
         let value = self.coefficient(law, p);
-        // What multiplies the friction coefficient, which may be zero itself.
+        // The factor of the friction coefficient, which may be zero itself.
         let per_friction = || self.coefficient(law, &p.with_friction(1.0));
-        match (parameter, law) {
-            (Friction, Law::FrictionStiffness | Law::FrictionDamping | Law::LateralFriction) => per_friction(),
-            (Load, Law::ContactStiffness | Law::FrictionStiffness) if value != 0.0 => {
-                value * self.contact_law.exponent / p.normal_load_n
-            }
-            (Load, Law::FrictionSlope | Law::LateralFriction) if value != 0.0 => value / p.normal_load_n,
-            (Speed, Law::LateralFriction) if value != 0.0 => -value / p.disc_speed_rad_s,
-            (Friction, Law::FrictionChebyshev { degree, range }) if value.is_finite() => {
-                let sign = p.disc_speed_rad_s.signum();
-                let sliding = p.contact_state() == ContactState::Sliding;
-                if sliding {
+        // Where nothing slides the load or the speed may be zero as well.
+        let ratio = |value: f64, by: f64| if value == 0.0 { 0.0 } else { value / by };
+        match law {
+            Law::Constant => 0.0,
+            Law::ContactStiffness => match parameter {
+                Load => ratio(value * self.contact_law.exponent, p.normal_load_n),
+                ContactStiffness => value,
+                Friction | Speed | ContactDamping => 0.0,
+            },
+            Law::FrictionStiffness => match parameter {
+                Friction => per_friction(),
+                Load => ratio(value * self.contact_law.exponent, p.normal_load_n),
+                ContactStiffness => value,
+                Speed | ContactDamping => 0.0,
+            },
+            Law::ContactDamping => match parameter {
+                ContactDamping => value,
+                Friction | Load | Speed | ContactStiffness => 0.0,
+            },
+            Law::FrictionDamping => match parameter {
+                Friction => per_friction(),
+                ContactDamping => value,
+                Load | Speed | ContactStiffness => 0.0,
+            },
+            Law::FrictionSlope => match parameter {
+                Load => ratio(value, p.normal_load_n),
+                Friction | Speed | ContactStiffness | ContactDamping => 0.0,
+            },
+            Law::LateralFriction => match parameter {
+                Friction => per_friction(),
+                Load => ratio(value, p.normal_load_n),
+                Speed => ratio(-value, p.disc_speed_rad_s),
+                ContactStiffness | ContactDamping => 0.0,
+            },
+            Law::FrictionChebyshev { degree, range } => match parameter {
+                Friction if value.is_finite() && p.contact_state() == ContactState::Sliding => {
+                    let sign = p.disc_speed_rad_s.signum();
                     sign * chebyshev::beside_zero_slope(sign * p.friction_coefficient, *degree, *range)
-                } else {
-                    0.0
                 }
-            }
-            (ContactStiffness, Law::ContactStiffness | Law::FrictionStiffness) => value,
-            (ContactDamping, Law::ContactDamping | Law::FrictionDamping) => value,
-            _ => 0.0,
+                Friction | Load | Speed | ContactStiffness | ContactDamping => 0.0,
+            },
+            Law::Custom(custom) => self.custom_derivative(custom, law, p, parameter),
         }
     }
 
