@@ -1,4 +1,4 @@
-//! `[basis]`: rigs whose coordinates are those of a basis of the whole full model, and what the basis was found good for.
+//! Rigs on a basis of the whole full model (`[basis]`): their model, and a summary of what `[basis]` records.
 
 use faer::Mat;
 
@@ -10,14 +10,19 @@ use super::settings::{Settings, within};
 use super::{Built, Contact, RigError, SideShapes};
 use crate::physics::{ContactPairs, Law, Model, Term};
 
-/// Builds the model of pad and disc that move with the same `k` coordinates:
+/// Builds the model of pad and disc that share `k` coordinates, the vectors `V` of a basis of the whole full model:
 ///
 /// ```text
 /// K(μ) = diag(Ω²) + κ(N) (B_n + s μ B_t)ᵀ K_c B_n,   B = d·V_p - T d·V_d
 /// ```
 ///
+/// `κ` is the load law of the contact stiffness, `s` the sign of the disc speed and `d` a direction of each pair.
+/// `values` are stiffness (N/m) and damping (N s/m) of the pairs.
+///
 /// # Errors
-/// [`RigError`]: sides with other coordinates, or with what belongs to modes of their own.
+/// [`RigError::Kind`] if there is no disc, if the natural frequencies of the two sides differ, if coordinates are
+/// deselected, or if a side brings damping ratios or residual flexibility, which belong to modes of a single part;
+/// [`RigError::Model`].
 pub(super) fn build(
     file: &str,
     pad: &Part,
@@ -78,7 +83,7 @@ pub(super) fn build(
     let model = Model::new(k, vec![free], vec![], law, None)
         .and_then(|model| model.with_contact(&contact))
         .and_then(|model| match &pad.data.mass_share {
-            // In the order in which the coordinates are taken: ascending in frequency.
+            // The model takes its coordinates in ascending frequency.
             Some(share) => model.with_pad_mass(Mat::from_fn(k, k, |i, j| share[(pad.selected[i], pad.selected[j])])),
             None => Ok(model),
         })
@@ -106,7 +111,7 @@ pub(super) fn build(
 }
 
 impl RawBasis {
-    /// What it says, a line or two for people.
+    /// The contents of `[basis]` in one or two lines of text.
     ///
     /// # Errors
     /// [`RigError::NotFinite`], [`RigError::Range`].

@@ -1,20 +1,20 @@
-//! Rigs that come with the program: ordinary rig files, read by the ordinary parser.
+//! Rigs embedded in the program: ordinary rig files, read by the ordinary parser.
 
 use super::RigFile;
 
-/// A rig that comes with the program.
+/// An embedded rig.
 #[derive(Clone, Copy, Debug)]
 pub struct Embedded {
     pub name: &'static str,
-    /// What it is, in a line.
+    /// A description in one line.
     pub about: &'static str,
-    /// The rig file.
+    /// The text of the rig file.
     text: &'static str,
-    /// What it refers to, by the names it uses.
+    /// Name and content of each file the rig file refers to.
     attached: &'static [(&'static str, &'static [u8])],
 }
 
-/// A rig file of `launch/rigs`, and what stands beside it.
+/// Embeds a rig file of `launch/rigs` and the files it refers to.
 macro_rules! embedded {
     ($name:literal, $about:literal $(, $attached:literal)*) => {
         Embedded {
@@ -26,7 +26,7 @@ macro_rules! embedded {
     };
 }
 
-/// Every embedded rig; the first is what `run` and `demo` take where nothing else is asked for.
+/// All embedded rigs. The first is the default of `run` and `demo`.
 pub const EMBEDDED: [Embedded; 8] = [
     embedded!(
         "tribometer",
@@ -55,12 +55,12 @@ impl Embedded {
         EMBEDDED.into_iter().find(|embedded| embedded.name == name)
     }
 
-    /// Their names, for messages.
+    /// The names of all embedded rigs, separated by commas, for messages.
     pub fn names() -> String {
         EMBEDDED.map(|embedded| embedded.name).join(", ")
     }
 
-    /// The rig file first, then what it refers to.
+    /// The rig file, then the files it refers to.
     pub fn files(&self) -> Vec<RigFile> {
         let file = |name: &str, bytes: &[u8]| RigFile { name: name.to_owned(), bytes: bytes.to_vec() };
         let rig_file = file(&format!("{}.toml", self.name), self.text.as_bytes());

@@ -1,10 +1,9 @@
-//! Why a rig could not be loaded: which file, which field, which value, and what was expected instead.
+//! Why a rig could not be loaded: the file, the field, its value and what was expected.
 
 use crate::physics::ModelError;
 use crate::reduction::ReductionError;
 
-/// Everything that can be wrong with a rig file or with what it refers to. Rows, columns, nodes and modes are counted
-/// from 0, lines from 1.
+/// An error in a rig file or in a file it refers to. Rows, columns, nodes and modes are counted from 0, lines from 1.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RigError {
     #[error("{value}: neither a readable rig file ({reason}) nor one of the embedded rigs, expected {limit}")]

@@ -1,4 +1,4 @@
-//! Kind 1: substructures written out in the rig file, contact pairs as rows over their degrees of freedom.
+//! Kind 1: substructures given as matrices in the rig file, contact pairs given as rows over their degrees of freedom.
 
 use faer::Mat;
 
@@ -14,7 +14,7 @@ pub(super) struct Side {
     pub damping_ratio: Vec<f64>,
 }
 
-/// Builds the model of a rig of kind 1: `n = i + j` coordinates, the pad's modes first.
+/// Builds the model of a rig of kind 1 in `n = i + j` modal coordinates: `i` of the pad, then `j` of the disc.
 ///
 /// # Errors
 /// [`RigError`].
@@ -31,8 +31,8 @@ pub(super) fn build(
     assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), pairs, settings, None)
 }
 
-/// `K = diag(ω²)`, `C = diag(2 ζ ω)` of both sides and the contact between them, through what the modes left out do
-/// where that is known.
+/// Builds the model of both sides: `K = diag(ω²)` and `C = diag(2 ζ ω)`, joined by the contact pairs. If `residual` is
+/// given, the contact acts in series with the residual flexibility of the truncated modes.
 pub(super) fn assemble(
     file: &str,
     kind: &str,
@@ -100,14 +100,15 @@ pub(super) fn assemble(
     Ok(Built { model, contact, contents, shapes, band_max_hz: settings.band_max_hz })
 }
 
-/// The lowest and the highest natural frequency of a part without contact: what a wrong unit shows in.
+/// The lowest and the highest natural frequency of a part without contact, as a line of text. A wrong unit shows in
+/// them.
 pub(super) fn free_frequencies(name: &str, omega_rad_s: &[f64]) -> Option<String> {
     let hz = omega_rad_s.iter().map(|omega| omega / std::f64::consts::TAU);
     let (low, high) = hz.fold((f64::INFINITY, 0.0f64), |(low, high), hz| (low.min(hz), high.max(hz)));
     (low <= high).then(|| format!("{name:<10} natural frequencies {low:.1} to {high:.1} Hz without contact"))
 }
 
-/// Modes of one inline side.
+/// Computes the modes of one inline substructure.
 fn substructure(file: &str, side: &str, raw: &RawSubstructure) -> Result<Side, RigError> {
     let matrix = |key: &str, rows: &Option<Vec<Vec<f64>>>| match rows {
         Some(rows) => dense(file, &format!("{side}.{key}"), rows),
@@ -128,7 +129,7 @@ fn substructure(file: &str, side: &str, raw: &RawSubstructure) -> Result<Side, R
     Ok(Side { modes, damping_ratio })
 }
 
-/// A square matrix from its rows.
+/// A square matrix from its rows; `field` names it in errors.
 fn dense(file: &str, field: &str, rows: &[Vec<f64>]) -> Result<Mat<f64>, RigError> {
     let n = rows.len();
     let shape = |field: String, value: String, limit: String| {
@@ -152,7 +153,7 @@ fn dense(file: &str, field: &str, rows: &[Vec<f64>]) -> Result<Mat<f64>, RigErro
     Ok(Mat::from_fn(n, n, |i, j| rows[i][j]))
 }
 
-/// Rows of relative displacement, `[pad_row Φ_p, -disc_row Φ_d]`, of every `[[contact]]`.
+/// The contact pairs of all `[[contact]]` tables, with rows `[pad_row Φ_p, -disc_row Φ_d]` of relative displacement.
 fn contact_pairs(
     file: &str,
     contacts: &[RawContact],
@@ -183,7 +184,7 @@ fn contact_pairs(
     Ok(ContactPairs { normal, sliding, lateral, stiffness_n_per_m, damping_n_s_per_m, radius_m })
 }
 
-/// `sign · row Φ` of one side; nothing for a rigid side.
+/// `sign · row Φ` of one side. Empty for a rigid side, zero for an optional row that is not given.
 fn modal_row(
     file: &str,
     field: &str,

@@ -1,27 +1,29 @@
-//! Interpolation between the nodes of the disc's contact surface: the rows of `T`.
+//! Interpolation of displacements between the nodes of the disc's contact surface: the rows of `T`.
 //!
-//! Nodes and contact point are seen along the patch's normal, and the point gets the linear weights of the Delaunay
-//! triangle it lies in: a partition of unity, exact for displacements linear in position (rigid motions, uniform
-//! strain), continuous over the surface. The triangle is found point by point as the optimum of a linear programme,
+//! Nodes and contact point are projected along the patch's normal. The point gets the linear (barycentric) weights of
+//! the Delaunay triangle that contains it. These weights are a partition of unity, exact for displacements linear in
+//! position (rigid motions, uniform strain) and continuous over the surface. The triangle of each point is the optimal
+//! basis of a linear programme,
 //!
 //! ```text
 //! minimise Σ w_j |x_j - x|²   subject to   Σ w_j x_j = x,   Σ w_j = 1,   w ≥ 0
 //! ```
 //!
-//! whose basis is the triangle below the point on the lifted paraboloid, so no triangulation has to be built or stored.
-//! A point beside the surface, by no more than the search distance, is extrapolated linearly from the nearest triangle.
+//! because it is the facet below the point on the lifted paraboloid. No triangulation has to be built or stored. A
+//! point outside the surface, by no more than the search distance, is extrapolated linearly from the nearest triangle.
 //!
 //! Source: Edelsbrunner, Seidel, "Voronoi diagrams and arrangements", Discrete Comput. Geom. 1 (1986) 25-44, for the
 //! lifting; Bland, Math. Oper. Res. 2 (1977) 103-107, for the pivot rule that cannot cycle.
 
 use super::patch::{cross, dot};
 
-/// Nodes that carry a point may be this many typical node distances away from it: beyond, it hangs over a hole.
+/// Largest distance from a point to the nodes of its triangle, in units of the node spacing or of the search distance,
+/// whichever is larger. A point farther from its nodes lies over a hole in the surface.
 const FARTHEST: f64 = 50.0;
-/// Extrapolation weights beyond this come from a triangle too thin to extrapolate with.
+/// Largest absolute weight of an extrapolation. Larger weights come from a triangle too thin to extrapolate from.
 const LARGEST_WEIGHT: f64 = 4.0;
 
-/// Two directions across a normal.
+/// A unit normal and two orthogonal unit vectors that span the plane perpendicular to it.
 #[derive(Clone, Copy, Debug)]
 pub struct Plane {
     normal: [f64; 3],
@@ -30,9 +32,9 @@ pub struct Plane {
 }
 
 impl Plane {
-    /// The plane across a unit normal.
+    /// The plane perpendicular to a unit normal.
     pub fn across(normal: [f64; 3]) -> Self {
-        // The coordinate axis most across the normal.
+        // The coordinate axis least parallel to the normal.
         let mut axis = [0.0; 3];
         let smallest = (0..3).min_by(|&a, &b| normal[a].abs().total_cmp(&normal[b].abs())).unwrap_or(0);
         axis[smallest] = 1.0;
@@ -46,7 +48,7 @@ impl Plane {
     }
 }
 
-/// The nodes of a surface, seen along its normal.
+/// The nodes of a surface, projected along its normal.
 #[derive(Clone, Debug)]
 pub struct Interpolation {
     plane: Plane,
@@ -57,8 +59,8 @@ pub struct Interpolation {
 }
 
 impl Interpolation {
-    /// `nodes` in m; `search_m` is how far beside or above the surface a point may lie, by default the typical
-    /// distance between neighbouring nodes.
+    /// `nodes` are positions in m. `search_m` is the largest distance of a point from the surface, in the plane and
+    /// along the normal; the default is the median distance between neighbouring nodes.
     pub fn new(nodes: &[[f64; 3]], plane: Plane, search_m: Option<f64>) -> Self {
         let seen: Vec<[f64; 2]> = nodes.iter().map(|&node| plane.seen(node)).collect();
         let height = nodes.iter().map(|&node| dot(node, plane.normal)).collect();
@@ -74,10 +76,13 @@ impl Interpolation {
         Self { plane, seen, height, spacing, search: search_m.unwrap_or(spacing) }
     }
 
-    /// Nodes and weights for a point, or what was found and what is expected.
+    /// The nodes that carry a point, each with its weight; weights sum to 1.
+    ///
+    /// # Errors
+    /// What was found and what was expected, if the point is too far from the surface.
     pub fn weights(&self, point: [f64; 3]) -> Result<Vec<(usize, f64)>, (String, String)> {
         let (at, above) = (self.plane.seen(point), dot(point, self.plane.normal));
-        // Nodes near the point's own height: a disc has two faces.
+        // Only nodes near the height of the point: a disc has two faces.
         let mut near: Vec<(usize, [f64; 2])> = (0..self.seen.len())
             .filter(|&node| (self.height[node] - above).abs() <= self.search)
             .map(|node| (node, [self.seen[node][0] - at[0], self.seen[node][1] - at[1]]))
@@ -106,7 +111,7 @@ impl Interpolation {
         Ok(local.into_iter().map(|(node, weight)| (near[node].0, weight)).collect())
     }
 
-    /// Weights for the origin where it lies outside the convex hull of `points`.
+    /// Weights for the origin if it lies outside the convex hull of `points`: extrapolation from the nearest triangle.
     fn beside(&self, points: &[[f64; 2]]) -> Result<Vec<(usize, f64)>, (String, String)> {
         let clamped = nearest_on_hull(points);
         if length(clamped) > self.search {
@@ -115,7 +120,7 @@ impl Interpolation {
                 format!("at most {:.6e} m (search_distance_m)", self.search),
             ));
         }
-        // A little further in, so that the triangle behind the edge is the one found.
+        // The nearest hull point, moved slightly inwards so that the triangle at that edge contains it.
         let count = points.len() as f64;
         let centre = points.iter().fold([0.0; 2], |sum, p| [sum[0] + p[0] / count, sum[1] + p[1] / count]);
         let around = |origin: [f64; 2]| -> Option<Vec<(usize, f64)>> {
@@ -130,7 +135,7 @@ impl Interpolation {
                 return Ok(vec![(a, weights[0]), (b, weights[1]), (c, weights[2])]);
             }
         }
-        // Nodes on a line, or a sliver: the nearest place on the surface itself.
+        // The nodes are collinear or the triangle is a sliver: take the nearest point of the surface instead.
         let weights = around(clamped).or_else(|| around(inner));
         weights.ok_or_else(|| ("no nodes surround it".to_owned(), "nodes that span a surface".to_owned()))
     }
@@ -144,21 +149,22 @@ fn distance(a: [f64; 2], b: [f64; 2]) -> f64 {
     length([a[0] - b[0], a[1] - b[1]])
 }
 
-/// Twice the area of the triangle, positive where it turns left.
+/// Twice the signed area of a triangle, positive if its corners run anticlockwise.
 fn area(a: [f64; 2], b: [f64; 2], c: [f64; 2]) -> f64 {
     (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 }
 
-/// Weights that make `at` out of the corners of a triangle.
+/// Barycentric coordinates of `at` in a triangle.
 fn barycentric([a, b, c]: [[f64; 2]; 3], at: [f64; 2]) -> [f64; 3] {
     let whole = area(a, b, c);
     let (first, second) = (area(at, b, c) / whole, area(at, c, a) / whole);
     [first, second, 1.0 - first - second]
 }
 
-/// Weights of the Delaunay triangle around the origin; `None` where no triangle holds it.
+/// Weights of the Delaunay triangle that contains the origin; `None` if no triangle does.
 ///
-/// Costs are compared in two ranks: first the weight on three far points added to start from, then `Σ w |x|²`.
+/// Simplex method with a lexicographic cost: first the weight on three artificial far points, which are the initial
+/// basis, then `Σ w |x|²`.
 fn inside(points: &[[f64; 2]]) -> Option<Vec<(usize, f64)>> {
     let reach = points.iter().map(|p| length(*p)).fold(0.0, f64::max);
     if reach == 0.0 {
@@ -174,7 +180,8 @@ fn inside(points: &[[f64; 2]]) -> Option<Vec<(usize, f64)>> {
     for _ in 0..100 * (count + 3) {
         let corners = basis.map(at);
         let weights = barycentric(corners, [0.0; 2]);
-        // Bland's rule: the first node, nearest first, that lowers the cost, and the first corner that then vanishes.
+        // Bland's rule: the first node (nearest first) that lowers the cost enters; of the corners that reach zero
+        // first, the one with the lowest index leaves.
         let entering = (0..count).filter(|j| !basis.contains(j)).find_map(|j| {
             let beta = barycentric(corners, at(j));
             let gain = |rank: usize| cost(j)[rank] - (0..3).map(|i| beta[i] * cost(basis[i])[rank]).sum::<f64>();
@@ -199,7 +206,7 @@ fn inside(points: &[[f64; 2]]) -> Option<Vec<(usize, f64)>> {
     Some(kept.into_iter().map(|(node, weight)| (node, weight / sum)).collect())
 }
 
-/// The place on the convex hull of `points` nearest to the origin, which lies outside (Andrew's monotone chain).
+/// The point of the convex hull of `points` nearest to the origin, which lies outside it (Andrew's monotone chain).
 fn nearest_on_hull(points: &[[f64; 2]]) -> [f64; 2] {
     let mut sorted = points.to_vec();
     sorted.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
@@ -267,7 +274,7 @@ mod tests {
 
     #[test]
     fn the_triangle_is_delaunays() {
-        // No node may lie inside the circle around the triangle found: the definition, by brute force.
+        // By definition, no node lies inside the circumcircle of a Delaunay triangle. Checked for every node.
         let mut state = 7_u64;
         let mut random = || {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);

@@ -1,13 +1,13 @@
-//! Text files line by line: one line in memory at a time.
+//! Reads text files line by line, with one line in memory at a time.
 
 use std::io::BufRead;
 
 use super::RigError;
 
-/// Longest line that is read, in bytes.
+/// Longest accepted line, bytes.
 const LONGEST: usize = 1 << 20;
 
-/// The lines of a text file, counted.
+/// The numbered lines of a text file.
 pub struct Lines<'a, R> {
     file: &'a str,
     input: R,
@@ -17,15 +17,15 @@ pub struct Lines<'a, R> {
 }
 
 impl<'a, R: BufRead> Lines<'a, R> {
-    /// `file` is how errors name it.
+    /// `file` names the file in errors.
     pub fn new(file: &'a str, input: R) -> Self {
         Self { file, input, bytes: vec![], text: String::new(), number: 0 }
     }
 
-    /// The next line with its number, from 1, trimmed; `None` after the last one.
+    /// The next line, trimmed, with its number (from 1); `None` after the last one.
     ///
     /// # Errors
-    /// [`RigError::Line`] for what cannot be read.
+    /// [`RigError::Line`] if the line cannot be read or is too long.
     pub fn advance(&mut self) -> Result<Option<(usize, &str)>, RigError> {
         self.bytes.clear();
         let mut limited = std::io::Read::take(&mut self.input, LONGEST as u64);
@@ -51,18 +51,18 @@ impl<'a, R: BufRead> Lines<'a, R> {
         Ok(Some((self.number, self.text.trim())))
     }
 
-    /// An error about the line read last.
+    /// An error about the last line read.
     pub fn refuse(&self, field: &str, value: String, limit: &str) -> RigError {
         refuse(self.file, self.number, field, value, limit)
     }
 }
 
-/// An error about a line.
+/// An error about line `line`.
 pub fn refuse(file: &str, line: usize, field: &str, value: String, limit: &str) -> RigError {
     RigError::Line { file: file.to_owned(), line: line.max(1), field: field.to_owned(), value, limit: limit.to_owned() }
 }
 
-/// `is` and the text, short enough for an error message.
+/// `` is `text` ``, with the text truncated after 40 characters, for error messages.
 pub fn told(text: &str) -> String {
     match text.char_indices().nth(40) {
         Some((end, _)) => format!("is `{}...`", &text[..end]),

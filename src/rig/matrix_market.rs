@@ -10,20 +10,20 @@ use super::RigError;
 use super::lines::{Lines, refuse, told};
 use crate::reduction::SparseMatrix;
 
-/// A matrix as its file lists it, mirrored where the header says so.
+/// The entries of a matrix file, including those mirrored at the diagonal if its header declares a symmetry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Listed {
     pub rows: usize,
     pub columns: usize,
-    /// `(row, column, value)` counted from 0; entries listed twice add up.
+    /// `(row, column, value)`, counted from 0. Entries at the same position add up.
     pub entries: Vec<(usize, usize, f64)>,
 }
 
 impl Listed {
-    /// The matrix in compressed columns.
+    /// Converts to compressed sparse columns.
     ///
     /// # Errors
-    /// [`RigError::Shape`] where memory does not suffice.
+    /// [`RigError::Shape`] if there is not enough memory.
     pub fn to_sparse(&self, file: &str) -> Result<SparseMatrix, RigError> {
         let triplets: Vec<_> =
             self.entries.iter().map(|&(row, column, value)| Triplet::new(row, column, value)).collect();
@@ -43,17 +43,18 @@ enum Symmetry {
     Skew,
 }
 
-/// What a file says of the matrix as a whole.
+/// Dimensions and symmetry of a matrix, from the header of its file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Size {
     pub rows: usize,
     pub columns: usize,
-    /// Which sign the entries mirrored at the diagonal have, where they are not listed: `+1` or `-1`.
+    /// Sign of the mirrored entries, which the file does not list: `+1` if symmetric, `-1` if skew-symmetric, `None` if
+    /// general.
     pub mirrored: Option<i8>,
 }
 
-/// Reads a Matrix Market file; `file` is how errors name it. Memory grows with the entries that are there, never with
-/// what the header claims.
+/// Reads a Matrix Market file; `file` names it in errors. Memory is proportional to the entries that are listed, not to
+/// the sizes the header claims.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -73,8 +74,9 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<Listed, RigError> {
     Ok(Listed { rows, columns, entries })
 }
 
-/// Reads a Matrix Market file line by line: `each` hears row and column, counted from 0, and value of every entry that
-/// is listed, in its order; those of symmetric and skew-symmetric matrices lie on or below the diagonal.
+/// Reads a Matrix Market file line by line and calls `each` with row, column (from 0) and value of every listed entry,
+/// in the order of the file. Entries of symmetric matrices lie on or below the diagonal, of skew-symmetric ones below
+/// it.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -130,7 +132,7 @@ pub fn read_entries(
             ([Some(word), None, ..], false) => {
                 let position = (array_row, array_column);
                 array_row += 1;
-                // Columns of a skew-symmetric array get empty towards the last one.
+                // The last column of a skew-symmetric array lists no rows.
                 if array_row >= rows {
                     array_column += 1;
                     array_row = first_row(array_column, symmetry);
@@ -170,14 +172,15 @@ pub fn read_entries(
     Ok(Size { rows, columns, mirrored })
 }
 
-/// Neither empty nor a comment.
+/// Whether a line is neither empty nor a comment.
 fn is_content(line: &str) -> bool {
     !line.is_empty() && !line.starts_with('%')
 }
 
 type HeaderError = (&'static str, String, &'static str);
 
-/// `%%MatrixMarket matrix <format> <field> <symmetry>`: coordinate? integer? symmetry.
+/// Parses `%%MatrixMarket matrix <format> <field> <symmetry>`. Returns whether the format is coordinate, whether the
+/// field is integer, and the symmetry.
 fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
     let words: Vec<String> = header.split_whitespace().take(6).map(str::to_ascii_lowercase).collect();
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
@@ -223,7 +226,7 @@ fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
     Ok((coordinate, integer, symmetry))
 }
 
-/// How many values an array lists.
+/// Number of values that an array file lists.
 fn count_of_array(rows: usize, columns: usize, symmetry: Symmetry) -> u128 {
     let (rows, columns) = (rows as u128, columns as u128);
     match symmetry {
@@ -233,7 +236,7 @@ fn count_of_array(rows: usize, columns: usize, symmetry: Symmetry) -> u128 {
     }
 }
 
-/// The first row an array lists in a column.
+/// The first row that an array file lists in a column.
 fn first_row(column: usize, symmetry: Symmetry) -> usize {
     match symmetry {
         Symmetry::General => 0,

@@ -1,9 +1,13 @@
 //! Rig files: raw form, validation, embedded rigs.
 //!
-//! A rig file is TOML (`raw`), says which of three kinds it is by the tables it has, and is built into a [`Rig`]:
-//! `inline` substructures, `modal` substructures of a finite-element program (`npz` or `uff`, touching in a `patch`), or a
-//! `system` of matrices (`matrix_market`, times a `scale`). What it refers to is read by name through `source`, so
-//! that a recording's attachments serve as well as a directory.
+//! A rig file is TOML (`raw`). Its tables determine which of three kinds it is, and it is built into a [`Rig`]:
+//!
+//! - `inline`: substructures given as matrices;
+//! - `modal`: modes of substructures from a finite-element program (`npz` or `uff`), joined by contact pairs (`patch`);
+//! - `system`: a sum of matrices (`matrix_market`), each times a `scale`.
+//!
+//! Files it refers to are read by name through `source`, so a rig can be read from a directory or from the attachments
+//! of a recording.
 
 mod basis;
 mod embedded;
@@ -39,90 +43,90 @@ pub use settings::Settings;
 
 use source::Source;
 
-/// Everything the program knows about a rig, ready to predict with.
+/// A rig: its model and its settings, checked and complete.
 #[derive(Clone, Debug)]
 pub struct Rig {
-    /// The rig's own name.
+    /// Name of the rig.
     pub name: String,
-    /// Its equation of motion, mass-normalised.
+    /// Equation of motion, mass-normalised.
     pub model: Model,
-    /// What touches; none for a system of matrices.
+    /// Contact pairs; `None` for a system of matrices.
     pub contact: Option<Contact>,
-    /// `[reference]`: the operating point used where none is given.
+    /// `[reference]`: the default operating point.
     pub reference: OperatingPoint,
-    /// `[band] max_hz`: modes above are neither listed nor judged. At most the cut-off of a rig with residual flexibility.
+    /// `[band] max_hz`: modes above are neither listed nor judged. With residual flexibility, at most the cut-off.
     pub band_max_hz: Option<f64>,
     /// `[search] mu_max`: windows of instability are sought in `[0, mu_max]`.
     pub mu_max: f64,
-    /// `[search] instability_threshold`: a root is unstable when `σ` exceeds this times `|λ|`.
+    /// `[search] instability_threshold`: a root is unstable if `σ` exceeds this times `|λ|`.
     pub instability_threshold: f64,
-    /// `[limits]`: what the node accepts as input.
+    /// `[limits]`: the inputs that the node accepts.
     pub limits: Limits,
     /// `[warning]`: when the node warns.
     pub warning: Warning,
-    /// `[chart]`: conditions for which predictions are prepared.
+    /// `[chart]`: the box of conditions that the chart covers.
     pub chart: ChartRange,
-    /// Where the rig file was read; `None` for a rig from memory.
+    /// Path of the rig file; `None` for a rig read from memory.
     pub path: Option<std::path::PathBuf>,
-    /// SHA-256 of the rig file and everything it refers to, hexadecimal.
+    /// SHA-256 of the rig file and all files it refers to, hexadecimal.
     pub content_hash: String,
-    /// The rig file (first) and everything it refers to, by the names it refers to them with.
+    /// The rig file, then the files it refers to, under the names it uses.
     pub files: Vec<RigFile>,
-    /// What the rig is made of, a line each, for [`Rig::describe`].
+    /// Description of the rig's contents, one line each, for [`Rig::describe`].
     pub contents: Vec<String>,
-    /// `[reduction]`: how far it is from the full model it was reduced from.
+    /// `[reduction]`: errors of the rig against the full model it was reduced from.
     pub reduction: Option<Certificate>,
-    /// `[basis] tolerance`: the largest `|Δλ|/|λ|` its basis was made to hold.
+    /// `[basis] tolerance`: the largest `|Δλ|/|λ|` allowed when the basis was made.
     pub basis_tolerance: Option<f64>,
-    /// `[basis]`: the conditions its basis was made for.
+    /// `[basis]`: range of conditions that the basis was sampled over.
     pub made_for: Option<MadeFor>,
-    /// How the coordinates of the model move each side, for pictures; empty where only the coordinates are known.
+    /// Shapes of the sides, for pictures; empty if only generalised coordinates are known.
     pub shapes: Vec<SideShapes>,
-    /// Where the disc turns, for pictures; `None` where no `[[contact_patch]]` says it.
+    /// Axis of the disc, for pictures; `None` without a `[[contact_patch]]`.
     pub disc_axis: Option<DiscAxis>,
 }
 
-/// The disc's axis as the first `[[contact_patch]]` gives it.
+/// Axis of the disc, from the first `[[contact_patch]]`.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct DiscAxis {
     pub axis_point_m: [f64; 3],
-    /// Positive speed turns right-handed about it; of any length.
+    /// Direction of the axis, of any length. At positive speed the disc turns about it by the right-hand rule.
     pub axis_direction: [f64; 3],
-    /// From disc to pad; of any length.
+    /// Normal from disc to pad, of any length.
     pub normal: [f64; 3],
 }
 
-/// The contact that a model of substructures was built with.
+/// The contact of a model made of substructures.
 #[derive(Clone, Debug)]
 pub struct Contact {
-    /// The pairs, in the coordinates of the model.
+    /// The contact pairs, in the coordinates of the model.
     pub pairs: ContactPairs,
-    /// What truncated modes do between them, where it is used.
+    /// Residual flexibility of the truncated modes at the pairs, if used.
     pub residual: Option<ResidualFlexibility>,
 }
 
-/// How a stretch of the model's coordinates moves one side of the rig.
+/// Displacement shapes of one side in the coordinates of the model.
 #[derive(Clone, Debug)]
 pub struct SideShapes {
     /// `pad` or `disc`.
     pub name: &'static str,
-    /// The model's coordinate that belongs to the first column of `phi`.
+    /// Index of the model's coordinate that corresponds to the first column of `phi`.
     pub first_coordinate: usize,
-    /// `Φ`: degrees of freedom by coordinates, kg^-1/2; with `nodes_m` three rows for each node.
+    /// `Φ`: degrees of freedom by coordinates, kg^-1/2. If `nodes_m` is not empty, rows are x, y and z of each node.
     pub phi: Mat<f64>,
-    /// Positions of the interface nodes, m; empty where degrees of freedom are only numbered.
+    /// Positions of the interface nodes, m; empty if the degrees of freedom have no positions.
     pub nodes_m: Vec<[f64; 3]>,
 }
 
-/// A file of a rig, as it was read.
+/// A file of a rig: name and content.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RigFile {
-    /// As the rig file refers to it: a relative path.
+    /// Relative path, as written in the rig file.
     pub name: String,
     pub bytes: Vec<u8>,
 }
 
-/// Closed ranges of the inputs a node accepts.
+/// Closed ranges of the inputs that a node accepts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Limits {
     pub normal_load_n: [f64; 2],
@@ -130,7 +134,7 @@ pub struct Limits {
     pub friction_coefficient: [f64; 2],
 }
 
-/// A condition outside the rig's limits.
+/// Why an operating point is outside the limits of the rig.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum OutOfLimits {
     #[error("{name} is {value}, expected a finite number")]
@@ -140,7 +144,7 @@ pub enum OutOfLimits {
 }
 
 impl Limits {
-    /// Whether every condition of `point` is finite and within its limits.
+    /// Checks that every condition of `point` is finite and within its limits.
     ///
     /// # Errors
     /// [`OutOfLimits`], naming the first condition that is not.
@@ -162,7 +166,7 @@ impl Limits {
     }
 }
 
-/// The conditions that the basis of a rig was made for, as far as its file names them.
+/// Closed ranges of the conditions that the basis of a rig was sampled over; `None` if the file does not give one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MadeFor {
     pub friction_coefficient: Option<[f64; 2]>,
@@ -170,30 +174,31 @@ pub struct MadeFor {
     pub disc_speed_rad_s: Option<[f64; 2]>,
 }
 
-/// Conditions for which predictions are prepared, where the rig depends on them.
+/// Ranges of load and speed that the chart covers, and its tolerance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChartRange {
     pub normal_load_n: [f64; 2],
     pub disc_speed_rad_s: [f64; 2],
-    /// Relative error of `λ²` that is asked for.
+    /// Largest relative error of `λ²` on the chart.
     pub tolerance: f64,
 }
 
-/// When the node warns.
+/// Thresholds of warnings.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Warning {
-    /// WARN when the margin to the critical friction is below this.
+    /// WARN if the margin to the critical friction coefficient is below this.
     pub margin: f64,
-    /// SQUEAL when a mode's damping ratio falls below this (negative: growing).
+    /// SQUEAL if a mode's damping ratio falls below this (negative: growing).
     pub damping_ratio: f64,
-    /// SQUEAL ends when every damping ratio is above `damping_ratio` by this much again.
+    /// SQUEAL ends when every damping ratio exceeds `damping_ratio` by at least this.
     pub hysteresis: f64,
     /// FAULT after this much silence, s.
     pub silence_s: f64,
 }
 
 impl MadeFor {
-    /// Whether `p` is outside, as far as what changes there matters to `model`: a vector held at one load need not hold at another.
+    /// Whether `p` is outside the sampled range. Load and speed count only if the coefficients of `model` depend on
+    /// them: then vectors sampled at one value need not be accurate at another.
     fn is_left_at(&self, model: &Model, p: &OperatingPoint) -> bool {
         let outside =
             |range: Option<[f64; 2]>, value: f64| range.is_some_and(|[low, high]| value < low || value > high);
@@ -210,7 +215,7 @@ impl MadeFor {
 }
 
 impl Rig {
-    /// Loads the embedded rig of that name ([`EMBEDDED`]), else the rig file at that path.
+    /// Loads the embedded rig of that name ([`EMBEDDED`]), otherwise the rig file at that path.
     ///
     /// # Errors
     /// [`RigError`], naming file, field, value and limit.
@@ -234,7 +239,7 @@ impl Rig {
         Ok(Self { path: Some(path.to_owned()), ..rig })
     }
 
-    /// The same from files in memory: the rig file first, then everything it refers to by the names it uses.
+    /// Reads a rig from files in memory: first the rig file, then all files it refers to, under the names it uses.
     ///
     /// # Errors
     /// [`RigError`], naming file, field, value and limit.
@@ -302,14 +307,15 @@ impl Rig {
         })
     }
 
-    /// What to know of a prediction at `p`: what the contact does there, and whether the rig's basis was made for it.
+    /// Notes for a prediction at `p`: the state of the contact, and whether `p` is outside the range of the rig's
+    /// basis.
     pub fn notes(&self, p: &OperatingPoint) -> impl Iterator<Item = &'static str> {
         let beyond = self.made_for.is_some_and(|made_for| made_for.is_left_at(&self.model, p));
         let beyond = beyond.then_some("beyond the conditions that the basis was made for");
         self.model.contact_state(p).note().into_iter().chain(beyond)
     }
 
-    /// The stiffness of the rig's contact pairs as its file lists it, N/m: one value, or one for each pair of a patch.
+    /// Contact stiffness as listed in the rig file, N/m: one value per contact or patch, or one per pair of a patch.
     pub fn contact_stiffness_n_per_m(&self) -> Vec<f64> {
         let mut listed = vec![];
         self.visit_contact_stiffness(&mut |value| {
@@ -322,7 +328,7 @@ impl Rig {
     /// The same rig with the stiffness of every contact pair multiplied by `factor`.
     ///
     /// # Errors
-    /// [`RigError`]: the rig's own files are at fault, or `factor` takes the stiffness out of range.
+    /// [`RigError`] if the rig's own files cannot be read again, or if `factor` takes the stiffness out of range.
     pub fn with_contact_stiffness_times(&self, factor: f64) -> Result<Self, RigError> {
         let Some(text) = self.visit_contact_stiffness(&mut |value| factor * value) else { return Ok(self.clone()) };
         let mut files = self.files.clone();
@@ -330,11 +336,12 @@ impl Rig {
         Self::from_files(&files)
     }
 
-    /// Its model at a friction coefficient of 0, and no other, with the stiffness of every contact pair multiplied by
-    /// `factor`: nothing is read or fitted again.
+    /// The model with the stiffness of every contact pair multiplied by `factor`, valid only at a friction coefficient
+    /// of 0. Faster than [`Rig::with_contact_stiffness_times`]: no file is read, and a flexible contact is not fitted
+    /// over `μ`.
     ///
     /// # Errors
-    /// [`RigError::Model`]: `factor` takes the contact out of range.
+    /// [`RigError::Model`] if `factor` takes the contact out of range.
     pub fn at_rest_with_contact_stiffness_times(&self, factor: f64) -> Result<Model, RigError> {
         let Some(Contact { pairs, residual }) = &self.contact else { return Ok(self.model.clone()) };
         let mut pairs = pairs.clone();
@@ -347,7 +354,7 @@ impl Rig {
         .map_err(|source| RigError::Model { file: self.name.clone(), source })
     }
 
-    /// The text of the rig file with every contact stiffness replaced by what `change` makes of it.
+    /// The text of the rig file with `change` applied to every contact stiffness; `None` if the file cannot be parsed.
     fn visit_contact_stiffness(&self, change: &mut dyn FnMut(f64) -> f64) -> Option<String> {
         let text = std::str::from_utf8(&self.files.first()?.bytes).ok()?;
         let mut table: toml::Table = text.parse().ok()?;
@@ -361,7 +368,7 @@ impl Rig {
         Some(table.to_string())
     }
 
-    /// What the rig is and holds, a few lines for people.
+    /// A description of the rig, in a few lines of text.
     pub fn describe(&self) -> String {
         let mut lines = vec![format!("rig        {}", self.name)];
         lines.extend(self.contents.iter().cloned());
@@ -381,7 +388,7 @@ impl Rig {
     }
 }
 
-/// Replaces a number, or every number of a list.
+/// Applies `change` to a number, or to every number of a list.
 fn change_numbers(value: &mut toml::Value, change: &mut dyn FnMut(f64) -> f64) {
     if let toml::Value::Array(values) = value {
         values.iter_mut().for_each(|value| change_numbers(value, change));
@@ -390,12 +397,12 @@ fn change_numbers(value: &mut toml::Value, change: &mut dyn FnMut(f64) -> f64) {
     }
 }
 
-/// What each kind of rig builds.
+/// The result of building a rig of any kind.
 struct Built {
     model: Model,
     contact: Option<Contact>,
     contents: Vec<String>,
     shapes: Vec<SideShapes>,
-    /// `[band] max_hz`, lower where the model ends below.
+    /// `[band] max_hz`, or the cut-off of the model if that is lower.
     band_max_hz: Option<f64>,
 }

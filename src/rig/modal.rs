@@ -1,4 +1,4 @@
-//! Kind 2: substructures by their modes at the contact interface, from any finite-element program.
+//! Kind 2: substructures given by their modes at the contact interface, from any finite-element program.
 
 use faer::Mat;
 
@@ -13,14 +13,15 @@ use super::{Built, RigError, basis, npz};
 use crate::physics::{ContactPairs, ResidualFlexibility};
 use crate::reduction::Modes;
 
-/// A substructure with the modes that were selected, ascending in frequency.
+/// A substructure and its selected modes, in ascending frequency.
 pub(super) struct Part {
     pub data: ModalData,
     pub selected: Vec<usize>,
     pub side: Side,
 }
 
-/// Builds the model of a rig of kind 2: `n = i + j` coordinates, the pad's modes first, or those that both sides share.
+/// Builds the model of a rig of kind 2, in `n = i + j` modal coordinates (`i` of the pad, then `j` of the disc) or in
+/// coordinates that both sides share.
 ///
 /// # Errors
 /// [`RigError`].
@@ -67,7 +68,7 @@ pub(super) fn build(
     Ok(built)
 }
 
-/// Sides with modes of their own.
+/// Builds the model of sides that have modal coordinates of their own.
 fn apart(
     file: &str,
     pad: &Part,
@@ -108,13 +109,16 @@ fn apart(
 }
 
 impl Part {
-    /// Displacement of a node along `d` in the `mode`-th of the selected modes.
+    /// Displacement of `node` along the direction `d` in the `mode`-th selected mode, kg^-1/2.
     pub fn along(&self, node: usize, mode: usize, d: [f64; 3]) -> f64 {
         let shape = self.data.shape(node, self.selected[mode]);
         shape[0] * d[0] + shape[1] * d[1] + shape[2] * d[2]
     }
 
-    /// What the modes that do not take part still do at the contact.
+    /// Residual flexibility of all modes that are not selected, at the contact interface.
+    ///
+    /// # Errors
+    /// [`RigError::Range`] if a rigid-body motion is not selected.
     fn residual(&self, name: &'static str, file: &str) -> Result<Option<Residual>, RigError> {
         self.data.residual_beyond(&self.selected).map_err(|mode| RigError::Range {
             file: file.to_owned(),
@@ -124,13 +128,14 @@ impl Part {
         })
     }
 
-    /// The highest frequency kept.
+    /// Highest natural frequency of the selected modes, Hz.
     fn cutoff_hz(&self) -> f64 {
         self.side.modes.omega_rad_s.iter().copied().fold(0.0, f64::max) / std::f64::consts::TAU
     }
 }
 
-/// The residuals that came with the sides, between `pairs`, and of which sides they are; `None` where none came.
+/// Residual flexibility between `pairs`, from the modal data of the sides, and the names of the sides that have it;
+/// `None` if neither has it.
 fn of_sides(
     file: &str,
     pairs: &[Pair],
@@ -156,7 +161,7 @@ fn of_sides(
     Ok(Some((between, names.join(" and "))))
 }
 
-/// `[residual]`: what the modes left out do between the pairs themselves.
+/// Reads `[residual]`: residual flexibility given directly between the contact pairs.
 fn given(
     source: &mut Source<'_>,
     raw: &RawResidual,
@@ -209,7 +214,7 @@ fn part(source: &mut Source<'_>, key: &str, raw: &RawSubstructure) -> Result<Par
     Ok(Part { data, selected, side: Side { modes, damping_ratio } })
 }
 
-/// `[d·Φ_p, -T d·Φ_d]`, a row for every pair, `d` its `direction`.
+/// Rows `[d·Φ_p, -T d·Φ_d]` of relative displacement, one per pair, along the direction `d` of the pair.
 fn relative_displacement(
     pairs: &[Pair],
     direction: &dyn Fn(&Pair) -> [f64; 3],

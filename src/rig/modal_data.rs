@@ -1,27 +1,28 @@
-//! Modes of a substructure at its contact interface, whatever format they came in.
+//! Modes of a substructure at its contact interface, from any file format.
 
 use faer::Mat;
 
 use super::{RigError, npz, uff};
 
-/// Modes at the nodes of a contact interface.
+/// Modes of a part at the `c` nodes of its contact interface.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ModalData {
-    /// `ω`, rad/s, one for each of `i` modes.
+    /// `ω` of the `i` modes, rad/s.
     pub omega_rad_s: Vec<f64>,
-    /// `Φ`, kg^-1/2, `(c, 3, i)` with the mode running fastest.
+    /// `Φ`, kg^-1/2, of shape `(c, 3, i)` in C order: the mode index varies fastest.
     pub phi: Vec<f64>,
     /// Positions of the `c` nodes, m.
     pub nodes_m: Vec<[f64; 3]>,
-    /// `ζ`, one for each mode, where given.
+    /// Damping ratio `ζ` of each mode, if given.
     pub damping_ratio: Option<Vec<f64>>,
-    /// `(i, i)`: this side's part of the unit mass matrix, where the columns of `phi` move other sides too and it is given.
+    /// This part's contribution `V_pᵀ M_p V_p` to the unit mass matrix, `i×i`, if given. Used if the columns of `phi`
+    /// are motions of both parts.
     pub mass_share: Option<Mat<f64>>,
-    /// What the modes beyond these do at the nodes, where given.
+    /// Residual flexibility of the modes above these, if given.
     pub residual: Option<Residual>,
 }
 
-/// Residuals of the modes left out, between x, y and z of every node: `3c×3c`, node by node, symmetric.
+/// Residual flexibility and inertia of the truncated modes, `3c×3c`, symmetric. Rows are x, y and z of each node.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Residual {
     /// `R = Σ φ φᵀ / ω²`, m/N.
@@ -31,8 +32,7 @@ pub struct Residual {
 }
 
 impl ModalData {
-    /// Reads modal data in the format that the name of the file says: `.unv` and `.uff` are Universal Files, everything
-    /// else is an `.npz` archive.
+    /// Reads modal data. Names that end with `.unv` or `.uff` are Universal Files, all others `.npz` archives.
     ///
     /// # Errors
     /// Those of [`npz::read`] and [`uff::read`].
@@ -41,17 +41,17 @@ impl ModalData {
         if lower.ends_with(".unv") || lower.ends_with(".uff") { uff::read(file, bytes) } else { npz::read(file, bytes) }
     }
 
-    /// Displacement of `node` in `mode`, kg^-1/2; 0 outside.
+    /// Displacement (x, y, z) of `node` in `mode`, kg^-1/2; 0 if either does not exist.
     pub fn shape(&self, node: usize, mode: usize) -> [f64; 3] {
         let modes = self.omega_rad_s.len();
         [0, 1, 2].map(|axis| self.phi.get((3 * node + axis) * modes + mode).copied().unwrap_or(0.0))
     }
 
-    /// The residual of all modes but those `kept`: what came with the data and what the others add to it. `None` where
-    /// none came with the data.
+    /// Residual flexibility of all modes except `kept`: that of the data plus the contribution of the modes of the data
+    /// that are not kept. `None` if the data has none.
     ///
     /// # Errors
-    /// The first mode left out that is a rigid-body motion: it has no flexibility.
+    /// Index of the first rigid-body motion that is not kept: its flexibility is infinite.
     pub fn residual_beyond(&self, kept: &[usize]) -> Result<Option<Residual>, usize> {
         let Some(residual) = &self.residual else { return Ok(None) };
         let modes = self.omega_rad_s.len();
@@ -64,7 +64,7 @@ impl ModalData {
             let rows = Mat::from_fn(3 * self.nodes_m.len(), out.len(), |row, k| {
                 self.phi[row * modes + out[k]] / self.omega_rad_s[out[k]].powi(power)
             });
-            // Symmetric by construction: the solver looks for it.
+            // Exactly symmetric by construction, because the solver tests for symmetry.
             let product = &rows * rows.transpose();
             Mat::from_fn(product.nrows(), product.ncols(), |i, j| product[(i.max(j), i.min(j))])
         };
@@ -75,5 +75,5 @@ impl ModalData {
     }
 }
 
-/// A mode with `ω` of at most this times the largest is a rigid-body motion.
+/// A mode is a rigid-body motion if its `ω` is at most this times the largest.
 const RIGID: f64 = 1e-4;

@@ -1,7 +1,7 @@
-//! Modes of a substructure as a finite-element program wrote them: an `.npz` archive of numpy arrays.
+//! Modes of a substructure from a finite-element program, as an `.npz` archive of numpy arrays.
 //!
-//! The type and the shape of an array are checked before its values are unpacked, and memory is allocated once, for as many
-//! values as the shape says.
+//! Type and shape of an array are checked before its values are decompressed. Memory is allocated once, for the number
+//! of values that the shape gives.
 
 use std::io::{self, BufReader, Cursor, Read};
 
@@ -12,25 +12,26 @@ use super::RigError;
 use super::modal_data::{ModalData, Residual};
 use crate::physics::ResidualFlexibility;
 
-/// The arrays of one archive may take this much, in bytes ...
+/// Largest total size of the arrays of one archive, bytes.
 const MOST_BYTES: u64 = 1 << 30;
-/// ... but, above the second number, no more than so many times the bytes of the archive: numbers that mean something do not
-/// compress further.
+/// Second limit on the total size: `(factor, floor)`. The arrays may take at most `factor` times the bytes of the
+/// archive, though always `floor` bytes. Real data does not compress further; a decompression bomb does.
 const MOST_TIMES_ARCHIVE: (u64, u64) = (100, 64 << 20);
-/// Longest header of an array, in bytes; numpy writes 128.
+/// Longest accepted header of an array, bytes; numpy writes 128.
 const LONGEST_HEADER: usize = 1024;
-/// Two mirrored entries of a residual may differ by this times its largest entry: what printing with ten digits leaves.
+/// Largest difference of two mirrored entries of a residual matrix, relative to its largest entry: what printing with
+/// ten digits leaves.
 const SYMMETRY: f64 = 1e-9;
 
-/// A numpy array, rewritten to C order.
+/// A numpy array in C order.
 struct Array {
     shape: Vec<usize>,
     values: Vec<f64>,
 }
 
-/// Reads what the modes left out do between `c` contact pairs: `flexibility_sliding` and `inertia_sliding` (c, c),
-/// `flexibility_normal` and `inertia_normal` (c (c + 1) / 2), the lower triangles of symmetric matrices row by row. Without
-/// inertia both of its arrays are missing.
+/// Reads residual flexibility and inertia between `c` contact pairs: `flexibility_sliding` and `inertia_sliding` of
+/// shape (c, c); `flexibility_normal` and `inertia_normal` of shape (c (c + 1) / 2), the lower triangles of symmetric
+/// matrices by rows. Both inertia arrays may be absent.
 ///
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
@@ -60,7 +61,7 @@ pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<Residual
     Ok(ResidualFlexibility { normal, sliding, inertia: both("inertia")? })
 }
 
-/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and, where they are there, `damping_ratio` (i), `mass_share`
+/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and the optional arrays `damping_ratio` (i), `mass_share`
 /// (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
 ///
 /// # Errors
@@ -108,7 +109,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     })
 }
 
-/// Residual flexibility and inertia between the three directions of every one of `count` nodes.
+/// Residual flexibility and inertia between x, y and z of `count` nodes, checked for symmetry.
 fn symmetric_residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> Result<Option<Residual>, RigError> {
     let names = ["residual_flexibility", "residual_inertia"];
     let symmetric = |name: &str, array: Array| -> Result<Mat<f64>, RigError> {
@@ -146,11 +147,11 @@ fn told(shape: &[usize]) -> String {
     shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
 }
 
-/// An archive and how much of it was unpacked.
+/// An open archive, with the size of the arrays read so far.
 struct Archive<'a> {
     file: &'a str,
     zip: npyz::npz::NpzArchive<Cursor<&'a [u8]>>,
-    /// Bytes that the arrays read so far take, and those that all of them may take.
+    /// Bytes taken by the arrays read so far, and the largest total allowed.
     unpacked: u64,
     limit: u64,
 }
@@ -166,7 +167,8 @@ impl<'a> Archive<'a> {
         Ok(Self { file, zip, unpacked: 0, limit })
     }
 
-    /// An array by name; `None` where it is not there. `fits` says what was expected where a shape is not of use.
+    /// The array called `name`; `None` if it is absent. `fits` checks the shape and returns the expected one if it
+    /// differs.
     fn array(
         &mut self,
         name: &str,
@@ -204,7 +206,7 @@ impl<'a> Archive<'a> {
         let count = shape.iter().try_fold(1_usize, |product, &length| product.checked_mul(length));
         let size = scalar.size_field() as usize;
         let needed = |each: usize| Some(count?.checked_mul(each)? as u64);
-        // Neither the archive nor the array is believed: both must agree that the values are there.
+        // Header and archive entry are untrusted: both must agree that all values are present.
         let Some(count) = count.filter(|_| needed(size).is_some_and(|bytes| header as u64 + bytes <= there)) else {
             return refuse_shape(&format!(" but {there} bytes"), "all its values");
         };
@@ -235,7 +237,7 @@ impl<'a> Archive<'a> {
     }
 }
 
-/// The `count` values of an array.
+/// Reads the `count` values of an array.
 fn values<T: Deserialize>(data: NpyFile<impl Read>, count: usize, to: fn(T) -> f64) -> io::Result<Vec<f64>> {
     let mut values = Vec::with_capacity(count);
     for value in data.data::<T>().map_err(io::Error::other)? {
@@ -244,8 +246,8 @@ fn values<T: Deserialize>(data: NpyFile<impl Read>, count: usize, to: fn(T) -> f
     Ok(values)
 }
 
-/// The length of a header. Refuses those on which the reader would overflow: too long, or with numbers whose product is no
-/// size.
+/// Length of an array's header, bytes. Refuses headers on which the npy reader would overflow: too long, or with
+/// numbers whose product is not a plausible size.
 fn check_header(bytes: &[u8]) -> Result<usize, String> {
     let length = match bytes.get(..12) {
         Some([0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, low, high, ..]) => {
@@ -270,7 +272,7 @@ fn check_header(bytes: &[u8]) -> Result<usize, String> {
     Ok(length)
 }
 
-/// Index of every axis of the `flat`-th value in C order.
+/// Index along each axis of the `flat`-th value in C order.
 fn position(shape: &[usize], flat: usize) -> Vec<usize> {
     let mut rest = flat;
     let mut indices: Vec<usize> = shape
@@ -286,7 +288,7 @@ fn position(shape: &[usize], flat: usize) -> Vec<usize> {
     indices
 }
 
-/// Values in Fortran order, the first axis running fastest, rewritten to C order.
+/// Converts values from Fortran order (the first axis varies fastest) to C order.
 fn to_c_order(shape: &[usize], values: &[f64]) -> Vec<f64> {
     let strides: Vec<usize> = shape
         .iter()

@@ -1,32 +1,33 @@
-//! Contact patches of modal substructures: which nodes touch, and along which triad.
+//! Contact patches of modal substructures: contact pairs and the triad `n, t, b` of each.
 //!
-//! Every selected pad node is a contact point. With the axis through `a` along the unit vector `e`, and `n` the given
-//! normal from disc to pad,
+//! Every selected pad node is a contact point. With the disc's axis through `a` along the unit vector `e`, and `n` the
+//! given normal from disc to pad,
 //!
 //! ```text
 //! r = x - a,   t = (e × r) / |e × r|,   b = n × t,   radius = |e × r|
 //! ```
 //!
-//! so that at positive speed the disc moves along `+t`. A disc node at the same place (within a millionth of the
-//! patch's size) is the partner; otherwise the disc's displacement is interpolated between its nodes around the point
-//! (`interpolation`), seen along the normal.
+//! so that at positive speed the disc moves along `+t`. If a disc node coincides with the pad node (within a millionth
+//! of the size of the patch), the two form the pair. Otherwise the disc's displacement is interpolated between its
+//! nodes, projected along the normal (`interpolation`).
 
 use super::RigError;
 use super::interpolation::{Interpolation, Plane};
 use super::raw::RawPatch;
 use super::settings::{MOST_TERMS, at_most, spread, within};
 
-/// Nodes closer than this times the size of the patch coincide.
+/// Nodes coincide if their distance is at most this times the size of the patch.
 const COINCIDENT: f64 = 1e-6;
 
-/// Least `|n·e|` of a normal `n` that is 60 degrees off the axis `e`; beyond, the pad would press on the disc's rim.
+/// Smallest `|n·e|`: the normal `n` may be at most 60 degrees off the axis `e`. Beyond that the pad would press on the
+/// rim of the disc.
 const LEAST_COSINE: f64 = 0.5;
 
 /// One contact pair.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pair {
     pub pad_node: usize,
-    /// Nodes of the disc and their weights, a row of `T`; sums to 1. Empty for a rigid disc.
+    /// Disc nodes and their weights, a row of `T`; weights sum to 1. Empty for a rigid disc.
     pub disc: Vec<(usize, f64)>,
     /// `n`, `t`, `b`.
     pub normal: [f64; 3],
@@ -56,19 +57,20 @@ fn scaled(a: [f64; 3], factor: f64) -> [f64; 3] {
     a.map(|value| value * factor)
 }
 
-/// The pairs of all patches, one after the other.
+/// The contact pairs of all patches, in the order of the patches.
 pub struct Contacts {
     pub pairs: Vec<Pair>,
-    /// One for each pair.
+    /// Contact stiffness of each pair.
     pub stiffness_n_per_m: Vec<f64>,
-    /// One for each pair.
+    /// Contact damping of each pair.
     pub damping_n_s_per_m: Vec<f64>,
 }
 
-/// The contact pairs of all patches with their springs and dampers; `disc_m` is `None` for a rigid disc.
+/// The contact pairs of all patches, with stiffness and damping; `disc_m` is `None` for a rigid disc.
 ///
 /// # Errors
-/// As [`pairs`]; [`RigError::Range`] for a stiffness or damping that is negative or not one for each pair.
+/// Those of [`pairs`]; [`RigError::Range`] for negative stiffness or damping; [`RigError::Shape`] if there are neither
+/// one value nor as many as pairs.
 pub fn contacts(
     file: &str,
     patches: &[RawPatch],
@@ -185,7 +187,7 @@ fn pairs(
     Ok(pairs)
 }
 
-/// A direction scaled to 1.
+/// A direction scaled to unit length.
 fn unit(file: &str, field: &str, direction: [f64; 3]) -> Result<[f64; 3], RigError> {
     for (axis, &value) in direction.iter().enumerate() {
         super::settings::finite(file, &format!("{field}[{axis}]"), value)?;
@@ -199,7 +201,7 @@ fn unit(file: &str, field: &str, direction: [f64; 3]) -> Result<[f64; 3], RigErr
     Ok(scaled(direction, 1.0 / norm(direction)))
 }
 
-/// The nodes listed, by default all of them.
+/// The listed node indices, by default all.
 fn selection(file: &str, field: &str, listed: Option<&[usize]>, count: usize) -> Result<Vec<usize>, RigError> {
     let Some(listed) = listed else { return Ok((0..count).collect()) };
     let refuse = |field: String, value: String, limit: String| {
@@ -225,7 +227,7 @@ fn selection(file: &str, field: &str, listed: Option<&[usize]>, count: usize) ->
     Ok(listed.to_vec())
 }
 
-/// Diagonal of the box around some points.
+/// Length of the diagonal of the bounding box of some points.
 fn extent(points: impl Iterator<Item = [f64; 3]>) -> f64 {
     let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
     for point in points {
@@ -237,7 +239,7 @@ fn extent(points: impl Iterator<Item = [f64; 3]>) -> f64 {
     norm(minus(high, low))
 }
 
-/// The nearest of some points, and how far it is.
+/// Index and distance of the point nearest to `to`.
 fn nearest(points: &[[f64; 3]], to: [f64; 3]) -> Option<(usize, f64)> {
     points.iter().enumerate().map(|(index, &point)| (index, norm(minus(point, to)))).min_by(|a, b| a.1.total_cmp(&b.1))
 }

@@ -1,4 +1,4 @@
-//! Rig files as they are written: every key, nothing checked but its type.
+//! The serde form of rig files: every key, checked only for its type.
 
 use serde::Deserialize;
 
@@ -37,7 +37,7 @@ pub struct RawRig {
     pub reduction: Option<Certificate>,
 }
 
-/// Declares a table whose keys all have defaults.
+/// Declares a table in which every key has a default.
 macro_rules! table_with_defaults {
     ($(#[$doc:meta])* $name:ident { $($field:ident: $type:ty = $default:expr,)* }) => {
         $(#[$doc])*
@@ -54,7 +54,7 @@ macro_rules! table_with_defaults {
 }
 
 table_with_defaults! {
-    /// `[reference]`: the paper's test conditions.
+    /// `[reference]`; defaults are the paper's test conditions.
     RawReference { normal_load_n: f64 = 500.0, disc_speed_rad_s: f64 = 13.0, friction_coefficient: f64 = 0.35, }
 }
 table_with_defaults! {
@@ -74,7 +74,7 @@ table_with_defaults! {
     RawLoad { exponent: f64 = 0.0, reference_n: f64 = 500.0, }
 }
 table_with_defaults! {
-    /// `[limits]`: closed ranges of what the node accepts.
+    /// `[limits]`: closed ranges of the inputs that the node accepts.
     RawLimits {
         normal_load_n: [f64; 2] = [0.0, 1e6],
         disc_speed_rad_s: [f64; 2] = [-1e4, 1e4],
@@ -87,7 +87,7 @@ table_with_defaults! {
 }
 
 table_with_defaults! {
-    /// `[chart]`: conditions for which predictions are prepared.
+    /// `[chart]`: the box of conditions that the chart covers.
     RawChart {
         normal_load_n: [f64; 2] = [50.0, 2000.0],
         disc_speed_rad_s: [f64; 2] = [1.0, 60.0],
@@ -95,7 +95,7 @@ table_with_defaults! {
     }
 }
 
-/// `[pad]` or `[disc]`: written out, or from a finite-element program.
+/// `[pad]` or `[disc]`: matrices written out, or a file of modal data.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawSubstructure {
@@ -106,15 +106,15 @@ pub struct RawSubstructure {
     pub modes: Option<RawModes>,
 }
 
-/// `[residual]`: what the modes left out do between the contact pairs.
+/// `[residual]`: residual flexibility between the contact pairs.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawResidual {
-    /// An `.npz` archive.
+    /// Name of an `.npz` archive.
     pub pairs: String,
 }
 
-/// A value for all, or one for each.
+/// One value for all, or one for each.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(untagged, expecting = "expected a number or a list of numbers")]
 pub enum OneOrMany {
@@ -148,7 +148,7 @@ pub struct RawContact {
     pub radius_m: f64,
 }
 
-/// `[[contact_patch]]`: where modal substructures touch.
+/// `[[contact_patch]]`: contact between modal substructures.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawPatch {
@@ -167,7 +167,7 @@ fn no_damping() -> OneOrMany {
     OneOrMany::One(0.0)
 }
 
-/// `[system]`: sums of matrices.
+/// `[system]`: sums of matrices, each times a scale.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawSystem {
@@ -179,11 +179,12 @@ pub struct RawSystem {
     pub stiffness: Vec<RawTerm>,
 }
 
-/// `[basis]`: the coordinates are those of a basis of a whole full model; what it was made for and found good for.
+/// `[basis]`: the rig is a projection of the full model on a basis. Holds the range of conditions it was sampled over
+/// and its errors at held-out points.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RawBasis {
-    /// Pad and disc have the same coordinates.
+    /// Whether pad and disc share their coordinates.
     pub shared: bool,
     pub degrees_of_freedom: Option<usize>,
     pub friction_coefficient: Option<[f64; 2]>,
@@ -195,7 +196,7 @@ pub struct RawBasis {
     pub largest_error: Option<f64>,
 }
 
-/// A matrix times a scale.
+/// A matrix file and its scale.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawTerm {
@@ -208,7 +209,7 @@ fn one() -> String {
     "1".to_owned()
 }
 
-/// Reads the text of a rig file, or of another file of tables.
+/// Parses the TOML text of a rig file or of a full model.
 ///
 /// # Errors
 /// [`RigError::TooLong`], [`RigError::Syntax`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
@@ -228,7 +229,7 @@ pub fn parse<T: serde::de::DeserializeOwned>(file: &str, bytes: &[u8]) -> Result
     })
 }
 
-/// Sorts the parser's complaint by what it is about.
+/// Translates a message of the TOML parser into the matching [`RigError`].
 fn explain(file: &str, line: usize, message: &str, found: &str) -> RigError {
     let file = file.to_owned();
     let quoted = |prefix: &str| message.strip_prefix(prefix).and_then(|rest| rest.split_once('`'));
@@ -240,7 +241,7 @@ fn explain(file: &str, line: usize, message: &str, found: &str) -> RigError {
         let limit = format!("it in the table of line {line}");
         return RigError::MissingKey { file, field: field.to_owned(), limit };
     }
-    // The complaint of a value that may have one of several types.
+    // The parser's message for a value that may have one of several types.
     if let Some(limit) = message.strip_prefix("expected ") {
         return RigError::Syntax { file, line, value: format!("the value {found}"), limit: limit.to_owned() };
     }

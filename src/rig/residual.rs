@@ -1,13 +1,15 @@
-//! What the modes left out do between contact pairs, and how far up in frequency it may be trusted.
+//! Residual flexibility and inertia between contact pairs, and the frequencies up to which they are valid.
 //!
 //! ```text
-//! R_nn = Σ_sides W_n R W_nᵀ,   R_nt = Σ_sides W_n R W_tᵀ,   Q alike;   W_d = [d] of the pad, T [d] of the disc
+//! R_nn = Σ_sides W_n R W_nᵀ,   R_nt = Σ_sides W_n R W_tᵀ,   Q likewise;   W_d = [d] of the pad, T [d] of the disc
 //! ```
 //!
-//! `W` is what `B` is made of, so that both use the same triads and the same interpolation. Modes are left out above the
-//! *cut-off*: of each side its highest frequency kept, the lower of the two for the rig. The residual stands for them by
-//! the first two terms of a series in `(ω/ω_cut-off)²`: the inertial term is used for bands of at most half the cut-off,
-//! near which it would spoil critical friction coefficients, and no mode above the cut-off is shown.
+//! `W` is built from the same triads and the same interpolation as the displacement rows `B` of the contact.
+//!
+//! The *cut-off* of a side is its highest kept frequency; that of the rig is the lower of the two. Residual flexibility
+//! and inertia are the first two terms of a series in `(ω/ω_cut-off)²` for the truncated modes. The inertial term is
+//! used for bands of at most half the cut-off, because closer to it critical friction coefficients would be wrong. No
+//! mode above the cut-off is shown.
 
 use faer::Mat;
 
@@ -16,22 +18,22 @@ use super::patch::{self, Pair};
 use super::raw::RawPatch;
 use crate::physics::ResidualFlexibility;
 
-/// The largest band, relative to the cut-off, for which the inertial term is used.
+/// The inertial term is used for bands up to this fraction of the cut-off.
 const INERTIA_BELOW: f64 = 0.5;
 
-/// What the modes left out do between pairs, and up to where it is used.
+/// Residual flexibility between pairs, and the band it is used in.
 pub(super) struct PairResidual {
     pub flexibility: ResidualFlexibility,
-    /// `[band] max_hz`, or the lower cut-off where the former is not given or higher.
+    /// `[band] max_hz`, at most the cut-off; the cut-off if not given.
     pub band_max_hz: f64,
     /// A line for [`super::Rig::describe`].
     pub told: String,
 }
 
-/// The residual of one side between x, y and z of its nodes.
+/// Residual flexibility and inertia of one side, between x, y and z of its nodes.
 #[derive(Clone, Copy, Debug)]
 pub struct SideResidual<'a> {
-    /// Whether it is the disc's.
+    /// Whether this side is the disc.
     pub disc: bool,
     /// `R`, `3c×3c`, m/N.
     pub flexibility: &'a Mat<f64>,
@@ -39,7 +41,7 @@ pub struct SideResidual<'a> {
     pub inertia: Option<&'a Mat<f64>>,
 }
 
-/// The residuals of `sides` between `pairs`, the inertial one where every side has it.
+/// The residual flexibility of `sides` between `pairs`. The inertial term is included if every side has it.
 pub(super) fn between(pairs: &[Pair], sides: &[SideResidual<'_>]) -> ResidualFlexibility {
     let c = pairs.len();
     let (mut normal, mut sliding) = (Mat::zeros(c, c), Mat::zeros(c, c));
@@ -53,7 +55,7 @@ pub(super) fn between(pairs: &[Pair], sides: &[SideResidual<'_>]) -> ResidualFle
             left.iter().map(|&(i, weight)| weight * row(i)).sum()
         };
         let seen = |matrix: &Mat<f64>| {
-            // Symmetric by construction: the solver looks for it.
+            // Exactly symmetric by construction, because the solver tests for symmetry.
             let nn = Mat::from_fn(c, c, |i, j| entry(matrix, &n[i.max(j)], &n[i.min(j)]));
             (nn, Mat::from_fn(c, c, |i, j| entry(matrix, &n[i], &t[j])))
         };
@@ -69,11 +71,11 @@ pub(super) fn between(pairs: &[Pair], sides: &[SideResidual<'_>]) -> ResidualFle
     ResidualFlexibility { normal, sliding, inertia }
 }
 
-/// The residuals of pad and disc between the pairs of `patches`, the tables `[[contact_patch]]` of a rig file called
-/// `file`; `nodes_m` are the interface nodes of each side.
+/// The residual flexibility of pad and disc between the contact pairs of `patches`, the `[[contact_patch]]` tables of
+/// the rig file `file`. `nodes_m` are the interface nodes of each side, m.
 ///
 /// # Errors
-/// [`RigError`]: a patch that is none.
+/// [`RigError`] if the patches are invalid.
 pub fn between_patches(
     file: &str,
     patches: &toml::Value,
@@ -89,7 +91,8 @@ pub fn between_patches(
     Ok(between(&patch::contacts(file, &patches, nodes_m[0], Some(nodes_m[1]))?.pairs, sides))
 }
 
-/// `flexibility` as it serves a rig with this cut-off and `[band] max_hz`; `of` says of what modes it is.
+/// Restricts `flexibility` to the band it is valid in: clamps `[band] max_hz` to the cut-off and drops the inertial
+/// term if the band exceeds half of it. `of` names the modes in the description.
 pub(super) fn within_band(
     flexibility: ResidualFlexibility,
     of: &str,
@@ -113,7 +116,8 @@ pub(super) fn within_band(
     }
 }
 
-/// The rows of `W`, `c×3c'`: what a direction of every pair sees of the displacements of a side's nodes.
+/// The rows of `W`, `c×3c'` for `c'` nodes of the side, sparse: weights of the nodal displacements in the displacement
+/// of each pair along `direction`.
 fn weights(pairs: &[Pair], disc: bool, direction: &dyn Fn(&Pair) -> [f64; 3]) -> Vec<Vec<(usize, f64)>> {
     pairs
         .iter()

@@ -1,8 +1,8 @@
 //! Scales of matrices: arithmetic expressions in the operating point.
 //!
-//! `+ - * / ^ ( )`, numbers, and the names `normal_load_n`, `disc_speed_rad_s`, `friction_coefficient`; nothing else.
-//! The text is tokenised here, so that nothing the expression crate might offer beyond that can get in, and evaluated
-//! by `exmex`. Two readings on which programs disagree are refused instead of guessed: `-a^b` and `a^b^c`.
+//! An expression consists of `+ - * / ^ ( )`, numbers and the names `normal_load_n`, `disc_speed_rad_s` and
+//! `friction_coefficient`. It is tokenised here, so that no other feature of the expression crate is reachable, and
+//! evaluated by `exmex`. `-a^b` and `a^b^c`, which programs read in different ways, are refused.
 
 use std::sync::Arc;
 
@@ -11,15 +11,16 @@ use exmex::{BinOp, MakeOperators, Operator, ops_factory};
 
 use crate::physics::{CustomLaw, Law, OperatingPoint};
 
-/// The names an expression may use, in the order of the alphabet.
+/// The names an expression may use, in alphabetical order.
 pub const NAMES: [&str; 3] = ["disc_speed_rad_s", "friction_coefficient", "normal_load_n"];
 
-/// Longest text that is read, in bytes.
+/// Longest accepted text, bytes.
 const LONGEST: usize = 1000;
-/// Deepest nesting of parentheses and signs that is read.
+/// Deepest accepted nesting of parentheses and signs.
 const DEEPEST: usize = 32;
 
-/// Declared as not commutative, so that terms of equal rank are taken from left to right as everywhere else.
+/// A binary operator. Declared as not commutative, so that operators of equal precedence are applied from left to
+/// right.
 fn binary(apply: fn(f64, f64) -> f64, prio: i64) -> BinOp<f64> {
     BinOp { apply, prio, is_commutative: false }
 }
@@ -34,7 +35,7 @@ ops_factory!(
     Operator::make_bin_unary("-", binary(|a, b| a - b, 0), |a| -a)
 );
 
-/// Why a scale was refused: what is wrong with which part, and what is expected.
+/// Why a scale was refused: the offending part and what was expected.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ScaleError {
     pub reason: String,
@@ -45,10 +46,10 @@ fn refuse<T>(reason: impl Into<String>, limit: impl Into<String>) -> Result<T, S
     Err(ScaleError { reason: reason.into(), limit: limit.into() })
 }
 
-/// Reads a scale; `"1"` is [`Law::Constant`], everything else [`Law::Custom`].
+/// Parses a scale; `"1"` is [`Law::Constant`], anything else [`Law::Custom`].
 ///
 /// # Errors
-/// [`ScaleError`] for an unknown name, another operator or function, an ambiguous power, or no expression at all.
+/// [`ScaleError`] for an unknown name, operator or function, an ambiguous power, or text that is not an expression.
 pub fn parse(text: &str) -> Result<Law, ScaleError> {
     let tokens = tokenise(text)?;
     check_powers(&tokens)?;
@@ -89,7 +90,7 @@ enum Token {
 }
 
 impl Token {
-    /// In the words of the expression crate, which knows no exponents in numbers.
+    /// The token in the syntax of `exmex`, which has no exponents in numbers.
     fn plain(&self) -> String {
         match self {
             Self::Number(value) => format!("{value}"),
@@ -159,7 +160,7 @@ fn tokenise(text: &str) -> Result<Vec<Token>, ScaleError> {
     Ok(tokens)
 }
 
-/// Digits with an optional point and an optional exponent.
+/// Parses digits with an optional decimal point and an optional exponent. Returns the token and its length in bytes.
 fn number(text: &str) -> Result<(Token, usize), ScaleError> {
     let bytes = text.as_bytes();
     let digits = |from: usize| bytes.iter().skip(from).take_while(|byte| byte.is_ascii_digit()).count();
@@ -201,7 +202,7 @@ fn check_powers(tokens: &[Token]) -> Result<(), ScaleError> {
     Ok(())
 }
 
-/// Where the operand that ends before position `at` starts.
+/// Start of the operand that ends before position `at`.
 fn operand_before(tokens: &[Token], at: usize) -> Option<usize> {
     let mut depth = 0_usize;
     for (position, token) in tokens.iter().enumerate().take(at).rev() {

@@ -1,13 +1,14 @@
-//! What every kind of rig has in common, and which kind it is.
+//! The tables common to all kinds of rig, and how the kind of a rig is determined.
 
 use super::raw::{OneOrMany, RawContact, RawModes, RawPatch, RawRig, RawSubstructure, RawSystem};
 use super::{ChartRange, Limits, RigError, Warning};
 use crate::physics::{ContactLaw, OperatingPoint};
 use crate::reduction::ModeSelection;
 
-/// Most coordinates of a model: a prediction that is not on the chart is a dense solve of matrices of so many rows.
+/// Largest number of coordinates of a model: a prediction that is not charted solves a dense eigenvalue problem of this
+/// size.
 pub const MOST_COORDINATES: usize = 3000;
-/// Most matrices of a system, and most contact patches: each refers to files, which a short line can do many times.
+/// Most matrices of a system, and most contact patches. Each refers to files, so a short rig file could name many.
 pub const MOST_TERMS: usize = 100;
 
 /// The common tables, checked.
@@ -24,20 +25,20 @@ pub struct Settings {
 }
 
 impl Settings {
-    /// The largest friction coefficient a prediction is made for: of the search and of the limits.
+    /// Largest absolute friction coefficient that is ever predicted: the largest of `[search] mu_max` and `[limits]`.
     pub fn largest_friction(&self) -> f64 {
         self.limits.friction_coefficient.iter().fold(self.mu_max, |largest, mu| largest.max(mu.abs()))
     }
 }
 
-/// The kind of a rig, by the tables it has.
+/// The kind of a rig, determined by its tables.
 pub enum Kind<'a> {
     Inline { pad: &'a RawSubstructure, disc: Option<&'a RawSubstructure>, contacts: &'a [RawContact] },
     Modal { pad: &'a RawSubstructure, disc: Option<&'a RawSubstructure>, patches: &'a [RawPatch] },
     System(&'a RawSystem),
 }
 
-/// A finite value.
+/// Checks that a value is finite.
 pub fn finite(file: &str, field: &str, value: f64) -> Result<f64, RigError> {
     if value.is_finite() {
         Ok(value)
@@ -46,7 +47,7 @@ pub fn finite(file: &str, field: &str, value: f64) -> Result<f64, RigError> {
     }
 }
 
-/// A finite value for which `holds`, told as `limit`.
+/// Checks that a value is finite and that `holds` is true; `limit` says in the error what was expected.
 pub fn within(file: &str, field: &str, value: f64, holds: bool, limit: &str) -> Result<f64, RigError> {
     finite(file, field, value)?;
     if holds {
@@ -55,7 +56,7 @@ pub fn within(file: &str, field: &str, value: f64, holds: bool, limit: &str) -> 
     Err(RigError::Range { file: file.into(), field: field.into(), value: value.to_string(), limit: limit.into() })
 }
 
-/// That there are at most `limit`.
+/// Checks that `count` is at most `limit`.
 pub fn at_most(file: &str, field: &str, count: usize, limit: usize) -> Result<(), RigError> {
     if count <= limit {
         return Ok(());
@@ -122,10 +123,10 @@ pub fn check(file: &str, raw: &RawRig) -> Result<Settings, RigError> {
     })
 }
 
-/// Which of the three kinds a rig file is.
+/// Determines which of the three kinds a rig file is.
 ///
 /// # Errors
-/// [`RigError::Kind`] where tables or keys of two kinds meet, [`RigError::MissingKey`] where one is not complete.
+/// [`RigError::Kind`] if tables or keys of two kinds are mixed, [`RigError::MissingKey`] if one is incomplete.
 pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
     let mixed = |field: &str, value: &str, limit: &str| {
         Err(RigError::Kind { file: file.into(), field: field.into(), value: value.into(), limit: limit.into() })
@@ -197,7 +198,7 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
 }
 
 impl RawSubstructure {
-    /// Which modes take part.
+    /// The modes that are selected.
     pub fn selection(&self) -> ModeSelection {
         match &self.modes {
             None => ModeSelection::All,
@@ -207,7 +208,7 @@ impl RawSubstructure {
     }
 }
 
-/// One value for each of `count`, finite; `each` says of what.
+/// One finite value for each of `count` items; a single value is repeated. `each` names the items in errors.
 ///
 /// # Errors
 /// [`RigError::Shape`], [`RigError::NotFinite`].

@@ -1,11 +1,11 @@
-//! The files of a rig, read by name and remembered.
+//! Reads the files of a rig by name and keeps their contents.
 
 use sha2::{Digest, Sha256};
 
 use super::{RigError, RigFile};
 use crate::hex::hex;
 
-/// Where what a rig file refers to comes from.
+/// Access to the files that a rig file refers to.
 pub struct Source<'a> {
     /// Name of the rig file, for errors.
     pub rig_file: String,
@@ -15,17 +15,17 @@ pub struct Source<'a> {
 }
 
 impl<'a> Source<'a> {
-    /// `read` gives the bytes of a file or says why not; `limit` says in errors what was expected.
+    /// `read` returns the bytes of a file, or the reason why it cannot; `limit` says in errors what was expected.
     pub fn new(rig_file: RigFile, read: &'a dyn Fn(&str) -> Result<Vec<u8>, String>, limit: &str) -> Self {
         Self { rig_file: rig_file.name.clone(), read, limit: limit.to_owned(), files: vec![rig_file] }
     }
 
-    /// The bytes of a file that `field` refers to.
+    /// The bytes of file `name`, which `field` of the rig file refers to. Each file is read once.
     ///
     /// # Errors
     /// [`RigError::MissingFile`].
     pub fn read(&mut self, field: &str, name: &str) -> Result<&[u8], RigError> {
-        // The rig file itself, first in the list, is not something to refer to.
+        // The first file is the rig file itself, which nothing refers to.
         let position = match self.files.iter().skip(1).position(|file| file.name == name) {
             Some(position) => position + 1,
             None => {
@@ -43,7 +43,7 @@ impl<'a> Source<'a> {
         Ok(&self.files[position].bytes)
     }
 
-    /// SHA-256 over the length and bytes of every name and every content, hexadecimal.
+    /// SHA-256 over name and content of every file, each preceded by its length, hexadecimal.
     pub fn content_hash(&self) -> String {
         let mut hasher = Sha256::new();
         for file in &self.files {

@@ -1,4 +1,4 @@
-//! Kind 3: sums of matrices, each times a scale of the operating point.
+//! Kind 3: sums of matrices, each times a scale that depends on the operating point.
 
 use faer::Mat;
 
@@ -11,7 +11,7 @@ use crate::reduction::{
     ReductionError, SparseMatrix, is_symmetric, lowest_modes, project_sparse, weighted_sum, whiten,
 };
 
-/// A term as it was read.
+/// A term as it was read, before projection.
 struct ReadTerm {
     matrix: SparseMatrix,
     symmetric: bool,
@@ -20,13 +20,13 @@ struct ReadTerm {
     told: String,
 }
 
-/// Takes a term to the model's coordinates.
+/// Transforms the matrix of a term to the coordinates of the model.
 type Reduce = Box<dyn Fn(&ReadTerm) -> Mat<f64>>;
 
 /// Builds the model of a rig of kind 3.
 ///
-/// Without `modes` coordinates are `y = Lᵀ x`, `M = L Lᵀ`, and nothing is left out. With `modes = k` they are those of
-/// the `k` lowest real modes of `M` and the symmetric stiffness terms at the reference point.
+/// Without `modes`, the coordinates are `y = Lᵀ x` with `M = L Lᵀ`, and nothing is truncated. With `modes = k`, they
+/// are the `k` lowest real modes of `M` and the symmetric stiffness terms at the reference point.
 ///
 /// # Errors
 /// [`RigError`].
@@ -45,7 +45,7 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
         let limit = "a square matrix with at least one row".to_owned();
         return Err(RigError::Shape { file, field: "system.mass".to_owned(), value, limit });
     }
-    // Only now is memory for n columns asked for: a definite mass matrix has an entry in every one of them.
+    // Checked before memory for n columns is allocated: a positive definite mass matrix has an entry in every column.
     if listed.entries.len() < n {
         let value = format!("{n}x{n} with {} entries ({})", listed.entries.len(), raw.mass);
         let limit = "an entry on every place of the diagonal".to_owned();
@@ -106,7 +106,7 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
     Ok(Built { model, contact: None, contents, shapes: vec![], band_max_hz: settings.band_max_hz })
 }
 
-/// That a system has no more terms than can be worked with.
+/// Checks that a system has at most [`MOST_TERMS`] terms of each sort.
 ///
 /// # Errors
 /// [`RigError::Range`].
@@ -115,7 +115,7 @@ pub(crate) fn check_terms(file: &str, raw: &RawSystem) -> Result<(), RigError> {
     at_most(file, "system.damping", raw.damping.len(), MOST_TERMS)
 }
 
-/// Reads `[[system.stiffness]]` or `[[system.damping]]`.
+/// Reads the terms of `[[system.stiffness]]` or `[[system.damping]]`.
 fn read_terms(
     source: &mut Source<'_>,
     key: &str,
@@ -148,10 +148,10 @@ fn read_terms(
     Ok(terms)
 }
 
-/// The law that a scale is written as, and its value at the reference point.
+/// Parses a scale into a law and evaluates it at the reference point.
 ///
 /// # Errors
-/// [`RigError::Scale`].
+/// [`RigError::Scale`], also if the value is not finite.
 pub(crate) fn checked_law(
     file: &str,
     field: &str,
@@ -174,11 +174,11 @@ pub(crate) fn checked_law(
     Err(refuse(reason, "a finite number".to_owned()))
 }
 
-/// A law of kind 3 at the reference point, with the friction coefficient that the model hands to it there.
+/// The value of a law at the reference point, with the friction coefficient that the model would pass to it.
 fn value_at(law: &Law, reference: &OperatingPoint) -> f64 {
     match law {
         Law::Custom(custom) => {
-            // A system of matrices knows no contact that could open, only one that does not slide.
+            // The contact of a system never opens, but it may not slide.
             let mu = match reference.state_closed() {
                 crate::physics::ContactState::Sliding => reference.friction_coefficient,
                 _ => 0.0,

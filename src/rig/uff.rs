@@ -1,12 +1,13 @@
 //! Modes of a substructure in the Universal File Format: datasets 15 or 2411 (nodes), 55 (normal modes), 164 (units).
 //!
-//! Text in fixed columns, every dataset between two lines of `-1`. Shapes are scaled to unit modal mass, which the file
-//! must give; lengths and masses are converted to SI where the file has units. The nodes of the substructure are those
-//! for which a shape has values, in the order of the nodes' dataset; a node that a mode does not list is at rest in it.
-//! A hysteretic loss factor counts as half as much viscous damping, which is the same at resonance.
+//! A Universal File is text in fixed columns, with every dataset between two lines of `-1`. Shapes are scaled to unit
+//! modal mass, which the file must give. Lengths and masses are converted to SI if the file gives units. The nodes of
+//! the substructure are those for which a shape has values, in the order of the nodes' dataset. A node that a mode does
+//! not list has zero displacement in it. A hysteretic loss factor `η` is converted to the viscous damping ratio `η/2`,
+//! which is equivalent at resonance.
 //!
-//! Source: Structural Dynamics Research Laboratory, University of Cincinnati, "Universal File Formats for Modal Analysis
-//! Testing".
+//! Source: Structural Dynamics Research Laboratory, University of Cincinnati, "Universal File Formats for Modal
+//! Analysis Testing".
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -15,10 +16,10 @@ use std::f64::consts::TAU;
 use super::RigError;
 use super::modal_data::ModalData;
 
-/// The line before and after every dataset.
+/// The line before and after each dataset.
 const DELIMITER: &str = "-1";
 
-/// A mode as it is written.
+/// A mode in the units of the file.
 struct Mode {
     omega_rad_s: f64,
     modal_mass: f64,
@@ -27,27 +28,27 @@ struct Mode {
     shape: HashMap<u64, [f64; 3]>,
 }
 
-/// A node as it is written.
+/// A node in the units of the file.
 struct Node {
     label: u64,
     position: [f64; 3],
 }
 
-/// What one unit of the file is in SI.
+/// The units of the file in SI.
 struct Units {
     length_m: f64,
     force_n: f64,
 }
 
-/// Longest line that is read, in bytes.
+/// Longest accepted line, bytes.
 const LONGEST_LINE: usize = 64 << 10;
 
-/// The lines of a file, one at a time.
+/// The lines of a file.
 struct Lines<'a> {
     file: &'a str,
-    /// What was not read yet; `None` behind the last line.
+    /// Bytes not yet read; `None` after the last line.
     rest: Option<&'a [u8]>,
-    /// How many lines were read.
+    /// Number of lines read.
     read: usize,
     dataset: String,
 }
@@ -55,7 +56,7 @@ struct Lines<'a> {
 /// Reads a Universal File.
 ///
 /// # Errors
-/// [`RigError::Line`], naming the line, what stands there and what was expected.
+/// [`RigError::Line`], naming the line, its content and what was expected.
 pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     let bytes = bytes.strip_suffix(b"\n").unwrap_or(bytes);
     let mut lines = Lines { file, rest: Some(bytes), read: 0, dataset: String::new() };
@@ -127,12 +128,12 @@ impl<'a> Lines<'a> {
         RigError::Line { file, line, field, value, limit }
     }
 
-    /// An error at the line read last.
+    /// An error at the last line read.
     fn refused_here(&self, field: &str, value: &str, limit: &str) -> RigError {
         self.refused(self.read, &format!("dataset {}: {field}", self.dataset), value, limit)
     }
 
-    /// The next line of the file; `None` behind the last one.
+    /// The next line of the file; `None` after the last one.
     fn advance(&mut self) -> Result<Option<Cow<'a, str>>, RigError> {
         let Some(rest) = self.rest else { return Ok(None) };
         let mut parts = rest.splitn(2, |byte| *byte == b'\n');
@@ -146,14 +147,14 @@ impl<'a> Lines<'a> {
         Ok(Some(String::from_utf8_lossy(line)))
     }
 
-    /// The number of the next dataset; `None` at the end of the file.
+    /// Reads up to the next dataset and returns its number; `None` at the end of the file.
     fn next_dataset(&mut self) -> Result<Option<String>, RigError> {
         while let Some(line) = self.advance()? {
             match line.trim() {
                 "" => {}
                 DELIMITER => {
                     let number = self.advance()?.map_or_else(String::new, |line| line.trim().to_owned());
-                    // A binary variant is told by a letter after the number, and by more numbers behind that.
+                    // The header of a binary variant has a letter after the number, followed by further numbers.
                     let first = number.split_whitespace().next().unwrap_or("").to_owned();
                     if first.is_empty() || !first.starts_with(|c: char| c.is_ascii_digit()) {
                         let value = format!("is `{}`", shown(&number));
@@ -176,7 +177,7 @@ impl<'a> Lines<'a> {
         Ok(None)
     }
 
-    /// The next line of a dataset; `None` after its last one.
+    /// The next line of the dataset; `None` at its end.
     fn line(&mut self) -> Result<Option<String>, RigError> {
         if let Some(line) = self.advance()? {
             let line = line.trim_end_matches('\r');
@@ -185,7 +186,7 @@ impl<'a> Lines<'a> {
         Err(self.refused(self.read, &format!("dataset {}", self.dataset), "has no end", "a line of -1"))
     }
 
-    /// The next line of a dataset that must not end here.
+    /// The next line of the dataset, an error if the dataset ends here; `what` names it.
     fn required(&mut self, what: &str) -> Result<String, RigError> {
         match self.line()? {
             Some(line) => Ok(line),
@@ -198,7 +199,7 @@ impl<'a> Lines<'a> {
         Ok(())
     }
 
-    /// The columns of a line, each of its own width; where they do not parse, the words of the line.
+    /// Splits a line into columns of the given widths. If they do not parse as numbers, splits it at spaces.
     fn fields(&self, line: &str, widths: &[usize]) -> Vec<String> {
         let mut start = 0;
         let columns: Vec<String> = widths
@@ -216,7 +217,7 @@ impl<'a> Lines<'a> {
         line.split_whitespace().map(str::to_owned).collect()
     }
 
-    /// At least `least` numbers from a line.
+    /// The numbers of a line, at least `least` of them.
     fn numbers(&self, line: &str, what: &str, widths: &[usize], least: usize) -> Result<Vec<f64>, RigError> {
         let fields = self.fields(line, widths);
         if fields.len() < least {
@@ -230,7 +231,7 @@ impl<'a> Lines<'a> {
         fields.iter().map(parsed).collect()
     }
 
-    /// A whole number of at least 0.
+    /// Converts `value` to a non-negative integer.
     fn count(&self, what: &str, value: f64) -> Result<u64, RigError> {
         if value >= 0.0 && value.fract() == 0.0 && value < 1e15 {
             return Ok(value as u64);
@@ -238,12 +239,12 @@ impl<'a> Lines<'a> {
         Err(self.refused_here(what, &format!("is {value}"), "a whole number of at least 0"))
     }
 
-    /// An error at the line read last, unless `holds`.
+    /// An error at the last line read unless `holds`.
     fn must(&self, holds: bool, what: &str, value: f64, limit: &str) -> Result<(), RigError> {
         if holds { Ok(()) } else { Err(self.refused_here(what, &format!("is {value}"), limit)) }
     }
 
-    /// Datasets 15 (one line a node) and 2411 (two lines a node).
+    /// Reads dataset 15 (one line per node) or 2411 (two lines per node).
     fn nodes(&mut self, lines_each: usize) -> Result<Vec<Node>, RigError> {
         let mut nodes = vec![];
         while let Some(line) = self.line()? {
@@ -257,7 +258,7 @@ impl<'a> Lines<'a> {
             };
             let label = self.count("label of a node", head[0])?;
             for (what, system) in [("definition", head[1]), ("displacement", head[2])] {
-                // 0 and 1 are both in use for the global Cartesian system.
+                // Both 0 and 1 are used for the global Cartesian system.
                 if system != 0.0 && system != 1.0 {
                     let value = format!("of node {label} is {system}");
                     return Err(self.refused_here(
@@ -272,7 +273,7 @@ impl<'a> Lines<'a> {
         Ok(nodes)
     }
 
-    /// Dataset 164: what to divide by to come to SI.
+    /// Reads dataset 164. The file gives the factors to divide by to obtain SI units.
     fn units(&mut self) -> Result<Units, RigError> {
         self.required("units")?;
         let line = self.required("factors of units")?;
@@ -284,7 +285,7 @@ impl<'a> Lines<'a> {
         Ok(Units { length_m: 1.0 / factors[0], force_n: 1.0 / factors[1] })
     }
 
-    /// Dataset 55; `None` for anything but normal modes.
+    /// Reads dataset 55; `None` for anything but normal modes.
     fn mode(&mut self) -> Result<Option<Mode>, RigError> {
         for line in 1..=5 {
             self.required(&format!("identification line {line}"))?;
@@ -333,12 +334,12 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// A number as Fortran or C writes it.
+/// Parses a number as written by Fortran or C.
 fn number(text: &str) -> Option<f64> {
     text.replace(['D', 'd'], "E").parse().ok()
 }
 
-/// The beginning of a text, for errors.
+/// The first 60 characters of a text, for errors.
 fn shown(text: &str) -> String {
     text.chars().take(60).map(|c| if c.is_control() { '.' } else { c }).collect()
 }
