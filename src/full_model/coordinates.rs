@@ -1,9 +1,9 @@
-//! Matrices as plain lines, as CalculiX and Abaqus write them, and the rows they are over.
+//! Text matrices of CalculiX and Abaqus: one entry per line, and the labels of rows.
 //!
-//! Three values: row, column, entry (CalculiX `.sti`, `.mas`; Abaqus `FORMAT=COORDINATE`). Five: node, direction, node,
-//! direction, entry (Abaqus `FORMAT=MATRIX INPUT` and `LABELS`). Commas and spaces part them; lines that begin with `*`
-//! are passed over. Where only one triangle is listed, the matrix is symmetric. CalculiX lists in its `.dof` file which
-//! `node.direction` each row is.
+//! Lines of three values hold row, column, entry (CalculiX `.sti`, `.mas`; Abaqus `FORMAT=COORDINATE`). Lines of five
+//! hold node, direction, node, direction, entry (Abaqus `FORMAT=MATRIX INPUT` and `LABELS`). Values are separated by
+//! commas or spaces; lines that begin with `*` are skipped. If only one triangle is listed, the matrix is symmetric.
+//! CalculiX lists the `node.direction` of each row in its `.dof` file.
 //!
 //! Source: Dhondt, "CalculiX CrunchiX user's manual version 2.20", *FREQUENCY, parameter SOLVER=MATRIXSTORAGE; Abaqus
 //! analysis user's guide, "Generating structural matrices".
@@ -16,19 +16,19 @@ use super::tables::Nodes;
 use crate::rig::RigError;
 use crate::rig::lines::{Lines, refuse, told};
 
-/// A diagonal entry of at least this holds its row: what Abaqus writes for a boundary condition.
+/// A diagonal entry of at least this marks a constrained row: Abaqus writes boundary conditions this way.
 const HELD: f64 = 1e35;
 
-/// A row by its labels: node and direction, from 0.
+/// The label of a row: node label, and direction from 0.
 pub type Label = (u64, usize);
 
-/// An entry as a line lists it.
+/// An entry as listed in a file; rows and columns are numbered from 0.
 enum Listed {
     Numbers(usize, usize, f64),
     Labels(Label, Label, f64),
 }
 
-/// Hands every entry to `each` with the number of its line.
+/// Calls `each` with the line number and content of every entry.
 fn scan(
     file: &str,
     input: impl BufRead,
@@ -59,7 +59,8 @@ fn scan(
             Ok(number @ 1..=6) => Ok(number - 1),
             _ => Err(refuse("direction", word, "1 to 6")),
         };
-        // A last line of labels that was cut could pass for one of numbers.
+        // Every line must have as many values as the first: a truncated line of labels could pass for one of row
+        // numbers.
         let first = *form.get_or_insert(count);
         if count != first {
             return Err(refuse("entry", content, &format!("{first} values, as in the first line")));
@@ -80,7 +81,7 @@ fn scan(
     Ok(())
 }
 
-/// The rows of a matrix with labels, ascending; those that are held are left out.
+/// The rows of a matrix that lists labels, ascending, without constrained rows.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -100,11 +101,14 @@ pub fn rows_of(file: &str, input: impl BufRead) -> Result<Vec<Label>, RigError> 
     Ok(held.into_iter().filter(|(_, held)| !held).map(|(label, _)| label).collect())
 }
 
-/// Reads a matrix of `n` rows; `row_of` says which row a label is. Labels without a row must be `held`, to which those
-/// that this matrix holds are added: others stand for rows that a file cut short no longer has.
+/// Reads a matrix of `n` rows; `row_of` maps labels to rows. Returns the entries and the sign of the mirrored triangle
+/// if only one is listed.
+///
+/// A label without a row must be constrained. Labels constrained in this matrix are added to `held`. Any other unknown
+/// label is an error, since it usually means that a file was truncated.
 ///
 /// # Errors
-/// [`RigError::Line`]; a label that `rows_file` does not know.
+/// [`RigError::Line`], also for a label that is neither in `rows_file` nor constrained.
 pub fn read(
     file: &str,
     input: impl BufRead,
@@ -136,7 +140,7 @@ pub fn read(
                             without_row.entry(label).or_insert(line);
                         }
                     }
-                    // What is held does not move.
+                    // A constrained degree of freedom does not move: its entries are dropped.
                     return Ok(());
                 }
             },
@@ -146,7 +150,7 @@ pub fn read(
         entries.push(row, column, value);
         Ok(())
     })?;
-    // By line: an error should not depend on the order in which labels are kept.
+    // The first line, so that the error does not depend on the order of a hash map.
     let unknown = without_row.into_iter().filter(|(label, _)| !held.contains(label)).min_by_key(|&(_, line)| line);
     if let Some(((node, direction), line)) = unknown {
         let value = format!("is at node {node}, direction {}", direction + 1);
@@ -156,7 +160,7 @@ pub fn read(
     Ok((entries, if below && above { None } else { Some(1) }))
 }
 
-/// The line of an entry, either way round; the last one where it is not listed.
+/// The line of an entry or of its mirror image; the last line if neither is listed.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -181,7 +185,7 @@ pub fn line_of(
     Ok(found.unwrap_or(last))
 }
 
-/// Reads a `.dof` file of CalculiX: `node.direction` of every row.
+/// Reads a CalculiX `.dof` file: the `node.direction` of each row.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -204,10 +208,10 @@ pub fn dof(file: &str, input: impl BufRead) -> Result<Vec<Label>, RigError> {
     Ok(rows)
 }
 
-/// Reads the nodes of a deck of CalculiX or Abaqus: the lines below `*NODE`, lengths multiplied by `scale`.
+/// Reads the nodes of a CalculiX or Abaqus deck, the lines below `*NODE`. Lengths are multiplied by `scale`.
 ///
 /// # Errors
-/// [`RigError::Line`].
+/// [`RigError::Line`], also for nodes in another coordinate system than the global one.
 pub fn deck_nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, RigError> {
     let mut lines = Lines::new(file, input);
     let (mut labels, mut positions, mut seen) = (vec![], vec![], HashMap::new());

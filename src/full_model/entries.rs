@@ -1,32 +1,32 @@
-//! Entries of a large sparse matrix, collected one by one and then compressed.
+//! Collects the entries of a large sparse matrix and compresses them.
 
 use faer::sparse::SymbolicSparseColMat;
 
 use crate::reduction::SparseMatrix;
 
-/// Rows and columns a matrix may have.
+/// Upper limit of rows and columns of a matrix.
 pub const MOST_ROWS: usize = u32::MAX as usize;
 
-/// Entries in any order, 16 bytes each.
+/// Entries `(row, column, value)` in any order, 16 bytes each.
 #[derive(Default)]
 pub struct Entries {
     places: Vec<(u32, u32, f64)>,
 }
 
 impl Entries {
-    /// Adds an entry; rows and columns, from 0, lie below [`MOST_ROWS`].
+    /// Adds an entry. Row and column count from 0 and are below [`MOST_ROWS`].
     pub fn push(&mut self, row: usize, column: usize, value: f64) {
         let index = |index: usize| u32::try_from(index).expect("callers keep rows and columns below MOST_ROWS");
         self.places.push((index(row), index(column), value));
     }
 
-    /// How many there are.
+    /// Number of entries.
     pub fn len(&self) -> usize {
         self.places.len()
     }
 
-    /// The `n×n` matrix, `factor` times the entries; those off the diagonal mirrored with the sign `mirrored`. Entries
-    /// at the same place add up.
+    /// The `n×n` matrix of the entries, multiplied by `factor`. If `mirrored` is a sign, off-diagonal entries are also
+    /// stored transposed with that sign. Entries at the same position add up.
     pub fn compress(self, n: usize, mirrored: Option<i8>, factor: f64) -> SparseMatrix {
         let sign = f64::from(mirrored.unwrap_or(0));
         let again = |row: u32, column: u32| mirrored.is_some() && row != column;
@@ -54,7 +54,8 @@ impl Entries {
                 put(column, row, sign * value);
             }
         }
-        // Columns are sorted and added up in place; what was added up moves the rest forward.
+        // Each column is sorted and its duplicates summed in place; later columns move forward into the space this
+        // frees.
         let (mut kept, mut from, mut column_entries) = (0, 0, vec![]);
         for column in 0..n {
             let to = starts[column + 1];

@@ -1,4 +1,4 @@
-//! The files of a full model, read once from beginning to end, and their hash.
+//! Reads the files of a full model, each in one pass, and hashes them.
 
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -9,10 +9,10 @@ use crate::hex::hex;
 use crate::input_file;
 use crate::rig::RigError;
 
-/// Bytes that are read at once.
+/// Size of the read buffer, bytes.
 const CHUNK: usize = 1 << 20;
 
-/// Files beside the TOML file, by the names it uses.
+/// The TOML file of a full model and the files it refers to, with their hashes.
 pub struct Files {
     /// Name of the TOML file, for errors.
     pub toml: String,
@@ -21,7 +21,7 @@ pub struct Files {
 }
 
 impl Files {
-    /// Reads the TOML file itself.
+    /// Opens the TOML file and returns its bytes.
     ///
     /// # Errors
     /// [`RigError::NoSuchFile`].
@@ -36,10 +36,11 @@ impl Files {
         Ok((Self { toml, directory: path.parent().unwrap_or(Path::new("")).to_owned(), digests }, bytes))
     }
 
-    /// What `work` makes of a file that `field` refers to.
+    /// Opens the file `name`, which `field` refers to, and returns the result of `work` on it. The first time, its hash
+    /// is recorded.
     ///
     /// # Errors
-    /// [`RigError::MissingFile`], those of `work`.
+    /// [`RigError::MissingFile`] and those of `work`.
     pub fn read<T>(
         &mut self,
         field: &str,
@@ -58,7 +59,7 @@ impl Files {
         let hashing = Hashing { inner: file, hasher: Sha256::new() };
         let mut reader = BufReader::with_capacity(CHUNK, hashing);
         let made = work(&mut reader)?;
-        // Whatever was left unread belongs to the hash all the same.
+        // The hash covers the whole file, even if `work` did not read to the end.
         io::copy(&mut reader, &mut io::sink()).map_err(missing)?;
         let digest = reader.into_inner().hasher.finalize().into();
         if !self.digests.iter().any(|(known, _)| known == name) {
@@ -72,7 +73,7 @@ impl Files {
         self.digests.iter().map(|(name, _)| name.as_str()).collect()
     }
 
-    /// SHA-256 over the names and hashes of all files, hexadecimal.
+    /// SHA-256 over names and hashes of all files, hexadecimal.
     pub fn content_hash(&self) -> String {
         let mut hasher = Sha256::new();
         for (name, digest) in &self.digests {
@@ -84,7 +85,7 @@ impl Files {
     }
 }
 
-/// Hashes what is read through it.
+/// A reader that hashes everything read through it.
 struct Hashing<R> {
     inner: R,
     hasher: Sha256,

@@ -1,8 +1,8 @@
-//! Full models from files: the matrices of a finite-element program, before anything is left out.
+//! Full models from files: the matrices of a finite-element program, before reduction.
 //!
-//! A TOML file with the common tables of a rig file and either `[pad]`, `[disc]` and `[[contact_patch]]` (`part`), or
-//! `[system]` as in rig files of kind 3. Matrices are read line by line into 16 bytes for each entry listed (`entries`);
-//! what is kept of the files is their hash (`files`).
+//! A full model is a TOML file with the common tables of a rig file and either `[pad]`, `[disc]` and
+//! `[[contact_patch]]` (`part`), or `[system]` as in rig files of kind 3. Matrices are read line by line into 16 bytes
+//! per listed entry (`entries`). The contents of the files are not kept, only their hashes (`files`).
 
 mod coordinates;
 mod entries;
@@ -27,55 +27,56 @@ use crate::rig::{Pair, RigError, patch, settings, system};
 use files::Files;
 use raw::{RawFullModel, RawPart};
 
-/// Tables that a full model has in common with rig files.
+/// Tables that full models share with rig files.
 const COMMON: [&str; 8] = ["reference", "band", "search", "friction", "load", "limits", "warning", "chart"];
 
-/// A full model with everything its files say.
+/// A full model and everything its files contain.
 #[derive(Clone, Debug)]
 pub struct FullModelFile {
-    /// Its own name.
+    /// Name of the full model.
     pub name: String,
-    /// Its equation of motion.
+    /// Equation of motion.
     pub model: FullModel,
-    /// Pad and disc; no disc where it is rigid, nothing for a system.
+    /// Nodes and rows of pad and disc; the disc is absent if rigid, both are absent for a system.
     pub geometry: Vec<PartGeometry>,
-    /// The contact pairs, in the order of the rows of `model.contact`; nodes are places in `geometry[..].nodes_m`.
+    /// Contact pairs, in the order of the rows of `model.contact`. Their nodes are indices into `geometry[..].nodes_m`.
     pub pairs: Vec<Pair>,
     /// The common tables, checked.
     pub settings: Settings,
-    /// The common tables as they are written.
+    /// The common tables as written in the file.
     pub common_tables: toml::Table,
-    /// `[[contact_patch]]` as it is written; none for a system.
+    /// `[[contact_patch]]` as written in the file; `None` for a system.
     pub contact_patches: Option<toml::Value>,
-    /// The file of each matrix of a part, by its field: `pad.mass`.
+    /// Field, such as `pad.mass`, and file name of each matrix of a part.
     matrix_files: Vec<(String, String)>,
-    /// Where its TOML file is.
+    /// Path of the TOML file.
     pub path: PathBuf,
-    /// SHA-256 of the TOML file and everything it refers to, hexadecimal.
+    /// SHA-256 of the TOML file and all files it refers to, hexadecimal.
     pub content_hash: String,
-    /// What it is made of, a line each, for [`FullModelFile::describe`].
+    /// Description of the contents, one line each, for [`FullModelFile::describe`].
     pub contents: Vec<String>,
 }
 
-/// The node of a row that belongs to no node: an inner degree of freedom of an element.
+/// Marks a row that belongs to no node: an internal degree of freedom of an element.
 pub const INTERNAL: usize = usize::MAX;
 
-/// Where the rows of a part are.
+/// Nodes and rows of a part.
 #[derive(Clone, Debug)]
 pub struct PartGeometry {
     /// Positions of all nodes, m.
     pub nodes_m: Vec<[f64; 3]>,
-    /// Node, or [`INTERNAL`], and direction of every row: 0 to 2 displacements along x, y, z; 3 to 5 rotations about them.
+    /// Node index (or [`INTERNAL`]) and direction of each row: 0 to 2 are displacements along x, y, z; 3 to 5 rotations
+    /// about them.
     pub rows: Vec<(usize, usize)>,
-    /// Nodes of the contact interface, as listed.
+    /// Node indices of the contact interface, in the order listed.
     pub interface: Vec<usize>,
-    /// Damping ratio of every mode of the part.
+    /// Damping ratio of all modes of the part.
     pub damping_ratio: Option<f64>,
 }
 
 impl FullModelFile {
-    /// Whether the TOML file at `path` has parts with matrices in files: the sign of a full model. A `[system]` may be a
-    /// rig as well.
+    /// Whether the TOML file at `path` is a full model, which its parts show: they refer to matrix files. A file with
+    /// `[system]` is not recognised, since it may also be a rig.
     pub fn is_one(path: &Path) -> bool {
         let table =
             input_file::read_text(path, input_file::TOML).ok().and_then(|text| text.parse::<toml::Table>().ok());
@@ -139,7 +140,7 @@ impl FullModelFile {
         })
     }
 
-    /// That no part has a damping ratio of its modes: the full matrices do not have them.
+    /// Checks that no part has a modal damping ratio, which the matrices of the full model cannot represent.
     ///
     /// # Errors
     /// [`RigError::Kind`].
@@ -158,11 +159,12 @@ impl FullModelFile {
         }
     }
 
-    /// The modes of pad and disc that are `wanted`, a word for each, and the residual of all others if that is asked for.
-    /// `progress` hears which part does what.
+    /// Computes the lowest modes of pad and disc: `wanted` has an entry for each. If `with_residual`, the residual
+    /// flexibility and inertia of the truncated modes are computed too. `progress` receives the index of the part and
+    /// its progress.
     ///
     /// # Errors
-    /// [`RigError::Reduction`] with those of [`keep_modes`], naming the file of a matrix that is at fault.
+    /// [`RigError::Reduction`] with the errors of [`keep_modes`], naming the file of the offending matrix.
     pub fn keep_modes(
         &self,
         wanted: &[Wanted],
@@ -191,7 +193,7 @@ impl FullModelFile {
         })
     }
 
-    /// The full model's file and, in brackets, that of the matrix which `field` names, such as `pad.mass`.
+    /// The path of the full model, followed in brackets by the file of the matrix `field`, such as `pad.mass`.
     pub fn file_of(&self, field: &str) -> String {
         let path = self.path.display();
         match self.matrix_files.iter().find(|(known, _)| known == field) {
@@ -200,7 +202,7 @@ impl FullModelFile {
         }
     }
 
-    /// What the full model is and holds, a few lines for people.
+    /// A description of the full model, in a few lines of text.
     pub fn describe(&self) -> String {
         let mut lines = vec![format!("full model {}", self.name)];
         lines.extend(self.contents.iter().cloned());
@@ -219,7 +221,7 @@ impl FullModelFile {
 }
 
 impl PartGeometry {
-    /// The rows of x, y and z of every interface node; `None` where a direction is held.
+    /// The row of each of x, y and z of every interface node; `None` if that direction is constrained.
     pub fn interface_rows(&self) -> Vec<Option<usize>> {
         let row_of: HashMap<(usize, usize), usize> =
             self.rows.iter().enumerate().map(|(row, &place)| (place, row)).collect();
@@ -233,7 +235,7 @@ impl PartGeometry {
     }
 }
 
-/// The file of each matrix of pad and disc.
+/// Field and file name of each matrix of pad and disc.
 fn matrix_files(raw: &raw::Own) -> Vec<(String, String)> {
     let parts = [("pad", &raw.pad), ("disc", &raw.disc)];
     let named = parts.into_iter().filter_map(|(name, part)| Some((name, part.as_ref()?)));
@@ -245,7 +247,7 @@ fn matrix_files(raw: &raw::Own) -> Vec<(String, String)> {
         .collect()
 }
 
-/// What each kind of full model gives.
+/// The result of reading a full model of either kind.
 struct ReadModel {
     model: FullModel,
     geometry: Vec<PartGeometry>,
@@ -253,7 +255,7 @@ struct ReadModel {
     contents: Vec<String>,
 }
 
-/// `[pad]`, `[disc]` and their contact.
+/// Reads `[pad]`, `[disc]` and their contact patches.
 fn read_parts(
     files: &mut Files,
     pad: &RawPart,
@@ -326,7 +328,8 @@ fn read_parts(
     Ok(ReadModel { model, geometry, pairs, contents })
 }
 
-/// `weight` times the displacement of a node along a direction; what is held does not move.
+/// A sparse row that gives `weight` times the displacement of `node` along a direction. Constrained directions
+/// contribute nothing. `offset` is the first row of the part.
 fn displacement(
     row_of: &HashMap<(usize, usize), usize>,
     node: usize,
@@ -340,7 +343,7 @@ fn displacement(
     along.into_iter().enumerate().filter_map(row).collect()
 }
 
-/// `[system]`; which `modes` a rig keeps of it does not matter here.
+/// Reads `[system]`. Its `modes`, which only a rig uses, are ignored.
 fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Result<ReadModel, RigError> {
     let file = files.toml.clone();
     if raw.stiffness.is_empty() {

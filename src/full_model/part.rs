@@ -14,15 +14,15 @@ use crate::reduction::{FullPart, SYMMETRY_TOLERANCE, SparseMatrix};
 use crate::rig::settings::within;
 use crate::rig::{RigError, lines, matrix_market};
 
-/// A part with what its rows are.
+/// A part with its nodes and rows.
 pub struct Part {
     pub part: FullPart,
     pub geometry: PartGeometry,
-    /// The row of each direction of each node.
+    /// Row of each node index and direction.
     pub row_of: HashMap<(usize, usize), usize>,
 }
 
-/// A matrix and where it was read.
+/// A matrix and the file it was read from.
 struct Read<'a> {
     field: String,
     file: &'a str,
@@ -30,14 +30,14 @@ struct Read<'a> {
     row_of: &'a HashMap<Label, usize>,
 }
 
-/// What is known of a matrix before it is read.
+/// What a matrix file must match, known before it is read.
 pub struct Expected<'a> {
     pub rows: usize,
-    /// What says so.
+    /// The file or field that determines the number of rows, for errors.
     pub told: &'a str,
-    /// The row of every label.
+    /// Row of each label.
     pub row_of: &'a HashMap<Label, usize>,
-    /// Labels that are held, as far as they are known, and have no row.
+    /// Labels known to be constrained; they have no row.
     pub held: &'a mut HashSet<Label>,
 }
 
@@ -89,7 +89,7 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
 
 type Rows = (Vec<(usize, usize)>, HashMap<(usize, usize), usize>);
 
-/// Every row with the place of its node instead of its label.
+/// Replaces the node label of every row by the index of the node. Returns the rows and the inverse map.
 fn placed(
     file: &str,
     labels: &[(u64, usize)],
@@ -105,7 +105,7 @@ fn placed(
         };
         let node = match nodes.place(label) {
             Some(node) => node,
-            // CalculiX gives the incompatible modes of its bricks nodes of their own.
+            // CalculiX assigns the incompatible modes of its bricks to nodes of their own.
             None if internal => {
                 rows.push((INTERNAL, direction));
                 continue;
@@ -120,7 +120,7 @@ fn placed(
     Ok((rows, row_of))
 }
 
-/// The interface nodes, by their places.
+/// Indices of the interface nodes.
 fn interface(toml: &str, field: &str, labels: &[u64], nodes: &Nodes, nodes_file: &str) -> Result<Vec<usize>, RigError> {
     let refuse = |field: String, value: String, limit: String| {
         Err(RigError::Range { file: toml.to_owned(), field, value, limit })
@@ -142,7 +142,7 @@ fn interface(toml: &str, field: &str, labels: &[u64], nodes: &Nodes, nodes_file:
     Ok(places)
 }
 
-/// Reads a square matrix times `factor`; `expected` is how many rows it has and what says so.
+/// Reads a square matrix and multiplies it by `factor`; `expected` is what it must match.
 ///
 /// # Errors
 /// [`RigError`].
@@ -172,7 +172,7 @@ pub fn matrix(
         let limit = match expected {
             _ if size.columns != n || n == 0 || n >= MOST_ROWS => format!("a square matrix of 1 to {MOST_ROWS} rows"),
             Some(Expected { rows, told, .. }) if rows != n => format!("{rows}x{rows}, as {told}"),
-            // Only now is memory for n columns asked for.
+            // Checked before memory for n columns is allocated.
             None if entries.len() < n => "an entry on every place of the diagonal".to_owned(),
             _ => return Ok(entries.compress(n, size.mirrored, factor)),
         };
@@ -181,17 +181,17 @@ pub fn matrix(
     })
 }
 
-/// Whether what is left to read begins with the banner of a Matrix Market file, or with nothing at all.
+/// Whether the remaining input is a Matrix Market file (begins with its banner) or empty.
 fn is_matrix_market(input: &mut dyn BufRead) -> bool {
     input.fill_buf().is_ok_and(|start| start.is_empty() || start.starts_with(b"%"))
 }
 
-/// A file name's extension in small letters.
+/// The extension of a file name, in lower case.
 fn extension(name: &str) -> String {
     Path::new(name).extension().map(|extension| extension.to_string_lossy().to_lowercase()).unwrap_or_default()
 }
 
-/// A symmetric matrix on its own, checked.
+/// Reads a symmetric matrix and checks it.
 ///
 /// # Errors
 /// [`RigError`].
@@ -203,7 +203,8 @@ pub fn symmetric(files: &mut Files, field: &str, file: &str, mass: bool) -> Resu
 }
 
 impl Read<'_> {
-    /// That the matrix is symmetric and its diagonal what a definite one's can be.
+    /// Checks that the matrix is symmetric, has a complete diagonal, and that no diagonal entry is negative (or zero,
+    /// for a mass matrix).
     fn check(&self, files: &mut Files, mass: bool) -> Result<(), RigError> {
         let view = self.matrix.as_ref();
         for row in 0..self.matrix.nrows() {
@@ -240,7 +241,7 @@ impl Read<'_> {
         Ok(())
     }
 
-    /// An error about an entry, with the line it stands in.
+    /// An error about an entry, with the line that lists it.
     fn at_line(&self, files: &mut Files, place: (usize, usize), value: String, limit: &str) -> RigError {
         let found = files.read(&self.field, self.file, |input| {
             if is_matrix_market(input) {
@@ -256,7 +257,7 @@ impl Read<'_> {
     }
 }
 
-/// The line in which an entry of a Matrix Market file stands; the last one where it is not listed at all.
+/// The line of an entry in a Matrix Market file; the last line if it is not listed.
 fn line_of(file: &str, input: impl BufRead, (row, column): (usize, usize)) -> Result<usize, RigError> {
     let mut lines = lines::Lines::new(file, input);
     let (mut size_seen, mut last) = (false, 1);

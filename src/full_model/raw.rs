@@ -1,4 +1,4 @@
-//! Full models as they are written: every key, nothing checked but its type.
+//! The serde form of full models: every key, checked only for its type.
 
 use serde::Deserialize;
 
@@ -7,7 +7,7 @@ use crate::rig::raw::{
     RawWarning,
 };
 
-/// A whole full model: the common tables of a rig file, and parts or a system.
+/// A whole full model: the common tables of a rig file, and either parts or a system.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawFullModel {
@@ -48,7 +48,7 @@ pub struct RawPart {
     pub units: Units,
 }
 
-/// In which units matrices and coordinates are written.
+/// Units of matrices and coordinates.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 pub enum Units {
     /// N/m, kg, m.
@@ -61,18 +61,18 @@ pub enum Units {
 }
 
 impl Units {
-    /// What matrices are multiplied by to be in N/m and kg.
+    /// Factor that converts matrices to N/m and kg.
     pub fn of_matrices(self) -> f64 {
         if self == Self::MetreKilogram { 1.0 } else { 1e3 }
     }
 
-    /// What coordinates are multiplied by to be in m.
+    /// Factor that converts coordinates to m.
     pub fn of_lengths(self) -> f64 {
         if self == Self::MetreKilogram { 1.0 } else { 1e-3 }
     }
 }
 
-/// The parts of a full model beside its common tables.
+/// The tables that a full model does not share with rig files.
 pub struct Own {
     pub name: String,
     pub pad: Option<RawPart>,
@@ -82,7 +82,7 @@ pub struct Own {
 }
 
 impl RawFullModel {
-    /// The common tables, as those of a rig file without substructures, and the rest.
+    /// Splits into the common tables, as a rig file without substructures, and the other tables.
     pub fn split(self) -> (RawRig, Own) {
         let own = Own {
             name: self.name.clone(),

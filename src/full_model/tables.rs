@@ -1,4 +1,4 @@
-//! Nodes and rows of a part, as CSV tables.
+//! CSV tables of the nodes and rows of a part.
 
 use std::collections::HashMap;
 use std::io::BufRead;
@@ -6,29 +6,29 @@ use std::io::BufRead;
 use crate::rig::RigError;
 use crate::rig::lines::{Lines, told};
 
-/// Directions of the rows of a node, in the order of their numbers.
+/// Directions of the rows of a node, in numerical order.
 const DIRECTIONS: [&str; 6] = ["x", "y", "z", "rx", "ry", "rz"];
 
-/// Nodes by their labels.
+/// Positions of nodes, accessible by label.
 pub struct Nodes {
     pub positions: Vec<[f64; 3]>,
-    /// Position in `positions` of every label; labels of a table without any count from 0.
+    /// Index into `positions` of every label. Without labels in the table, nodes are labelled from 0.
     place: HashMap<u64, usize>,
 }
 
 impl Nodes {
-    /// Nodes with labels, in the order of their lines.
+    /// Nodes from labels and positions, both in the order of the file.
     pub fn new(labels: &[u64], positions: Vec<[f64; 3]>) -> Self {
         Self { place: labels.iter().enumerate().map(|(place, &label)| (label, place)).collect(), positions }
     }
 
-    /// Where the node of that label is.
+    /// Index of the node with this label.
     pub fn place(&self, label: u64) -> Option<usize> {
         self.place.get(&label).copied()
     }
 }
 
-/// Reads `x_m,y_m,z_m`, or with a column `node` of labels before; lengths are multiplied by `scale`.
+/// Reads a table `x_m,y_m,z_m` or `node,x_m,y_m,z_m`, where `node` is a label. Lengths are multiplied by `scale`.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -74,7 +74,7 @@ pub fn nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, RigEr
     Ok(Nodes::new(&labels, positions))
 }
 
-/// Reads `node,direction`: which row of the matrices is which direction of which node, as labels.
+/// Reads a table `node,direction`: node label and direction of each matrix row.
 ///
 /// # Errors
 /// [`RigError::Line`].
@@ -104,7 +104,7 @@ pub fn rows(file: &str, input: impl BufRead) -> Result<Vec<(u64, usize)>, RigErr
     Ok(rows)
 }
 
-/// The first line without spaces.
+/// The first line, with all spaces removed.
 fn header<R: BufRead>(lines: &mut Lines<'_, R>) -> Result<String, RigError> {
     let header = lines.advance()?.map(|(_, text)| text.chars().filter(|c| !c.is_whitespace()).collect::<String>());
     Ok(header.unwrap_or_default())
