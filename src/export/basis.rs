@@ -1,4 +1,5 @@
-//! A full model on a parametric basis to a rig file: pad and disc on shared coordinates, or a system of small matrices.
+//! Writes a full model on a parametric basis as a rig: pad and disc on shared coordinates, or a system of small
+//! matrices.
 
 use anyhow::{Context, bail};
 use faer::Mat;
@@ -13,10 +14,11 @@ use crate::physics::{Law, Term};
 use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
 use crate::rig::RigFile;
 
-/// The files of a rig on `basis`: the rig file, called `file`, first, then what it names.
+/// The files of a rig on `basis`: the rig file, called `file`, followed by the files it refers to. `known` is the
+/// certificate, if the rig has been compared.
 ///
 /// # Errors
-/// A full model that cannot be read again, what cannot be put into words of TOML.
+/// A table that cannot be serialised as TOML, a matrix or archive that cannot be written.
 pub fn basis_rig(
     file: &str,
     full: &FullModelFile,
@@ -49,7 +51,7 @@ pub fn basis_rig(
             ModalSide {
                 name: &part.name,
                 nodes_m: geometry.interface_m(),
-                // A rigid-body motion is found a rounding above or below zero.
+                // Rounding may leave `ω²` of a rigid-body motion slightly negative.
                 omega_rad_s: projected.omega_squared.iter().map(|square| square.max(0.0).sqrt()).collect(),
                 phi: Mat::from_fn(rows.len(), projected.omega_squared.len(), |i, k| {
                     rows[i].map_or(0.0, |row| projected.basis[(offset + row, k)])
@@ -66,7 +68,7 @@ pub fn basis_rig(
     modal_rig(file, &remarks, &common, full.contact_patches.as_ref(), known, &sides, None)
 }
 
-/// The common tables of the full model, what a rig searches and prepares cut down to what the basis was made for.
+/// The common tables of the full model, with the ranges of `[search]` and `[chart]` replaced by those of the basis.
 fn within(common: &toml::Table, request: &ParametricRequest) -> toml::Table {
     let mut tables = common.clone();
     let mut set = |table: &str, key: &str, value: toml::Value| {
@@ -80,7 +82,7 @@ fn within(common: &toml::Table, request: &ParametricRequest) -> toml::Table {
         set("search", "mu_max", range.friction_coefficient[1].into());
     }
     for (key, [low, high]) in [("normal_load_n", range.normal_load_n), ("disc_speed_rad_s", range.disc_speed_rad_s)] {
-        // A chart wants a range, of positive numbers.
+        // A chart needs a range of positive numbers with an interior.
         if 0.0 < low && low < high {
             set("chart", key, vec![low, high].into());
         }
@@ -88,7 +90,7 @@ fn within(common: &toml::Table, request: &ParametricRequest) -> toml::Table {
     tables
 }
 
-/// `[system]` of dense matrices in array form; the mass matrix is the unit matrix.
+/// A rig with `[system]`: dense matrices in array format, and a unit mass matrix.
 fn system_rig(
     file: &str,
     basis: &ParametricBasis,
@@ -148,7 +150,7 @@ fn system_rig(
     Ok(files)
 }
 
-/// What the basis was made for and how good it was found, as `[basis]`.
+/// The table `[basis]`: the range of conditions, the tolerance and the largest error at held-out points.
 fn record(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricBasis) -> toml::Table {
     let range = |[low, high]: [f64; 2]| toml::Value::from(vec![low, high]);
     let mut table = toml::Table::new();
@@ -163,7 +165,7 @@ fn record(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricB
     table
 }
 
-/// What the rig was made of, for its head.
+/// Comment lines at the top of the rig file: what the rig was made of.
 fn remarks(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricBasis) -> Vec<String> {
     let mut lines = source_remarks(full);
     lines.push(format!(

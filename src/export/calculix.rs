@@ -1,16 +1,16 @@
-//! Decks of CalculiX (and, but for the springs' order, Abaqus): nodes, `C3D8I` bricks, materials, supports, springs,
-//! equations of hanging nodes, and a frequency step.
+//! Decks of CalculiX and, except for the order of the springs, of Abaqus: nodes, `C3D8I` bricks, materials, supports,
+//! springs, equations of hanging nodes, and a frequency step.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use crate::fem::{Spring, Structure};
 
-/// Writes a structure as a deck that asks for the `modes` lowest natural frequencies; nodes and bricks count from 1, units
-/// are SI. CalculiX reads no field of more than 20 characters: numbers have 13 digits.
+/// Writes a structure as a deck that computes the `modes` lowest natural frequencies. Nodes and bricks count from 1;
+/// units are SI. Numbers have 13 digits, because CalculiX reads at most 20 characters per field.
 ///
 /// # Errors
-/// What the writer reports.
+/// Those of the writer.
 pub fn write_deck(structure: &Structure, heading: &str, modes: usize, out: &mut impl Write) -> io::Result<()> {
     let mesh = &structure.mesh;
     writeln!(out, "*HEADING\n{heading}\n*NODE, NSET=ALL")?;
@@ -42,7 +42,7 @@ pub fn write_deck(structure: &Structure, heading: &str, modes: usize, out: &mut 
                 .chain(weights)
                 .map(|(node, weight)| format!("{}, {direction}, {weight:.12e}", node + 1))
                 .collect();
-            // At most four terms fit on a line.
+            // A line holds at most four terms.
             for line in terms.chunks(4) {
                 writeln!(out, "{}", line.join(", "))?;
             }
@@ -52,10 +52,10 @@ pub fn write_deck(structure: &Structure, heading: &str, modes: usize, out: &mut 
     writeln!(out, "*STEP\n*FREQUENCY\n{modes}\n*NODE FILE\nU\n*END STEP")
 }
 
-/// What makes springs alike: whether they join two nodes, their direction, the bits of their stiffness.
+/// Key of identical springs: whether they join two nodes, their direction, the bits of their stiffness.
 type Kind = (bool, usize, u64);
 
-/// Springs that are alike share a set and a stiffness; elements count on after the `bricks`.
+/// Writes springs, those with the same key as one set. Element numbers continue after the `bricks`.
 fn write_springs(springs: &[Spring], bricks: usize, out: &mut impl Write) -> io::Result<()> {
     let mut alike: BTreeMap<Kind, Vec<(usize, &Spring)>> = BTreeMap::new();
     for (index, spring) in springs.iter().enumerate() {

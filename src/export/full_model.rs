@@ -1,4 +1,4 @@
-//! The full model of the tribometer: a TOML file that names matrices, nodes and the contact patch.
+//! Writes the full model of the tribometer: a TOML file with its matrices, nodes and contact patch.
 
 use std::io::Write;
 use std::path::Path;
@@ -9,16 +9,16 @@ use super::{write_deck, write_mesh, write_symmetric};
 use crate::fem::tribometer::{CONTACT_STIFFNESS_N_PER_M, Part, Tribometer};
 use crate::io::whole_file::write_whole;
 
-/// The band holds the paper's first 18 modes, up to 3256 Hz, and a margin.
+/// Upper end of the band: includes the paper's first 18 modes, which reach 3256 Hz, with a margin.
 const BAND_HZ: f64 = 4000.0;
-/// Friction coefficients of interest: the paper's go to 1.
+/// Largest friction coefficient searched, the largest in the paper.
 const MU_MAX: f64 = 1.0;
-/// Frequencies that a deck asks for.
+/// Number of natural frequencies a deck computes.
 const DECK_MODES: usize = 20;
 
-/// Writes into `folder`, made where it is missing: of each part the matrices, nodes, map from rows to nodes and a CalculiX
-/// deck; the mesh of both as VTK; and last `tribometer.toml`, which is thus there when all of it is. `say` hears the name
-/// of each file that is there.
+/// Writes the full model into `folder`, which is created if necessary. For each part: matrices, nodes, rows and a
+/// CalculiX deck; for both: the mesh as VTK. `tribometer.toml` is written last, so it exists only if everything else
+/// does. `say` receives the name of each file once it is written.
 ///
 /// # Errors
 /// A part that cannot be assembled, a file that cannot be written.
@@ -45,7 +45,7 @@ pub fn write_full_model(tribometer: &Tribometer, folder: &Path, mut say: impl Fn
     Ok(())
 }
 
-/// The files of one part; returns its table of the full model.
+/// Writes the files of one part and returns its TOML table.
 fn write_part(name: &str, part: &Part, folder: &Path, say: &mut impl FnMut(&str)) -> anyhow::Result<String> {
     let structure = &part.structure;
     let file = |what: &str| format!("{name}-{what}");

@@ -1,4 +1,4 @@
-//! Matrix Market files of symmetric sparse matrices and of dense ones.
+//! Writes symmetric sparse matrices and dense matrices as Matrix Market files.
 //!
 //! Source: Boisvert, Pozo, Remington, "The Matrix Market exchange formats", NISTIR 5935 (1996).
 
@@ -6,10 +6,11 @@ use std::io::{self, Write};
 
 use crate::reduction::SparseMatrix;
 
-/// Writes the lower triangle of a symmetric matrix in coordinate form, every value with the digits that give it back.
+/// Writes the lower triangle of a symmetric matrix in coordinate format. Values have enough digits to be read back
+/// exactly.
 ///
 /// # Errors
-/// What the writer reports.
+/// Those of the writer.
 pub fn write_symmetric(matrix: &SparseMatrix, comment: &str, out: &mut impl Write) -> io::Result<()> {
     let lower = || matrix.as_ref().triplet_iter().filter(|entry| entry.row >= entry.col && *entry.val != 0.0);
     writeln!(out, "%%MatrixMarket matrix coordinate real symmetric")?;
@@ -21,10 +22,10 @@ pub fn write_symmetric(matrix: &SparseMatrix, comment: &str, out: &mut impl Writ
     Ok(())
 }
 
-/// Writes a dense matrix in array form, column by column, every value with the digits that give it back.
+/// Writes a dense matrix in array format, by columns. Values have enough digits to be read back exactly.
 ///
 /// # Errors
-/// What the writer reports.
+/// Those of the writer.
 pub fn write_array(matrix: &faer::Mat<f64>, comment: &str, out: &mut impl Write) -> io::Result<()> {
     writeln!(out, "%%MatrixMarket matrix array real general")?;
     writeln!(out, "% {comment}")?;

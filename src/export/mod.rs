@@ -1,5 +1,5 @@
-//! Finite-element models to files: matrices, the full model that names them, decks and pictures for other programs, and
-//! what a reduction leaves of them as rig files.
+//! Writes finite-element models to files: matrices, full models, decks and meshes for other programs, and reduced
+//! models as rig files.
 
 mod basis;
 mod calculix;

@@ -1,4 +1,5 @@
-//! Reduced models to rig files: modal data as archives under names with their hash, then the rig file that names them.
+//! Writes reduced models as rigs: archives of modal data with a hash in their names, and the rig file that refers to
+//! them.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -17,15 +18,15 @@ use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullPart, Kept, Residual};
 use crate::rig::RigFile;
 
-/// The name of the rig in a rig file called `file`.
+/// Name of the rig in a rig file called `file`: the file name without its extension.
 pub(super) fn rig_name(file: &str) -> String {
     Path::new(file).file_stem().map_or(file.into(), |stem| stem.to_string_lossy()).into_owned()
 }
 
-/// Digits of a hash that a name carries.
+/// Number of hexadecimal digits of a hash in a file name.
 pub const HASH_DIGITS: usize = 12;
 
-/// A rigid-body motion is found this far from zero at most, relative to the highest square kept.
+/// Most negative `ω²` accepted as a rounded rigid-body motion, relative to the highest `ω²` kept.
 const ROUNDING: f64 = 1e-6;
 
 /// One side of a rig of kind 2.
@@ -35,22 +36,22 @@ pub struct ModalSide<'a> {
     pub name: &'a str,
     /// Positions of the `c` interface nodes, m.
     pub nodes_m: Vec<[f64; 3]>,
-    /// `ω`, rad/s, ascending.
+    /// `ω` of the modes, rad/s, ascending.
     pub omega_rad_s: Vec<f64>,
-    /// `Φ`, `3c` by modes, kg^-1/2; x, y and z of every node.
+    /// `Φ`, kg^-1/2, `3c` by modes; rows are x, y and z of each node.
     pub phi: Mat<f64>,
-    /// Between x, y and z of every node.
+    /// Residual flexibility and inertia between x, y and z of the nodes.
     pub residual: Option<&'a Residual>,
-    /// Of every mode.
+    /// Damping ratio of all modes.
     pub damping_ratio: Option<f64>,
-    /// This side's part of the unit mass matrix, where the columns of `phi` move the other side too.
+    /// This side's contribution to the unit mass matrix, if the columns of `phi` also move the other side.
     pub mass_share: Option<Mat<f64>>,
 }
 
-/// What was kept of pad and disc of a full model.
+/// The sides of a rig, from the modes kept of pad and disc of a full model.
 ///
 /// # Errors
-/// A part whose stiffness is indefinite by more than a rounding.
+/// A part whose stiffness matrix is indefinite beyond rounding.
 pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Result<Vec<ModalSide<'a>>> {
     for (part, kept) in full.model.parts.iter().zip(kept) {
         let squares = &kept.modes.omega_squared;
@@ -66,7 +67,7 @@ pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Res
         ModalSide {
             name: &part.name,
             nodes_m: geometry.interface_m(),
-            // A rigid-body motion is found a rounding above or below zero.
+            // Rounding may leave `ω²` of a rigid-body motion slightly negative.
             omega_rad_s: kept.modes.omega_squared.iter().map(|square| square.max(0.0).sqrt()).collect(),
             phi: Mat::from_fn(rows.len(), phi.ncols(), |i, mode| rows[i].map_or(0.0, |row| phi[(row, mode)])),
             residual: kept.residual.as_ref(),
@@ -77,7 +78,7 @@ pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Res
     Ok(full.model.parts.iter().zip(&full.geometry).zip(kept).map(side).collect())
 }
 
-/// Lines of comment: what a rig was reduced from.
+/// Comment lines that name the full model a rig was reduced from.
 pub fn source_remarks(full: &FullModelFile) -> Vec<String> {
     let file = full.path.file_name().unwrap_or_default().to_string_lossy();
     vec![
@@ -91,7 +92,7 @@ pub fn source_remarks(full: &FullModelFile) -> Vec<String> {
 }
 
 impl ModalSide<'_> {
-    /// The arrays that a rig of kind 2 reads.
+    /// The modal data as an archive that a rig of kind 2 reads.
     fn archive(&self) -> std::io::Result<Vec<u8>> {
         let (count, modes, phi) = (self.nodes_m.len(), self.omega_rad_s.len(), &self.phi);
         let mut arrays = vec![
@@ -111,7 +112,7 @@ impl ModalSide<'_> {
     }
 }
 
-/// What the modes left out do between contact pairs, as a rig of kind 2 reads it.
+/// Residual flexibility between contact pairs as an archive that a rig of kind 2 reads.
 fn residual_archive(residual: &ResidualFlexibility) -> std::io::Result<Vec<u8>> {
     let c = residual.normal.nrows();
     let lower = |m: &Mat<f64>| (0..c).flat_map(|i| (0..=i).map(move |j| m[(i, j)])).collect::<Vec<f64>>();
@@ -130,13 +131,13 @@ fn by_rows(matrix: &Mat<f64>) -> Vec<f64> {
     (0..matrix.nrows()).flat_map(|i| (0..matrix.ncols()).map(move |j| matrix[(i, j)])).collect()
 }
 
-/// An archive of arrays: name, shape and values in C order, as `numpy.savez` would write it.
+/// An `.npz` archive of arrays, as `numpy.savez` would write it; `arrays` are names, shapes and values in C order.
 fn packed(arrays: &[(&str, Vec<usize>, Vec<f64>)]) -> std::io::Result<Vec<u8>> {
     let mut bytes = Cursor::new(vec![]);
     let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
     for (name, shape, values) in arrays {
         let shape: Vec<u64> = shape.iter().map(|&length| length as u64).collect();
-        // The time of writing would make the same modes another archive.
+        // A fixed time stamp: equal modes must give equal archives.
         let options = FileOptions::default().last_modified_time(DateTime::default());
         let array = archive.array(name, options).map_err(std::io::Error::other)?;
         let mut writer = array.default_dtype().shape(&shape).begin_nd()?;
@@ -147,14 +148,15 @@ fn packed(arrays: &[(&str, Vec<usize>, Vec<f64>)]) -> std::io::Result<Vec<u8>> {
     Ok(bytes.into_inner())
 }
 
-/// The files of a rig of kind 2: the rig file, called `file`, first, then the archives it names.
+/// The files of a rig of kind 2: the rig file, called `file`, followed by the archives it refers to.
 ///
-/// The rig is named as its file. `common` are the tables that full models and rigs share; `patches` is `contact_patch` with
-/// nodes counted as in the sides; `reduction`, where it is known, is how far the rig is from its full model; `remarks` are
-/// lines of comment at the top; `residual` is what the modes left out do between pairs, where the sides do not have it.
+/// The name of the rig is that of its file. `remarks` are comment lines at the top; `common` are the tables that full
+/// models and rigs share. `patches` is `contact_patch` with nodes numbered as in `sides`. `reduction` is the
+/// certificate, if the rig has been compared. `residual` is residual flexibility between pairs, if the sides do not
+/// have it themselves.
 ///
 /// # Errors
-/// What could not be put into words of TOML or into an archive.
+/// A table that cannot be serialised as TOML, an archive that cannot be written.
 pub fn modal_rig(
     file: &str,
     remarks: &[String],

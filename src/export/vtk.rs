@@ -1,4 +1,4 @@
-//! Meshes to look at: legacy VTK files, binary, which ParaView, PyVista and VisIt open.
+//! Writes meshes as binary legacy VTK files, which ParaView, PyVista and VisIt open.
 
 use std::io::{self, Write};
 
@@ -9,10 +9,10 @@ use vtkio::model::{
 
 use crate::fem::Mesh;
 
-/// Writes meshes as one unstructured grid with the number of each brick's component, counted on from mesh to mesh.
+/// Writes meshes as one unstructured grid. Each brick carries the number of its component, counted across all meshes.
 ///
 /// # Errors
-/// What the writer reports, and meshes with more nodes than the format can count.
+/// Those of the writer; meshes with more nodes than the format can count.
 pub fn write_mesh(meshes: &[&Mesh], title: &str, out: &mut impl Write) -> io::Result<()> {
     let points: Vec<f64> = meshes.iter().flat_map(|mesh| mesh.nodes_m.as_flattened()).copied().collect();
     let bricks: usize = meshes.iter().map(|mesh| mesh.bricks.len()).sum();
@@ -21,7 +21,7 @@ pub fn write_mesh(meshes: &[&Mesh], title: &str, out: &mut impl Write) -> io::Re
     let (mut first_node, mut first_component) = (0, 0);
     for mesh in meshes {
         for brick in &mesh.bricks {
-            // The corners of a hexahedron come in the order of a brick's.
+            // VTK orders the corners of a hexahedron as a brick does.
             vertices.push(8);
             for node in brick.nodes {
                 vertices.push(count(first_node + node)?);
