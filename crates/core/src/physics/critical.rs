@@ -1,8 +1,9 @@
-//! Windows of instability in the friction coefficient, and their ends to 1e-10.
+//! Windows of instability in the friction coefficient, with ends accurate to 1e-10.
 //!
-//! A coalescence is bracketed on the discriminant of its pair, `d = ((λ₁² - λ₂²)/2)²`, which is analytic and passes
-//! through zero with a slope, where the growth rate starts like a square root and its zero depends on the threshold.
-//! A damped mode crosses `σ = 0` itself. A static root crosses `λ² = 0`, in a damped model `λ = 0`.
+//! The end of a coalescence is found on the discriminant of its pair, `d = ((λ₁² - λ₂²)/2)²`. The discriminant is
+//! analytic and crosses zero with a nonzero slope; the growth rate starts like a square root there, so its zero would
+//! depend on the threshold. For a damped mode the zero of `σ` itself is found. A static root crosses `λ² = 0`, in a
+//! damped model `λ = 0`.
 
 use std::collections::BTreeMap;
 
@@ -14,19 +15,19 @@ use super::spectrum::{Root, Spectrum, Vectors};
 use super::stability_map::{MapError, MapOptions, Node, StabilityMap, mirror};
 use super::tracking::{Continuation, tracked};
 
-/// How an instability comes about.
+/// Cause of an instability.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum WindowKind {
-    /// Two undamped modes merge and one of them grows (flutter).
+    /// Two undamped modes merge and one of the two grows (flutter).
     Coalescence,
-    /// The growth rate of a damped mode passes through zero.
+    /// The growth rate of a damped mode crosses zero.
     ZeroGrowth,
-    /// A root that does not oscillate grows (static divergence).
+    /// A static root grows (divergence).
     Divergence,
 }
 
 impl WindowKind {
-    /// Its name in output.
+    /// Name of the kind in output.
     pub fn name(self) -> &'static str {
         match self {
             Self::Coalescence => "coalescence",
@@ -36,30 +37,32 @@ impl WindowKind {
     }
 }
 
-/// An interval of the friction coefficient in which a mode, or a pair of modes, is unstable.
+/// An interval of the friction coefficient in which a mode or a pair of modes is unstable.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Window {
-    /// The pair of a coalescence, the mode of a zero growth; of a divergence the root where it is followed, or none.
+    /// Identities: the pair of a coalescence; the mode of a zero growth; the root of a divergence, or empty if static
+    /// roots are not followed.
     pub mode_ids: Vec<u32>,
-    /// Where it begins.
+    /// Friction coefficient at which it begins.
     pub mu_from: f64,
-    /// Where it ends; `None` where it is still open at the end of the range.
+    /// Friction coefficient at which it ends; `None` if it is still open at the upper end of the range.
     pub mu_to: Option<f64>,
-    /// Frequency where it begins, Hz; 0 for a divergence.
+    /// Frequency at its lower end, Hz; 0 for divergence.
     pub frequency_hz: f64,
-    /// Frequency where it ends, Hz; `None` where it is still open at the end of the range.
+    /// Frequency at its upper end, Hz; `None` if it is still open at the upper end of the range.
     pub frequency_to_hz: Option<f64>,
-    /// How it comes about.
+    /// The cause of the instability.
     pub kind: WindowKind,
 }
 
-/// Samples of an interpolated quantity inside an interval.
+/// Number of points inside an interval at which an interpolated quantity is sampled.
 const SAMPLES: usize = 9;
-/// An interpolated discriminant must keep this share of its smaller end value for an interval to be free of merging.
+/// An interval is free of merging if the interpolated discriminant keeps at least this share of its smaller end
+/// value.
 const CLEARANCE: f64 = 0.25;
 
-/// Whether nothing hides between two neighbouring spectra: no merging of a pair that the ends do not show, no growth
-/// rate that passes its threshold and comes back.
+/// Whether the interval between two neighbouring spectra hides nothing: no pair merges without the ends showing it,
+/// and no growth rate crosses its threshold and returns.
 ///
 /// Pair discriminants and growth rates are interpolated by cubics through values and sensitivities at both ends.
 pub(super) fn is_resolved(left: &Spectrum, right: &Spectrum, link: &Continuation, options: &MapOptions) -> bool {
@@ -79,17 +82,18 @@ pub(super) fn is_resolved(left: &Spectrum, right: &Spectrum, link: &Continuation
             .all(|(k, &first)| branches[..k].iter().all(|&second| pair_is_resolved(left, right, first, second, step)))
 }
 
-/// A coupled pair may part within an interval, or two single roots meet; that a root leaves one partner for another
-/// takes a part and a meeting, which have to be seen one by one.
+/// Whether the partner of a branch changes at most once within the interval. A coupled pair may separate or two
+/// single roots may merge. A change from one partner to another takes a separation and a merging, which must lie in
+/// different intervals.
 fn partner_is_kept(left: &Spectrum, right: &Spectrum, &(i, j): &(usize, usize), link: &Continuation) -> bool {
     let before = mirror(left, i);
     let after = mirror(right, j).map(|partner| link.source[partner]);
     match (before, after) {
         (None, None) => true,
         (Some(before), Some(after)) => after == Some(before),
-        // They met: the partner was single as well.
+        // They merged: the partner must have been single too.
         (None, Some(after)) => after.is_some_and(|after| mirror(left, after).is_none()),
-        // They parted: the partner is single now as well.
+        // They separated: the partner must be single now too.
         (Some(before), None) => {
             let now = link.source.iter().position(|&source| source == Some(before));
             now.is_some_and(|now| mirror(right, now).is_none())
@@ -97,12 +101,13 @@ fn partner_is_kept(left: &Spectrum, right: &Spectrum, &(i, j): &(usize, usize), 
     }
 }
 
-/// Whether a root lies in the band of interest.
+/// Whether the frequency of a root lies in the band.
 fn is_judged(root: &Root, options: &MapOptions) -> bool {
     options.band_max_hz.is_none_or(|max_hz| root.frequency_hz() <= max_hz)
 }
 
-/// Two branches that stay far apart, or whose discriminant is seen to keep away from zero or to pass it once.
+/// Whether two branches stay far apart, or their interpolated discriminant stays away from zero or crosses it exactly
+/// once.
 fn pair_is_resolved(
     left: &Spectrum,
     right: &Spectrum,
@@ -129,7 +134,7 @@ fn pair_is_resolved(
     if least >= CLEARANCE * d_left.norm().min(d_right.norm()) {
         return true;
     }
-    // A discriminant that is real and changes sign passes zero; once, if it falls or rises all the way.
+    // A real discriminant that changes sign crosses zero; exactly once if it is monotonic.
     let real = |d: c64| d.im.abs() <= 1e-9 * d.norm();
     let rises = (d_right.re - d_left.re).signum();
     let mut path = vec![d_left.re];
@@ -141,12 +146,12 @@ fn pair_is_resolved(
         && path.windows(2).all(|pair| (pair[1] - pair[0]) * rises > 0.0)
 }
 
-/// The growth rate of one branch keeps to its side of the threshold, or passes it once.
+/// Whether the growth rate of one branch stays on its side of the threshold or crosses it exactly once.
 fn growth_is_resolved(left: &Spectrum, i: usize, right: &Spectrum, j: usize, step: f64, threshold: f64) -> bool {
     let slope = |spectrum: &Spectrum, k: usize| spectrum.friction_sensitivity[k] / (2.0 * spectrum.roots[k].lambda);
     let (from, to) = (left.roots[i].lambda, right.roots[j].lambda);
     let (slope_from, slope_to) = (slope(left, i), slope(right, j));
-    // What the trapezoidal rule misses is what a cubic through the same data cannot be trusted with.
+    // The error of the trapezoidal rule serves as the uncertainty of the cubic through the same data.
     let off = (to - from - 0.5 * step * (slope_from + slope_to)).re.abs();
     let limit = threshold * from.norm().max(to.norm());
     let samples = (1..=SAMPLES).map(|k| hermite(from, slope_from, to, slope_to, step, fraction(k)).re);
@@ -161,35 +166,37 @@ fn fraction(k: usize) -> f64 {
     k as f64 / (SAMPLES + 1) as f64
 }
 
-/// Cubic through values and slopes at both ends of an interval of length `step`, at fraction `s` of it.
+/// Cubic Hermite interpolation: values and slopes at both ends of an interval of length `step`, evaluated at fraction
+/// `s`.
 fn hermite(a: c64, slope_a: c64, b: c64, slope_b: c64, step: f64, s: f64) -> c64 {
     let r = 1.0 - s;
     a * (r * r * (1.0 + 2.0 * s)) + b * (s * s * (3.0 - 2.0 * s)) + (slope_a * r - slope_b * s) * (step * s * r)
 }
 
-/// What a followed root does at a node.
+/// How a followed root is unstable at a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Behaviour {
-    /// Flutter of a pair: the other member's identity.
+    /// Flutter of a pair; contains the other member's identity.
     Coupled(u32),
-    /// Grows by itself.
+    /// A single mode grows.
     Growing,
-    /// Static, growing.
+    /// A static root grows.
     Diverging,
 }
 
-/// A stretch of neighbouring nodes in which a root, or a pair, behaves the same unstable way.
+/// A sequence of neighbouring nodes at which a root or pair is unstable in the same way.
 #[derive(Clone, Copy, Debug)]
 struct Stretch {
     first: usize,
     last: usize,
-    /// The largest `σ/|λ|` at its nodes.
+    /// The largest `σ/|λ|` at these nodes.
     growth: f64,
-    /// It is in the band at one of them at least. The window is the mode's, beyond the band's edge too.
+    /// Whether the root is in the band at one of these nodes at least. The window then extends beyond the edge of the
+    /// band too.
     judged: bool,
 }
 
-/// All windows of instability of a map, their ends polished.
+/// All windows of instability of a map, with their ends located by root finding.
 pub(super) fn windows(
     model: &Model,
     solver: &mut Solver,
@@ -243,7 +250,7 @@ pub(super) fn windows(
     Ok(windows)
 }
 
-/// The unstable followed roots of a node, each with how it is unstable.
+/// The unstable followed roots of a node: identity, behaviour and root.
 fn unstable(node: &Node) -> impl Iterator<Item = (u32, Behaviour, &Root)> {
     (0..tracked(&node.spectrum)).filter_map(|k| {
         let root = &node.spectrum.roots[k];
@@ -259,7 +266,7 @@ fn unstable(node: &Node) -> impl Iterator<Item = (u32, Behaviour, &Root)> {
     })
 }
 
-/// Finds the ends of windows between two nodes.
+/// Locates the ends of windows between two nodes.
 struct Polish<'a> {
     model: &'a Model,
     solver: &'a mut Solver,
@@ -268,7 +275,8 @@ struct Polish<'a> {
 }
 
 impl Polish<'_> {
-    /// The end of a window between node `inside` and its neighbour `outside`, and the frequency there in Hz.
+    /// Friction coefficient and frequency (Hz) of the end of a window between node `inside` and its neighbour
+    /// `outside`.
     fn end(
         &mut self,
         kind: WindowKind,
@@ -283,7 +291,8 @@ impl Polish<'_> {
         let (Some(outer), Some((f_inside, _))) = (outside.map(|k| &map.nodes[k]), value_inside) else {
             return Ok(here);
         };
-        // A divergence that begins where a flutter pair meets on the real axis: its end is the pair's merging.
+        // A divergence that begins where a flutter pair merges on the real axis: its end is the merging point of the
+        // pair.
         let merging = mirror_pair(outer, ids);
         let (kind, ids) = match (kind, &merging) {
             (WindowKind::Divergence, Some(pair)) => (WindowKind::Coalescence, pair.as_slice()),
@@ -301,14 +310,15 @@ impl Polish<'_> {
                 .solve(model, &map.point.with_friction(mu), Vectors::Right)
                 .map_err(|source| MapError::Solve { mu, source })?;
             let node = Node { ids: map.identify(&spectrum), spectrum };
-            // Within rounding of a merging point the pair may look either way; the discriminant does not mind.
+            // Within rounding of a merging point the roots may appear merged or separate; the discriminant is the
+            // same for both.
             Ok(quantity(kind, ids, &node).unwrap_or((0.0, here.1)))
         };
         bracketed_root(evaluate, (outer.mu(), f_outside), (inner.mu(), f_inside))
     }
 
-    /// Windows of static divergence of a damped model: stretches with a given number of growing static roots, each end
-    /// bisected on that number.
+    /// Windows of static divergence of a damped model, whose static roots are not followed. A window is an interval
+    /// in which at least a given number of static roots grow; each end is found by bisection on that number.
     fn damped_divergence(&mut self) -> Result<Vec<Window>, MapError> {
         let threshold = self.options.instability_threshold;
         let growing = |spectrum: &Spectrum| {
@@ -356,7 +366,7 @@ impl Polish<'_> {
     }
 }
 
-/// If `ids` is one member of a coupled pair at `node`, the pair.
+/// The coupled pair at `node` that contains the single identity in `ids`, if there is one.
 fn mirror_pair(node: &Node, ids: &[u32]) -> Option<Vec<u32>> {
     let [id] = *ids else { return None };
     let partner = mirror(&node.spectrum, node.find(id)?)?;
@@ -364,7 +374,8 @@ fn mirror_pair(node: &Node, ids: &[u32]) -> Option<Vec<u32>> {
     Some(vec![id.min(partner), id.max(partner)])
 }
 
-/// The quantity whose zero ends a window of `kind`, and the frequency in Hz, at a node; `None` where a root is gone.
+/// The quantity whose zero ends a window of `kind`, and the frequency in Hz, at a node; `None` if a root is not found
+/// there.
 fn quantity(kind: WindowKind, ids: &[u32], node: &Node) -> Option<(f64, f64)> {
     let root = |id: u32| node.find(id).map(|k| node.spectrum.roots[k]);
     match (kind, ids) {
@@ -381,7 +392,8 @@ fn quantity(kind: WindowKind, ids: &[u32], node: &Node) -> Option<(f64, f64)> {
 }
 
 /// Zero of a continuous function between two points of opposite sign, by inverse quadratic interpolation, secant and
-/// bisection (Brent 1973, chapter 4), to 1e-14 of the larger end; with what else the function says there.
+/// bisection (Brent 1973, chapter 4), to 1e-14 of the larger end. `evaluate` returns the function and a second value
+/// (the frequency); the result is the zero and the second value there.
 fn bracketed_root(
     mut evaluate: impl FnMut(f64) -> Result<(f64, f64), MapError>,
     (mut a, mut fa): (f64, f64),
@@ -428,7 +440,8 @@ fn bracketed_root(
     Ok((b, extra))
 }
 
-/// Where a condition that is false at the first end and true at the second changes, to 1e-13 of the larger end.
+/// The point at which a condition, false at the first end and true at the second, changes, to 1e-13 of the larger
+/// end.
 fn bisect((mut a, mut b): (f64, f64), mut holds: impl FnMut(f64) -> Result<bool, MapError>) -> Result<f64, MapError> {
     let tolerance = 1e-13 * a.abs().max(b.abs());
     while (b - a).abs() > tolerance {
@@ -471,7 +484,8 @@ mod tests {
         }
     }
 
-    /// 30-digit arithmetic on the same matrices; 14.598 is a crossing, not a bifurcation.
+    /// Expected values: 30-digit arithmetic on the same matrices. The modes meet at 14.598 too, but that is a
+    /// crossing, not a bifurcation.
     #[test]
     fn nine_dof_critical_frictions() {
         assert_starts(&nine_dof(1.0, 1.0, 1.0), 20.0, &[(0.82001495938185, [1, 2]), (2.8222527641081, [4, 5])]);
@@ -500,7 +514,7 @@ mod tests {
         }
     }
 
-    /// Two modes that cross at `μ = m`, `K = [[4 + (μ-m), w], [-w, 4 - (μ-m)]]`: flutter where `(μ - m)² < w²`.
+    /// Two modes that cross at `μ = m`, `K = [[4 + (μ-m), w], [-w, 4 - (μ-m)]]`: flutter for `(μ - m)² < w²`.
     fn crossing(m: f64, w: f64) -> Model {
         let term = |matrix, law| Term { matrix, law };
         let terms = vec![
@@ -515,13 +529,13 @@ mod tests {
         for w in [1e-1, 1e-3, 1e-5] {
             let found = starts(&crossing(0.7, w), 2.0);
             assert_eq!(found.len(), 1, "{found:?}");
-            // Rounding in d is ε·16, its slope 2w.
+            // Rounding of `d` is 16 ε, its slope is 2w.
             let limit = 1e-10f64.max(16.0 * f64::EPSILON / w);
             assert!((found[0].0 - (0.7 - w)).abs() < limit, "{found:?}");
             assert!((found[0].2.unwrap() - (0.7 + w)).abs() < limit, "{found:?}");
         }
         assert!(starts(&crossing(0.7, 0.0), 2.0).is_empty());
-        // Veering: a symmetric coupling keeps the two apart.
+        // Veering: a symmetric coupling keeps the two roots apart.
         let veering = Model::new(
             2,
             vec![
@@ -535,8 +549,8 @@ mod tests {
         assert!(starts(&veering.unwrap(), 2.0).is_empty());
     }
 
-    /// A damped mode whose growth rate is `a - b (μ - m)²`: it grows for `|μ - m| < √(a/b)`, between two of the points that are
-    /// solved first, at which it decays.
+    /// A damped mode with growth rate `a - b (μ - m)²`: it grows for `|μ - m| < √(a/b)`. Both ends lie between two
+    /// initial nodes, at which it decays.
     #[test]
     fn narrow_windows_of_damped_modes_are_found() {
         let (a, b, m) = (1e-4, 1.0, 0.71875);
@@ -557,13 +571,14 @@ mod tests {
         assert_eq!((window.kind, window.mode_ids.as_slice()), (WindowKind::ZeroGrowth, &[0][..]));
         let half: f64 = (a / b).sqrt();
         assert!((window.mu_from - (m - half)).abs() < 1e-10 && (window.mu_to.unwrap() - (m + half)).abs() < 1e-10);
-        // ω = 2 rad/s at the ends, where nothing damps.
+        // At the ends the damping is zero, so `ω = 2` rad/s.
         for hz in [window.frequency_hz, window.frequency_to_hz.unwrap()] {
             assert!((hz - 2.0 / std::f64::consts::TAU).abs() < 1e-9, "{window:?}");
         }
     }
 
-    /// Two damped modes that flutter for `(μ - m)² < w² - 4 c²`: at `λ = iω` the equation is `ω² = 4`, `c ω = √(w² - (μ - m)²)`.
+    /// Two damped modes that flutter for `(μ - m)² < w² - 4 c²`: at `λ = iω` the equation gives `ω² = 4` and
+    /// `c ω = √(w² - (μ - m)²)`.
     #[test]
     fn damping_narrows_a_window_as_by_hand() {
         let (m, w, c) = (0.7, 1e-3, 4e-4);
@@ -573,7 +588,7 @@ mod tests {
         let model = Model::new(2, terms, damping, ContactLaw::default(), None).expect("the model is well formed");
         let found = map(&model, 2.0).windows;
         let [window] = found.as_slice() else { panic!("{found:?}") };
-        // The threshold of instability does not move the ends, which are where the growth rate is zero.
+        // The ends are the zeros of the growth rate; the instability threshold does not move them.
         let half = (w * w - 4.0 * c * c).sqrt();
         assert!(
             (window.mu_from - (m - half)).abs() < 1e-9 && (window.mu_to.unwrap() - (m + half)).abs() < 1e-9,
@@ -581,7 +596,8 @@ mod tests {
         );
     }
 
-    /// Of a pair, the lower identity belongs to the growing mode, and to the lower frequency once they have parted.
+    /// While a pair is coupled, the growing mode has the lower identity; once it has separated, the lower frequency
+    /// has it.
     #[test]
     fn a_pair_that_parts_keeps_its_identities_in_order() {
         let map = map(&crossing(0.7, 1e-2), 2.0);
@@ -599,7 +615,7 @@ mod tests {
         assert!(coupled > 0 && parted > 5, "{coupled} {parted}");
     }
 
-    /// `k = 1 - μ`: diverges from `μ = 1`, damped or not.
+    /// `k = 1 - μ` diverges for `μ > 1`, with and without damping.
     #[test]
     fn static_divergence() {
         let term = |value: f64, law| Term { matrix: mat![[value]], law };
@@ -619,8 +635,8 @@ mod tests {
         }
     }
 
-    /// Every point of a scan agrees with the windows of random rigs, undamped and damped: what grows lies in a window,
-    /// and what lies well inside a window grows.
+    /// A scan over the friction coefficient agrees with the windows of random rigs, undamped and damped: every
+    /// unstable point lies in a window, and every point well inside a window is unstable.
     #[test]
     fn a_scan_agrees_with_the_windows() {
         let (mut windows, mut growing) = (0, 0);
@@ -639,7 +655,8 @@ mod tests {
                     map.windows.iter().any(|w| mu > w.mu_from + slack && w.mu_to.is_none_or(|to| mu < to - slack))
                 };
                 assert!(!unstable || inside(-1e-9), "seed {seed}: {mu} grows in none of {:?}", map.windows);
-                // Just inside an end the growth is below the threshold still, but it is there.
+                // Just inside an end the growth rate is positive but still below the instability threshold; hence
+                // 1e-11.
                 let grows = spectrum.roots.iter().any(|root| root.is_unstable(1e-11));
                 assert!(grows || !inside(1e-5), "seed {seed}: {mu} does not grow in {:?}", map.windows);
                 growing += usize::from(unstable);

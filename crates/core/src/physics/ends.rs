@@ -1,8 +1,8 @@
-//! The ends of the windows of instability at loads and speeds near those they were found at.
+//! The ends of the windows of instability at loads and speeds near those of a stability map.
 //!
-//! An end is where a condition `F(μ, p)` is zero: the discriminant of a pair, a growth rate, the square of a static root.
-//! So it moves with load, speed and contact by `dμ/dp = -F_p / F_μ`, and at another load and speed Newton's method
-//! finds it again from there in two or three solves.
+//! An end is a zero of a condition `F(μ, p)`: the discriminant of a pair, a growth rate, or the square of a static
+//! root. It therefore moves with load, speed and contact by `dμ/dp = -F_p / F_μ`. At another load and speed, Newton's
+//! method started from the extrapolated end converges in two or three solves.
 
 use super::critical::{Window, WindowKind};
 use super::model::{Model, Parameter};
@@ -12,22 +12,23 @@ use super::solver::Solver;
 use super::spectrum::{Spectrum, Vectors};
 use super::stability_map::{MapError, StabilityMap};
 
-/// How far load and speed may be, relative, from where ends are known for these to be extrapolated with a bound.
+/// Largest relative change of load and speed over which ends are extrapolated with an error bound.
 pub const REACH: f64 = 0.02;
 
-/// Steps of Newton's method before it is given up.
+/// Maximum number of Newton steps.
 const STEPS: usize = 12;
-/// A step this short, relative, is the last.
+/// Newton's method stops after a step shorter than this, relative.
 const NEAR: f64 = 1e-9;
-/// The longest step that still counts as near.
+/// Longest Newton step accepted, in friction coefficient.
 const LONGEST: f64 = 0.1;
-/// Two merging roots are told apart this far beside the merging point, relative: their discriminant has the same slope
-/// there, but their span is known to more digits.
+/// Relative distance from the merging point at which a pair is evaluated. At the merging point both roots have the
+/// same vector; beside it the discriminant has the same slope, and the difference of the roots has more accurate
+/// digits.
 const BESIDE: f64 = 1e-10;
-/// The conditions, beside the friction coefficient, that ends move with while a rig runs.
+/// The conditions other than friction that change while a rig runs; ends are extrapolated in them.
 const MOVING: [Parameter; 2] = [Parameter::Load, Parameter::Speed];
 
-/// What is zero at an end.
+/// The condition that is zero at an end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Condition {
     /// The discriminant of a pair.
@@ -38,7 +39,7 @@ enum Condition {
     Square(u32),
     /// The static root of a damped model that is nearest to zero.
     Static,
-    /// None: the edge of the range that was searched.
+    /// No condition: the end is the edge of the searched range.
     Edge,
 }
 
@@ -48,42 +49,42 @@ pub struct End {
     condition: Condition,
     /// Friction coefficient.
     pub mu: f64,
-    /// Bound of its error; NaN where nothing is known.
+    /// Bound of the error of `mu`; NaN if unknown.
     pub error: f64,
-    /// Derivatives with respect to load (1/N), speed (s/rad), contact stiffness and contact damping (relative), as
-    /// [`Parameter::ALL`] from the second on.
+    /// Derivatives of `mu` with respect to load (1/N), speed (s/rad), and contact stiffness and contact damping (per
+    /// relative change), in the order of [`Parameter::ALL`] from the second on.
     pub slope: [f64; 4],
-    /// Second derivatives with respect to load and speed.
+    /// Second derivatives of `mu` with respect to load and speed.
     curvature: [[f64; 2]; 2],
 }
 
 /// The ends of all windows of a map, at one load and speed.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Ends {
-    /// Load and speed; the friction coefficient is of no meaning.
+    /// Load and speed; the friction coefficient is not used.
     pub point: OperatingPoint,
-    /// For every window of the map, in its order, where it begins and, unless it is open, where it ends.
+    /// For every window of the map, in the map's order: its lower end and, unless the window is open, its upper end.
     pub windows: Vec<(End, Option<End>)>,
 }
 
 /// The end of a window of instability that is nearest to a friction coefficient.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NearestEnd {
-    /// Which window of the map it belongs to.
+    /// Index of the window in the map.
     pub window: usize,
-    /// Whether the window begins here, or ends here.
+    /// Whether this is the lower end of the window.
     pub is_start: bool,
-    /// Whether the friction coefficient lies in a window, this one or another.
+    /// Whether the present friction coefficient lies in any window, this one or another.
     pub inside: bool,
     /// The friction coefficient of the end.
     pub mu: f64,
-    /// Distance from the present friction coefficient to the end: negative inside a window, positive outside.
+    /// Distance from the present friction coefficient to the end, negative inside a window.
     pub margin: f64,
-    /// Bound of the error of `mu` and `margin`; NaN where none is known.
+    /// Bound of the error of `mu` and `margin`; NaN if unknown.
     pub error: f64,
 }
 
-/// A value with a bound of its error; NaN where none is known.
+/// A value with a bound of its error; the bound is NaN if unknown.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounded {
     pub value: f64,
@@ -91,9 +92,10 @@ pub struct Bounded {
 }
 
 impl End {
-    /// The end at a load and speed that differ by `moved` from where it is known.
+    /// The end extrapolated by `moved`, the change of load (N) and speed (rad/s).
     ///
-    /// `μ + μ' δ + δᵀ μ'' δ / 2`; the bound takes the last term as uncertain as it is large.
+    /// `μ + μ' δ + δᵀ μ'' δ / 2`. The error bound adds the magnitude of the quadratic term; it is NaN unless
+    /// `reached`.
     fn at(&self, moved: [f64; 2], reached: bool) -> Bounded {
         let (mut bend, mut size) = (0.0, 0.0);
         for (j, row) in self.curvature.iter().enumerate() {
@@ -124,8 +126,8 @@ impl Ends {
         Ok(Self { point: map.point, windows })
     }
 
-    /// The ends of the windows of `map` at the load and speed of `point`, which the map serves; `None` where one of
-    /// them is not found again, so that another map is due.
+    /// The ends of the windows of `map`, recomputed by Newton's method at the load and speed of `point`. `None` if
+    /// one of them is not found: a new map is needed then.
     ///
     /// # Errors
     /// [`MapError`].
@@ -151,13 +153,13 @@ impl Ends {
         Ok(Some(Self { point: point.with_friction(0.0), windows }))
     }
 
-    /// The ends at the load and speed of `point`, window by window.
+    /// The ends extrapolated to the load and speed of `point`, one entry for each window.
     pub fn at(&self, point: &OperatingPoint) -> impl Iterator<Item = (Bounded, Option<Bounded>)> + Clone {
         let (load, speed) = (self.point.normal_load_n, self.point.disc_speed_rad_s);
         let moved = [point.normal_load_n - load, point.disc_speed_rad_s - speed];
         let within = |moved: f64, at: f64| moved.abs() <= REACH * at.abs();
         self.windows.iter().map(move |(from, to)| {
-            // An end that does not move with a condition is good for any value of it.
+            // An end that does not depend on a condition is valid for any value of it.
             let reached = |end: &End| {
                 let moves = |k: usize| end.slope[k] != 0.0 || end.curvature[k] != [0.0; 2];
                 (!moves(0) || within(moved[0], load)) && (!moves(1) || within(moved[1], speed))
@@ -166,9 +168,9 @@ impl Ends {
         })
     }
 
-    /// The end of the union of the windows that is nearest to the friction coefficient of `point`, at its load and speed;
-    /// `None` without windows. An open end (beyond the searched range) is no end, and neither is one that another window
-    /// covers.
+    /// The end of the union of all windows that is nearest to the friction coefficient of `point`, at its load and
+    /// speed; `None` without windows. An end covered by another window does not count, nor does the open side of a
+    /// window that extends beyond the searched range.
     pub fn nearest(&self, point: &OperatingPoint) -> Option<NearestEnd> {
         let mu = point.friction_coefficient;
         let windows = self.at(point);
@@ -188,14 +190,14 @@ impl Ends {
         Some(NearestEnd { window, is_start, inside, mu: end.value, margin, error: end.error })
     }
 
-    /// The end that `nearest` speaks of, unless it is the edge of the searched range.
+    /// The end that `nearest` refers to; `None` if it is the edge of the searched range.
     pub fn end(&self, nearest: &NearestEnd) -> Option<&End> {
         let (from, to) = self.windows.get(nearest.window)?;
         let end = if nearest.is_start { Some(from) } else { to.as_ref() };
         end.filter(|end| end.condition != Condition::Edge)
     }
 
-    /// Every number that a prediction can depend on, as bits.
+    /// The bits of every number a prediction can depend on.
     pub fn words(&self) -> impl Iterator<Item = u64> {
         self.windows.iter().flat_map(|(from, to)| std::iter::once(from).chain(to)).flat_map(|end| {
             let numbers = [end.mu, end.error].into_iter().chain(end.slope).chain(end.curvature.into_iter().flatten());
@@ -204,14 +206,14 @@ impl Ends {
     }
 }
 
-/// The value of a condition with its derivatives and a bound of its error.
+/// Value of a condition, its derivatives in the order of [`Parameter::ALL`] and a bound of its error.
 struct Value {
     f: f64,
     slope: [f64; 5],
     error: f64,
 }
 
-/// Looks for ends.
+/// Root finding for ends.
 struct Search<'a> {
     model: &'a Model,
     solver: &'a mut Solver,
@@ -224,7 +226,7 @@ impl Search<'_> {
         solved.map_err(|source| MapError::Solve { mu, source })
     }
 
-    /// The end of `window` that the map has found at `mu`, with all there is to know of it.
+    /// The end of `window` at `mu`, where the map found it, with error bound, slopes and curvatures.
     fn first(&mut self, window: &Window, mu: f64) -> Result<End, MapError> {
         let edge = [self.map.nodes.first(), self.map.nodes.last()].iter().flatten().any(|node| node.mu() == mu);
         let condition = if edge { Condition::Edge } else { self.condition(window, mu)? };
@@ -237,7 +239,7 @@ impl Search<'_> {
         let Some(mut end) = self.carry(&end, mu, &map.point)?.filter(|found| (found.mu - mu).abs() < 1e-6) else {
             return Ok(unknown);
         };
-        // What the map has polished is at least as good.
+        // The value of the map is at least as accurate.
         end.mu = mu;
         let depends: [bool; 2] = self.model.depends_on_load_and_speed().into();
         for k in (0..2).filter(|&k| depends[k]) {
@@ -255,7 +257,7 @@ impl Search<'_> {
         Ok(end)
     }
 
-    /// What is zero where `window` ends at `mu`.
+    /// The condition that is zero at the end `mu` of `window`.
     fn condition(&mut self, window: &Window, mu: f64) -> Result<Condition, MapError> {
         Ok(match (window.kind, window.mode_ids.as_slice()) {
             (WindowKind::Coalescence, &[a, b]) => Condition::Discriminant(a, b),
@@ -266,7 +268,8 @@ impl Search<'_> {
                 let ids = map.identify(&spectrum);
                 let at = ids.iter().position(|&id| id == Some(a));
                 let square = at.map(|k| spectrum.roots[k].square);
-                // Where it ends by meeting another root on the real axis, the two are close and zero is far.
+                // If the divergence ends by merging with another root on the real axis, that root is closer than
+                // zero.
                 let partner = square.and_then(|z| {
                     let others = (0..spectrum.roots.len()).filter(|&j| Some(j) != at);
                     let distance = |j: usize| (spectrum.roots[j].square - z).norm();
@@ -281,7 +284,7 @@ impl Search<'_> {
         })
     }
 
-    /// The end at another load and speed, by Newton's method from `mu`; `None` where it does not converge.
+    /// The end at the load and speed of `point`, by Newton's method from `mu`; `None` if it does not converge.
     fn carry(&mut self, end: &End, mut mu: f64, point: &OperatingPoint) -> Result<Option<End>, MapError> {
         if end.condition == Condition::Edge {
             return Ok(Some(*end));
@@ -291,7 +294,7 @@ impl Search<'_> {
             let value = match self.value(end.condition, point, mu)? {
                 Some(value) => value,
                 None => {
-                    // Exactly at a merging point both roots have one vector.
+                    // Exactly at the merging point both roots have the same vector; evaluate beside it.
                     mu += BESIDE * unit;
                     let Some(value) = self.value(end.condition, point, mu)? else { return Ok(None) };
                     value
@@ -302,7 +305,7 @@ impl Search<'_> {
                 return Ok(None);
             }
             mu += step;
-            // What the next step would correct is of the order of this one squared.
+            // The remaining error is of the order of this step squared.
             if step.abs() <= NEAR * unit {
                 let Some(beside) = self.value(end.condition, point, mu + BESIDE * unit)? else { return Ok(None) };
                 let slope = std::array::from_fn(|k| -beside.slope[k + 1] / beside.slope[0]);
@@ -313,7 +316,7 @@ impl Search<'_> {
         Ok(None)
     }
 
-    /// The condition at `mu`; `None` where a root is gone or not to be followed.
+    /// The condition at `mu`; `None` if a root is not found or its derivatives are not available.
     fn value(&mut self, condition: Condition, point: &OperatingPoint, mu: f64) -> Result<Option<Value>, MapError> {
         let spectrum = self.solve(point, mu)?;
         let ids = self.map.identify(&spectrum);
@@ -380,8 +383,8 @@ mod tests {
         }
     }
 
-    /// An end that moves with the load has a bound up to [`REACH`] from where it is known, and none beyond; one that does not
-    /// move has it anywhere.
+    /// An end that moves with the load has a bound up to a change of [`REACH`], and none beyond. An end that does not
+    /// move has a bound everywhere.
     #[test]
     fn beyond_its_reach_an_end_has_no_bound() {
         let end = |slope: f64| End {
@@ -402,12 +405,13 @@ mod tests {
         }
     }
 
-    /// At a merging point the bound of an end holds against thirty digits, and is that of rounding, not zero.
+    /// At a merging point the error bound of an end holds against 30-digit arithmetic; it is of the size of rounding,
+    /// not zero.
     #[test]
     fn the_bound_of_an_end_holds_where_modes_merge() {
         let map = map(&nine_dof(2.0, 2.0, 5.0), &REFERENCE);
         let nearest = map.ends.nearest(&REFERENCE.with_friction(0.3)).unwrap();
-        // The reference has 14 digits.
+        // The reference value has 14 digits.
         assert!((nearest.mu - 0.35592805826058).abs() <= nearest.error + 1e-14, "{nearest:?}");
         assert!(nearest.error > f64::EPSILON && nearest.error < 1e-11, "{nearest:?}");
         let next = map.next_window(&map.ends, &REFERENCE.with_friction(0.3)).unwrap();
@@ -415,8 +419,8 @@ mod tests {
         assert_eq!(next.frequency_hz, map.windows[0].frequency_hz);
     }
 
-    /// Ends carried to another load and speed are those that a map made there finds, to 1e-10; extrapolated ones are off
-    /// by no more than their bound. Undamped and damped rigs whose stiffness and damping depend on load and speed.
+    /// Ends carried to another load and speed agree to 1e-10 with those of a map built there. Extrapolated ends stay
+    /// within their bound. Tested on undamped and damped rigs whose stiffness and damping depend on load and speed.
     #[test]
     fn ends_follow_load_and_speed() {
         let laws = [
@@ -457,8 +461,8 @@ mod tests {
         assert!(carried_ends > 15 && moved_most > 1e-3, "worth testing: {carried_ends} ends, moved by {moved_most}");
     }
 
-    /// An end moves with the contact's stiffness as the ends of a stiffer rig say. The nine degrees of freedom with
-    /// contact springs a thousandth stiffer and softer.
+    /// The derivative of an end with respect to contact stiffness agrees with a central difference.
+    /// 9-degree-of-freedom model with contact springs stiffer and softer by 1e-4.
     #[test]
     fn ends_follow_the_contact() {
         let step = 1e-4;
@@ -471,7 +475,8 @@ mod tests {
         assert!(map.ends.windows[0].0.error < 1e-12, "{:?}", map.ends.windows[0]);
     }
 
-    /// The growth rate of Hultén's damped model: its end is known with a bound, and carried to where it is it stays.
+    /// Zero growth in Hultén's damped model: the end has an error bound, and carrying it to the same load and speed
+    /// leaves it unchanged.
     #[test]
     fn damped_ends_stay() {
         let model = hulten(0.02, 0.10);

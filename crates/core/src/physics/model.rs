@@ -1,8 +1,9 @@
 //! The equation of motion of a rig, `q̈ + C(p) q̇ + K(p) q = 0`, as sums of terms.
 //!
-//! Coordinates are mass-normalised (`M = I`) for every kind of rig: substructures by their modes, systems of
-//! matrices by a Cholesky factor of `M` or by a projection on modes. A term is a constant matrix times a scalar
-//! [`Law`] of the operating point; a [`ContactPairs`] becomes such terms when the model is built.
+//! Coordinates are mass-normalised (`M = I`) for every kind of rig: substructures by their mass-normalised modes,
+//! systems given by matrices by a Cholesky factor of `M` or by projection on modes. A term is a constant matrix times
+//! a scalar [`Law`] of the operating point. Contact is given as [`ContactPairs`] and converted to terms when the
+//! model is built.
 
 use std::sync::{Arc, OnceLock};
 
@@ -12,45 +13,46 @@ use super::chart::chebyshev;
 use super::decoupled::Parts;
 use super::operating_point::{ContactState, OperatingPoint};
 
-/// A matrix times a scalar law of the operating point.
+/// A constant matrix times a scalar law of the operating point.
 #[derive(Clone, Debug)]
 pub struct Term {
     /// `n×n`; in `K` rad²/s² per unit of the law, in `C` 1/s per unit of the law.
     pub matrix: Mat<f64>,
-    /// The scalar it is multiplied by.
+    /// The scalar function that multiplies the matrix.
     pub law: Law,
 }
 
-/// The scalar that multiplies a term, as a function of the operating point.
+/// The scalar factor of a term, as a function of the operating point. Where its condition (contact closed, or
+/// sliding) does not hold, the factor is 0.
 #[derive(Clone, Debug)]
 pub enum Law {
-    /// `1`, whatever the conditions.
+    /// `1` at every operating point.
     Constant,
     /// `κ(N) = (N / N_ref)^α` while the contact is closed.
     ContactStiffness,
-    /// `s μ κ(N)` while it slides, `s` the sign of the disc speed.
+    /// `s μ κ(N)` while the contact slides; `s` is the sign of the disc speed.
     FrictionStiffness,
     /// `1` while the contact is closed.
     ContactDamping,
-    /// `s μ` while it slides.
+    /// `s μ` while the contact slides.
     FrictionDamping,
-    /// `dμ/dv · N` while it slides.
+    /// `N` while the contact slides; the matrix contains the slope `dμ/dv`.
     FrictionSlope,
-    /// `μ N / |ω|` while it slides.
+    /// `μ N / |ω|` while the contact slides.
     LateralFriction,
-    /// `x T_k(x / r)`, `x = s μ`, while it slides: one of a sum that stands for a smooth function of `μ` less its value
-    /// at 0. It does not exist for `|μ|` above `r`.
+    /// `x T_k(x / r)` with `x = s μ`, while the contact slides. A sum of such terms expands `f(x) - f(0)` of a smooth
+    /// function `f`. Undefined for `|μ| > r`.
     FrictionChebyshev { degree: usize, range: f64 },
-    /// Any other function, from a rig file's expression.
+    /// Any other function, given as an expression in the rig file.
     Custom(CustomLaw),
 }
 
-/// A law given from outside, with what it depends on.
+/// A law supplied by the caller, with the conditions it depends on.
 #[derive(Clone)]
 pub struct CustomLaw {
-    /// How it was written.
+    /// The expression as written in the rig file.
     pub text: String,
-    /// Its value. The friction coefficient handed in is 0 where the contact does not slide.
+    /// Evaluates the law. It receives a friction coefficient of 0 where the contact does not slide.
     pub evaluate: Arc<dyn Fn(&OperatingPoint) -> f64 + Send + Sync>,
     /// Whether its value changes with the normal load.
     pub depends_on_load: bool,
@@ -67,7 +69,7 @@ impl std::fmt::Debug for CustomLaw {
 }
 
 impl Law {
-    /// Its value at `p` under `contact`, with the contact in `state`.
+    /// Value of the law at `p` for the contact parameters `contact` and the contact state `state`.
     pub fn value(&self, contact: &ContactLaw, state: ContactState, p: &OperatingPoint) -> f64 {
         let closed = state != ContactState::Open;
         let sliding = state == ContactState::Sliding;
@@ -94,16 +96,16 @@ impl Law {
     }
 }
 
-/// How contact and friction depend on load and speed.
+/// Parameters of contact and friction: how both depend on load and speed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactLaw {
-    /// `α` in `k = k_ref (N / N_ref)^α`: 0 a linear spring, 1/3 Hertzian, 1 an exponential contact.
+    /// `α` in `k = k_ref (N / N_ref)^α`: 0 for a linear spring, 1/3 for Hertzian, 1 for exponential contact.
     pub exponent: f64,
     /// `N_ref`, N.
     pub reference_n: f64,
     /// `dμ/dv`, s/m; negative where friction falls with speed.
     pub slope_s_per_m: f64,
-    /// Whether friction turns with the direction of sliding and so damps motion along `b`.
+    /// Whether the friction force follows the direction of the sliding velocity, and so damps motion along `b`.
     pub lateral_damping: bool,
 }
 
@@ -113,24 +115,25 @@ impl Default for ContactLaw {
     }
 }
 
-/// Contact pairs in modal coordinates: relative displacement, pad minus disc, along the triad `n`, `t`, `b`.
+/// Contact pairs in modal coordinates. The rows map coordinates to the relative displacement, pad minus disc, along
+/// the triad `n`, `t`, `b`.
 #[derive(Clone, Debug)]
 pub struct ContactPairs {
-    /// `B_n`, `c×n`, kg^-1/2: along the normal, from disc to pad.
+    /// `B_n`, `c×n`, kg^-1/2: along the normal, which points from disc to pad.
     pub normal: Mat<f64>,
     /// `B_t`, `c×n`, kg^-1/2: along the sliding direction of the disc at positive speed.
     pub sliding: Mat<f64>,
     /// `B_b`, `c×n`, kg^-1/2: along `b = n × t`.
     pub lateral: Mat<f64>,
-    /// `k` per pair at the reference load, N/m.
+    /// Stiffness `k` of each pair at the reference load, N/m.
     pub stiffness_n_per_m: Vec<f64>,
-    /// `c` per pair, N·s/m.
+    /// Damping coefficient `c` of each pair, N·s/m.
     pub damping_n_s_per_m: Vec<f64>,
-    /// Distance of each pair from the disc's axis, m; only lateral damping uses it.
+    /// Distance of each pair from the disc's axis, m; used by lateral damping only.
     pub radius_m: Vec<f64>,
 }
 
-/// What derivatives are taken with respect to.
+/// The parameter of a derivative.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Parameter {
     /// The friction coefficient.
@@ -139,14 +142,15 @@ pub enum Parameter {
     Load,
     /// The disc speed, rad/s.
     Speed,
-    /// The logarithm of a factor on the stiffness of all contact pairs: the change for a relative change.
+    /// The logarithm of a common factor on the stiffness of all contact pairs, so that derivatives are per relative
+    /// change.
     ContactStiffness,
-    /// The logarithm of a factor on the damping of all contact pairs.
+    /// The logarithm of a common factor on the damping of all contact pairs.
     ContactDamping,
 }
 
 impl Parameter {
-    /// All of them, in the order in which derivatives are listed.
+    /// All parameters, in the order in which derivatives are listed.
     pub const ALL: [Self; 5] = [Self::Friction, Self::Load, Self::Speed, Self::ContactStiffness, Self::ContactDamping];
 }
 
@@ -186,7 +190,7 @@ pub enum ModelError {
     PointNotFinite { normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64 },
 }
 
-/// A term with what its matrix is known to be.
+/// A term, with the known symmetry of its matrix.
 #[derive(Clone, Debug)]
 pub(super) struct KnownTerm {
     pub(super) term: Term,
@@ -194,7 +198,7 @@ pub(super) struct KnownTerm {
 }
 
 impl KnownTerm {
-    /// `coefficient` of its law, a finite number.
+    /// `coefficient` of the term's law, checked to be finite.
     pub(super) fn factor(&self, coefficient: impl Fn(&Law) -> f64, p: &OperatingPoint) -> Result<f64, ModelError> {
         let value = coefficient(&self.term.law);
         if value.is_finite() {
@@ -223,23 +227,24 @@ pub struct Model {
     pub(super) has_contact: bool,
     pub(super) pad_modes: Option<usize>,
     pub(super) pad_mass: Option<Mat<f64>>,
-    /// What is coupled and what is not, once it was asked for; none where everything is.
+    /// Which coordinates are coupled and which are not, computed at first use; `None` if all are coupled.
     pub(super) parts: OnceLock<Option<Box<Parts>>>,
 }
 
-/// What [`Model::assemble`] found out about the matrices it wrote.
+/// Properties of the matrices that [`Model::assemble`] wrote.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Structure {
-    /// Any damping term has a coefficient other than zero.
+    /// Whether any damping term has a nonzero coefficient.
     pub damped: bool,
-    /// Every term of the stiffness with a coefficient other than zero is symmetric.
+    /// Whether every stiffness term with a nonzero coefficient is symmetric.
     pub symmetric_stiffness: bool,
 }
 
 impl Model {
     /// A model from its terms, without contact.
     ///
-    /// `pad_modes`: how many of the first coordinates belong to the pad; `None` where pad and disc are not told apart.
+    /// `pad_modes`: number of leading coordinates that belong to the pad; `None` if coordinates are not separated
+    /// into pad and disc.
     ///
     /// # Errors
     /// [`ModelError::Shape`], [`ModelError::NotFinite`].
@@ -270,7 +275,8 @@ impl Model {
     ///
     /// ```text
     /// K += κ(N) (B_n + s μ B_t)ᵀ K_c B_n
-    /// C += (B_n + s μ B_t)ᵀ C_c B_n + dμ/dv B_tᵀ diag(N_0) B_t + μ B_bᵀ diag(N_0 / v) B_b,   N_0 = N / c, v_k = |ω| r_k
+    /// C += (B_n + s μ B_t)ᵀ C_c B_n + dμ/dv B_tᵀ diag(N_0) B_t + μ B_bᵀ diag(N_0 / v) B_b
+    /// N_0 = N / c, v_k = |ω| r_k
     /// ```
     ///
     /// # Errors
@@ -286,7 +292,7 @@ impl Model {
         self.with_friction_damping(pairs)
     }
 
-    /// One matrix for each displacement of a pair, one value for each pair.
+    /// Checks that there is one `c×n` matrix for each displacement and one value for each pair.
     pub(super) fn check_pairs(&self, pairs: &ContactPairs) -> Result<(), ModelError> {
         let count = pairs.normal.nrows();
         for (what, rows) in [("sliding", &pairs.sliding), ("lateral", &pairs.lateral), ("normal", &pairs.normal)] {
@@ -311,7 +317,8 @@ impl Model {
         Ok(())
     }
 
-    /// Adds what friction does to motion along and across the direction of sliding, the same whatever the springs.
+    /// Adds the damping that friction causes along and across the sliding direction (falling slope, lateral
+    /// friction). It does not depend on the contact springs.
     pub(super) fn with_friction_damping(mut self, pairs: &ContactPairs) -> Result<Self, ModelError> {
         let count = pairs.normal.nrows();
         let each_n_0 = 1.0 / count.max(1) as f64;
@@ -364,7 +371,7 @@ impl Model {
         Ok(KnownTerm { term, symmetric })
     }
 
-    /// A matrix of zeros is no term: it would only cost time.
+    /// Drops terms whose matrix is zero: they would only cost time.
     pub(super) fn drop_zero_terms(&mut self) {
         let is_zero = |known: &KnownTerm| known.term.matrix.norm_max() == 0.0;
         self.stiffness.retain(|known| !is_zero(known));
@@ -376,12 +383,14 @@ impl Model {
         self.dimension
     }
 
-    /// How many of the first coordinates belong to the pad; `None` where pad and disc are not told apart.
+    /// Number of leading coordinates that belong to the pad; `None` if coordinates are not separated into pad and
+    /// disc.
     pub fn pad_modes(&self) -> Option<usize> {
         self.pad_modes
     }
 
-    /// The model of coordinates that move pad and disc at once, `mass` being the pad's part of the unit matrix.
+    /// Declares coordinates that move pad and disc together. `mass`, `n×n`, is the pad's contribution to the unit
+    /// mass matrix.
     ///
     /// # Errors
     /// [`ModelError::Shape`], [`ModelError::NotFinite`].
@@ -391,12 +400,13 @@ impl Model {
         Ok(self)
     }
 
-    /// The pad's part of the unit mass matrix, `n×n`, where coordinates move pad and disc at once and it is known.
+    /// The pad's contribution to the unit mass matrix, `n×n`, if coordinates move pad and disc together and it is
+    /// known.
     pub fn pad_mass(&self) -> Option<&Mat<f64>> {
         self.pad_mass.as_ref()
     }
 
-    /// The same coordinates without contact: the terms that hold whatever the conditions.
+    /// The model without contact, in the same coordinates: only the terms with a constant law.
     pub fn without_contact(&self) -> Self {
         let constant = |terms: &[KnownTerm]| -> Vec<KnownTerm> {
             terms.iter().filter(|known| matches!(known.term.law, Law::Constant)).cloned().collect()
@@ -411,19 +421,19 @@ impl Model {
         }
     }
 
-    /// Whether the model has contact pairs of its own, which open without load.
+    /// Whether the model has contact pairs of its own, which open at zero load.
     pub fn has_contact(&self) -> bool {
         self.has_contact
     }
 
-    /// Whether `K` and `C` are proportional to stiffness and damping of the contact, so that their derivatives by these
-    /// are known: there is contact, and without residual flexibility.
+    /// Whether the contact terms of `K` and `C` are proportional to contact stiffness and damping, so that
+    /// derivatives with respect to these are available. True with contact pairs and without residual flexibility.
     pub fn is_linear_in_contact(&self) -> bool {
         let mut terms = self.stiffness.iter().chain(&self.damping);
         self.has_contact && !terms.any(|known| matches!(known.term.law, Law::FrictionChebyshev { .. }))
     }
 
-    /// The state of the contact, as far as this model knows contact: one without contact pairs never opens.
+    /// The contact state at `p`; a model without contact pairs is always closed.
     pub fn contact_state(&self, p: &OperatingPoint) -> ContactState {
         if self.has_contact { p.contact_state() } else { p.state_closed() }
     }
@@ -433,7 +443,7 @@ impl Model {
         law.value(&self.contact_law, self.contact_state(p), p)
     }
 
-    /// Writes `K(p)` and `C(p)`, both `n×n`, and says what is known of them.
+    /// Writes `K(p)` and `C(p)`, both `n×n`, and returns their properties.
     ///
     /// # Errors
     /// [`ModelError::PointNotFinite`], [`ModelError::LawNotFinite`].
@@ -456,8 +466,8 @@ impl Model {
         Ok(Structure { damped, symmetric_stiffness })
     }
 
-    /// Writes the derivatives of `K` and `C` at `p` with respect to `parameter`, both `n×n`; those of custom laws are
-    /// central differences, exact up to rounding where a law is linear.
+    /// Writes the derivatives of `K` and `C` at `p` with respect to `parameter`, both `n×n`. Custom laws are
+    /// differentiated by central differences, which are exact up to rounding for a linear law.
     ///
     /// # Errors
     /// [`ModelError::LawNotFinite`].
@@ -474,14 +484,14 @@ impl Model {
         Ok(())
     }
 
-    /// Derivative of the value of `law` at `p` with respect to `parameter`: per unit of friction coefficient, N or rad/s, or
-    /// relative to the contact's stiffness or damping.
+    /// Derivative of the value of `law` at `p` with respect to `parameter`: per unit of the friction coefficient, per N,
+    /// per rad/s, or per relative change of contact stiffness or damping.
     pub(super) fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
         use Parameter::{ContactDamping, ContactStiffness, Friction, Load, Speed};
         let value = self.coefficient(law, p);
-        // The factor of the friction coefficient, which may be zero itself.
+        // The factor of the friction coefficient; evaluated at `μ = 1` because `μ` may be zero.
         let per_friction = || self.coefficient(law, &p.with_friction(1.0));
-        // Where nothing slides the load or the speed may be zero as well.
+        // The value is 0 where nothing slides, and load or speed may be zero there.
         let ratio = |value: f64, by: f64| if value == 0.0 { 0.0 } else { value / by };
         match law {
             Law::Constant => 0.0,
@@ -543,22 +553,22 @@ impl Model {
             _ => p.with_friction(to),
         };
         let (up, down) = (self.coefficient(law, &moved(at + step)), self.coefficient(law, &moved(at - step)));
-        // A law need not exist for negative friction coefficients.
+        // A law may be undefined for negative friction coefficients; the difference is then one-sided.
         if down.is_finite() { (up - down) / (2.0 * step) } else { (up - self.coefficient(law, p)) / step }
     }
 
-    /// Whether any damping takes part at `p`.
+    /// Whether any damping term has a nonzero coefficient at `p`.
     pub fn is_damped(&self, p: &OperatingPoint) -> bool {
         self.damping.iter().any(|known| self.coefficient(&known.term.law, p) != 0.0)
     }
 
-    /// How many terms have a coefficient of zero at `p`: matrices that need not be added.
+    /// Number of terms with a coefficient of zero at `p`; their matrices need not be added.
     pub fn zero_terms(&self, p: &OperatingPoint) -> usize {
         self.stiffness.iter().chain(&self.damping).filter(|known| self.coefficient(&known.term.law, p) == 0.0).count()
     }
 
-    /// Writes `(K(above) - K(below)) per` and the same of `C`, both `n×n`, from the differences of the laws: terms that
-    /// are constant leave no rounding. Says whether anything changes at all.
+    /// Writes `(K(above) - K(below)) per` and the same for `C`, both `n×n`. The laws are subtracted before the
+    /// matrices are summed, so constant terms contribute no rounding. Returns whether `K` and whether `C` changes.
     ///
     /// # Errors
     /// [`ModelError::LawNotFinite`].
@@ -576,7 +586,8 @@ impl Model {
         Ok([stiffness_changes, damping_changes])
     }
 
-    /// Whether any term's coefficient changes with load or with speed beyond opening, stopping and reversing.
+    /// Whether any coefficient depends on the load, and whether any depends on the speed, apart from opening,
+    /// stopping and reversing.
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
         let (mut load, mut speed) = (false, false);
         for known in self.stiffness.iter().chain(&self.damping) {
@@ -594,7 +605,7 @@ impl Model {
         (load, speed)
     }
 
-    /// Whether load and speed matter by their ratio alone.
+    /// Whether the model depends on load and speed through their ratio only.
     pub fn depends_on_load_over_speed_only(&self) -> bool {
         let exponent = self.contact_law.exponent;
         let constant = |law: &Law| match law {
@@ -608,31 +619,31 @@ impl Model {
     }
 }
 
-/// Traces of a model's matrices at any operating point, in the time it takes to evaluate its laws.
+/// Precomputed traces of a model's matrices: at an operating point only the laws are evaluated.
 #[derive(Clone, Debug)]
 pub struct Traces {
     stiffness: Vec<f64>,
     damping: Vec<f64>,
-    /// `tr(A B)` for every pair of terms, of the stiffness and of the damping.
+    /// `tr(A B)` for every pair of terms, for stiffness and for damping.
     stiffness_products: Mat<f64>,
     damping_products: Mat<f64>,
-    /// `tr(Aᵀ B)`, likewise.
+    /// `tr(Aᵀ B)` for every pair of terms.
     stiffness_norms: Mat<f64>,
     damping_norms: Mat<f64>,
 }
 
-/// What is known of the roots and the matrices at an operating point without solving anything.
+/// Sums of the roots and norms of the matrices at an operating point, known exactly without solving.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exact {
-    /// Sums over the roots, first and second power: of `λ²` where no damping takes part, `-tr K` and `tr K²`; else of `λ`,
-    /// conjugates and static roots included, `-tr C` and `tr C² - 2 tr K`.
+    /// Sums over all roots of the first and second power. Undamped, of `λ²`: `-tr K` and `tr K²`. Damped, of `λ`,
+    /// conjugates and static roots included: `-tr C` and `tr C² - 2 tr K`.
     pub powers: [f64; 2],
     /// Frobenius norms of `I`, `C` and `K`.
     pub norms: [f64; 3],
 }
 
 impl Traces {
-    /// Precomputes what is constant.
+    /// Precomputes the traces of all terms and products of terms.
     pub fn new(model: &Model) -> Self {
         let trace = |m: &Mat<f64>| (0..m.nrows()).map(|i| m[(i, i)]).sum();
         let product = |a: &Mat<f64>, b: &Mat<f64>| -> f64 {
@@ -655,7 +666,7 @@ impl Traces {
         }
     }
 
-    /// What they say at `p`.
+    /// Sums and norms at `p`.
     pub fn at(&self, model: &Model, p: &OperatingPoint) -> Exact {
         let weighted = |terms: &[KnownTerm], traces: &[f64]| -> f64 {
             terms.iter().zip(traces).map(|(known, trace)| model.coefficient(&known.term.law, p) * trace).sum()
@@ -682,7 +693,8 @@ impl Traces {
     }
 }
 
-/// `Σ coefficient(law) · matrix` into `out`; whether any term took part, and whether all that did are symmetric.
+/// Writes `Σ coefficient(law) · matrix` to `out`. Returns whether any coefficient was nonzero, and whether all terms
+/// with a nonzero coefficient are symmetric.
 fn sum(
     terms: &[KnownTerm],
     coefficient: impl Fn(&Law) -> f64,
@@ -707,7 +719,7 @@ pub(super) fn congruence(a: MatRef<'_, f64>, d: &[f64], b: MatRef<'_, f64>) -> M
     let scaled = Mat::from_fn(b.nrows(), b.ncols(), |row, column| d[row] * b[(row, column)]);
     let product = a.transpose() * &scaled;
     if std::ptr::eq(a.as_ptr(), b.as_ptr()) {
-        // Symmetric by construction, not only up to rounding: the solver looks for it.
+        // Symmetrised exactly, not only up to rounding: the choice of the solver depends on it.
         return Mat::from_fn(product.nrows(), product.ncols(), |i, j| product[(i.min(j), i.max(j))]);
     }
     product
@@ -719,9 +731,9 @@ mod tests {
     use super::super::spectrum::Vectors;
     use super::*;
 
-    /// Two pairs of contact in two coordinates, of which one moves along the direction of sliding and one across it: each obeys
-    /// `λ² + c λ + k = 0`. The slope of friction makes `c = N dμ/dv`, the turning of friction `c = μ N / (|ω| r)`, whichever way
-    /// the disc turns; by hand, -10 and 153.846 1/s.
+    /// Two contact pairs in two coordinates. One coordinate moves along the sliding direction, the other across it;
+    /// each obeys `λ² + c λ + k = 0`. Along, the friction slope gives `c = N dμ/dv`; across, lateral friction gives
+    /// `c = μ N / (|ω| r)`, for both directions of rotation. Calculated by hand: -10 and 153.846 1/s.
     #[test]
     fn friction_damps_along_and_across_the_direction_of_sliding_as_by_hand() {
         let law = |slope_s_per_m: f64, lateral_damping: bool| ContactLaw {
@@ -753,13 +765,13 @@ mod tests {
                 let spectrum = Solver::new(2).solve(&model, &point(speed), Vectors::Right).unwrap();
                 for (mode, damping) in expected.into_iter().enumerate() {
                     assert!((c[(mode, mode)] - damping).abs() < 1e-12 * across, "{law:?} at {speed}: {c:?}");
-                    // σ = -c/2 of a root that oscillates.
+                    // `σ = -c/2` of an oscillating root.
                     let growth = spectrum.roots[mode].lambda.re;
                     assert!((growth + 0.5 * damping).abs() < 1e-9, "{law:?} at {speed}: {growth} 1/s");
                 }
                 assert_eq!((c[(0, 1)], c[(1, 0)]), (0.0, 0.0));
             }
-            // Twice the speed, half the damping across; along it speed takes no part.
+            // Twice the speed halves the damping across the sliding direction; along it, the speed has no effect.
             let (mut k, mut c) = (Mat::zeros(2, 2), Mat::zeros(2, 2));
             model.assemble(&point(-26.0), &mut k, &mut c).unwrap();
             assert!((c[(1, 1)] - 0.5 * expected[1]).abs() < 1e-12 * across && (c[(0, 0)] - expected[0]).abs() < 1e-12);

@@ -1,9 +1,10 @@
-//! Complex eigenvalues of `(λ² I + λ C + K) x = 0`, by the cheapest exact problem, with a residual for each root.
+//! Complex eigenvalues of `(λ² I + λ C + K) x = 0`, by the cheapest exact eigenvalue problem, with a residual for
+//! each root.
 //!
 //! | situation | problem solved | roots |
 //! |---|---|---|
 //! | undamped, `K` symmetric | `K x = -λ² x`, symmetric, `n×n` | `λ² = -κ` |
-//! | undamped | `K x = -λ² x`, unsymmetric, `n×n` | `λ² = -κ`, a complex pair `κ` gives a growing and a decaying mode |
+//! | undamped | `K x = -λ² x`, unsymmetric, `n×n` | `λ² = -κ`; a complex pair `κ` gives a growing and a decaying mode |
 //! | damped | `[0 S; -K S⁻¹ -C]`, `S = diag(√K_ii)`, `2n×2n` | `λ` |
 //!
 //! The scaling by `S` is not optional: without it the state-space roots lose half their digits.
@@ -16,14 +17,14 @@ use super::model::{Model, Parameter};
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, SolveError, Spectrum, Vectors, order, square_root};
 
-/// Residual above which a root counts as not found.
+/// Residual above which a root is rejected.
 pub const RESIDUAL_LIMIT: f64 = 1e-9;
 
-/// Backward error of the dense solvers, in units of `ε` times the Frobenius norm of the matrix: above what is seen, by the
-/// tests of the bounds that rest on it.
+/// Assumed backward error of the dense solvers, in units of `ε` times the Frobenius norm of the matrix. It exceeds
+/// every observed error; the tests of the error bounds check it.
 pub const ROUNDING: f64 = 8.0;
 
-/// Workspace for the spectra of one model, allocated once.
+/// Workspace that computes the spectra of one model, allocated once.
 pub struct Solver {
     stiffness: Mat<f64>,
     damping: Mat<f64>,
@@ -31,13 +32,14 @@ pub struct Solver {
     damping_slope: Mat<f64>,
     state: Mat<f64>,
     dense: Dense,
-    /// Displacements of the right vectors, packed.
+    /// Displacement part of the right vectors, packed.
     shapes: Mat<f64>,
-    /// `K X`, `C X`, `dK/dμ X` and `dC/dμ X`, packed: one product of matrices each, far cheaper than one for each root.
+    /// `K X`, `C X`, `dK/dμ X` and `dC/dμ X`, packed. One matrix product each is far cheaper than a product for each
+    /// root.
     products: [Mat<f64>; 4],
 }
 
-/// Which problem gives the roots.
+/// The eigenvalue problem that is solved.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Problem {
     Symmetric,
@@ -45,7 +47,7 @@ enum Problem {
     Damped,
 }
 
-/// A root before it is ordered, and where its vectors are.
+/// A root before sorting, with the columns of its vectors.
 struct Raw {
     root: Root,
     packing: Packing,
@@ -54,14 +56,14 @@ struct Raw {
     left: Option<Left>,
 }
 
-/// What a left vector tells of a root.
+/// Quantities of a root that need its left vector.
 #[derive(Clone, Copy)]
 struct Left {
-    /// `yᴴx`, in a damped model `yᴴ(2λ I + C)x`.
+    /// `yᴴx`; in a damped model `yᴴ(2λ I + C)x`.
     weight: c64,
     /// `d(λ²)/dμ`.
     sensitivity: c64,
-    /// Condition of the eigenvalue, `‖y‖‖x‖ / |yᴴx|`, in the problem that was solved.
+    /// Condition number of the eigenvalue in the problem that was solved, `‖y‖‖x‖ / |yᴴx|`.
     condition: f64,
 }
 
@@ -81,11 +83,12 @@ impl Solver {
         }
     }
 
-    /// The spectrum of `model` at `p`. Coordinates that nothing couples stay out of the eigenvalue problem: see `physics::decoupled`.
+    /// The spectrum of `model` at `p`. Uncoupled coordinates are solved in closed form, outside the eigenvalue
+    /// problem: see `physics::decoupled`.
     ///
     /// # Errors
-    /// [`SolveError::Model`] where the model cannot be evaluated there, [`SolveError::NoConvergence`],
-    /// [`SolveError::Trace`] and [`SolveError::Residual`] where the answer is not one.
+    /// [`SolveError::Model`] if the model cannot be evaluated at `p`; [`SolveError::NoConvergence`];
+    /// [`SolveError::Trace`] and [`SolveError::Residual`] if the result fails a check.
     pub fn solve(&mut self, model: &Model, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, SolveError> {
         let damped = model.is_damped(p);
         match model.parts() {
@@ -97,7 +100,8 @@ impl Solver {
         }
     }
 
-    /// The spectrum of `model`, all of it one problem; `damped` or not, whether or not damping takes part in it.
+    /// The spectrum of `model` as one eigenvalue problem. `damped` selects the state-space form, even if the damping
+    /// of these coordinates is zero.
     pub(super) fn solve_coupled(
         &mut self,
         model: &Model,
@@ -149,18 +153,18 @@ impl Solver {
         })
     }
 
-    /// The matrix whose eigenvalues the last solve computed, which gave `spectrum`: `K` of the coordinates that are coupled, whose
-    /// eigenvalues are `-λ²`, or their scaled state matrix.
+    /// The matrix whose eigenvalues gave `spectrum`, as left by the last solve, for the coupled coordinates only.
+    /// Undamped: `K`, whose eigenvalues are `-λ²`. Damped: the scaled state matrix.
     pub fn matrix(&self, spectrum: &Spectrum) -> MatRef<'_, f64> {
         if spectrum.undamped { self.stiffness.as_ref() } else { self.state.as_ref() }
     }
 
-    /// Left vectors of the problem that was solved, packed: those of a symmetric one are its right ones.
+    /// Left vectors of the problem that was solved, packed; for a symmetric problem these are the right vectors.
     fn left_vectors(&self, problem: Problem) -> &Mat<f64> {
         if problem == Problem::Symmetric { &self.dense.right } else { &self.dense.left }
     }
 
-    /// Writes `[0 S; -K S⁻¹ -C]`.
+    /// Writes the state matrix `[0 S; -K S⁻¹ -C]`.
     fn assemble_state(&mut self) {
         let n = self.stiffness.nrows();
         if self.state.nrows() != 2 * n {
@@ -177,15 +181,15 @@ impl Solver {
         }
     }
 
-    /// The roots of the eigenvalues that were found, one for each conjugate pair of a damped model.
+    /// Converts eigenvalues to roots; of a conjugate pair of a damped model, only the root with `ω ≥ 0` is kept.
     fn roots(&self, problem: Problem, stiffness_norm: f64, matrix_norm: f64) -> Vec<Raw> {
         let rounding = 16.0 * self.stiffness.nrows() as f64 * f64::EPSILON;
-        // `|λ²|` below which a root is a zero disturbed by rounding. A double root at the origin splits into ±√(rounding):
-        // as a square it is zero to rounding.
+        // `|λ²|` up to which a root is set to zero. Rounding splits a double root at the origin into `±√(rounding)`,
+        // whose square is zero up to rounding.
         let mut zero = rounding * stiffness_norm;
         let near_origin = self.dense.values.iter().filter(|value| value.norm_sqr() <= zero).count();
         if problem == Problem::Damped && near_origin == 1 {
-            // A simple one, as where a static root crosses, is known far better.
+            // A simple root near the origin, as where a static root crosses zero, is much more accurate.
             zero = (rounding * matrix_norm).powi(2);
         }
         let mut raw = Vec::with_capacity(self.stiffness.nrows() + 8);
@@ -193,7 +197,7 @@ impl Solver {
             let (lambda, square) = match problem {
                 Problem::Damped if value.im < 0.0 => continue, // its conjugate stands for it
                 Problem::Damped => (value, value * value),
-                // The sum turns the -0 of a real root into 0.
+                // The subtraction from zero turns the -0 of a real root into 0.
                 _ => (square_root(c64::ZERO - value), c64::ZERO - value),
             };
             let lambda = if square.norm() <= zero { c64::ZERO } else { lambda };
@@ -204,7 +208,7 @@ impl Solver {
         raw
     }
 
-    /// Fills in the displacements of the right vectors and their products with the matrices.
+    /// Extracts the displacements of the right vectors and multiplies them by the matrices.
     fn multiply(&mut self, problem: Problem, vectors: Vectors) {
         let n = self.stiffness.nrows();
         let damped = problem == Problem::Damped;
@@ -218,7 +222,7 @@ impl Solver {
             for packing in packing(&self.dense.values) {
                 let state = Packed::new(&self.dense.right, packing);
                 let (displacement, velocity) = (state.rows(..n), state.rows(n..));
-                // x from whichever half of the state holds more of it: [S x; λ x].
+                // `x` is taken from the larger half of the state `[S x; λ x]`.
                 let from_velocity = velocity.norm_sqr() >= displacement.norm_sqr();
                 for j in std::iter::once(packing.re).chain(packing.im) {
                     let state = self.dense.right.col_as_slice(j);
@@ -247,7 +251,7 @@ impl Solver {
         }
     }
 
-    /// Fills in residual and pad share, and refuses a root that does not satisfy the equation.
+    /// Computes residual and pad participation of every root, and fails if a residual exceeds its limit.
     fn judge(&self, raw: &mut [Raw], problem: Problem, stiffness_norm: f64, model: &Model) -> Result<(), SolveError> {
         let n = self.stiffness.nrows();
         let of_pad = model.pad_mass().map(|mass| mass * &self.shapes);
@@ -270,7 +274,8 @@ impl Solver {
             };
             let mut residual = residual_of(&entry.root);
             if damped && residual > RESIDUAL_LIMIT {
-                // Near the origin the state space loses relative accuracy; the best root for the given shape does not.
+                // Near the origin the state space loses relative accuracy. One Gauss-Newton step for the given shape
+                // restores it.
                 let slope = |i: usize| 2.0 * entry.root.lambda * x.at(i) + cx.at(i);
                 let along: c64 = (0..n).map(|i| slope(i).conj() * off(&entry.root, i)).sum();
                 let lambda = entry.root.lambda - along / (0..n).map(|i| slope(i).norm_sqr()).sum::<f64>();
@@ -295,7 +300,7 @@ impl Solver {
         Ok(())
     }
 
-    /// What the left vectors tell: weights, sensitivities and conditions.
+    /// Computes weight, friction sensitivity and condition number of every root from its left vector.
     fn read_left(&self, raw: &mut [Raw], problem: Problem) {
         let n = self.stiffness.nrows();
         for entry in raw {
@@ -316,7 +321,7 @@ impl Solver {
         }
     }
 
-    /// Right and left vectors in the order of `raw`, scaled as [`Spectrum`] says.
+    /// Right and left vectors in the order of `raw`, scaled as documented in [`Spectrum`].
     fn vectors(&self, raw: &[Raw], problem: Problem) -> (Mat<c64>, Mat<c64>) {
         let n = self.stiffness.nrows();
         let known = raw.iter().filter(|entry| !entry.length.is_nan()).count();
@@ -336,9 +341,9 @@ impl Solver {
     }
 }
 
-/// `S`: what each displacement is multiplied by, so that it weighs as much as its velocity, rad/s.
+/// `S`: scale of the displacements in the state, which makes them as large as the velocities, rad/s.
 ///
-/// `√|K_ii|`, kept within six decades of the largest so that a free coordinate does not blow up its column.
+/// `√|K_ii|`, at least 1e-6 of the largest: without this limit a free coordinate would give a huge column of `K S⁻¹`.
 pub(super) fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
     let diagonal = || (0..stiffness.nrows()).map(|i| stiffness[(i, i)].abs().sqrt());
     let largest = diagonal().fold(0.0, f64::max);
@@ -348,20 +353,22 @@ pub(super) fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
     diagonal().map(|s| s.max(1e-6 * largest)).collect()
 }
 
-/// Bounds every root's error from its condition and the distance of its nearest neighbour, where left vectors are known.
+/// Bounds the error of every root whose left vector is known, from its condition number and the gaps to its
+/// neighbours.
 ///
-/// A backward stable solver is exact for a matrix that is off by `E`; to first order a root is then off by `κ E`. Where `m`
-/// roots come together, `κ` grows like one over the product of the gaps between them, and what remains is the `m`-th root
-/// of `κ E g₁ … g₍ₘ₋₁₎`: half the digits at a merging point, a third where three modes meet.
+/// A backward stable solver returns the exact eigenvalues of a matrix perturbed by `E`; to first order a root then
+/// moves by `κ E`. Where `m` roots approach each other, `κ` grows like the inverse product of the gaps between them.
+/// The error then stays below the `m`-th root of `κ E g₁ … g₍ₘ₋₁₎`: half of the digits are left at a merging point of
+/// two modes, a third where three meet.
 fn bound_errors(raw: &mut [Raw], damped: bool, matrix_norm: f64) {
     let backward_error = ROUNDING * f64::EPSILON * matrix_norm;
-    // Gaps below are no gaps to the solver, nor to the condition that is computed from its vectors.
+    // The solver does not resolve smaller gaps, and neither does a condition number computed from its vectors.
     let least_gap = f64::EPSILON * matrix_norm;
     let values: Vec<c64> = raw.iter().map(|raw| if damped { raw.root.lambda } else { raw.root.square }).collect();
     for (k, entry) in raw.iter_mut().enumerate() {
         let Some(left) = entry.left else { continue };
         let z = values[k];
-        // In a damped model the conjugate is a neighbour too.
+        // In a damped model the complex conjugate is a neighbour too.
         let mirror = if damped && z.im != 0.0 { 4.0 * z.im * z.im } else { f64::INFINITY };
         let mut gaps = [mirror, f64::INFINITY, f64::INFINITY];
         for (j, other) in values.iter().enumerate() {
@@ -380,7 +387,8 @@ fn bound_errors(raw: &mut [Raw], damped: bool, matrix_norm: f64) {
             let power = f64::from(together);
             error = error.min(power * product.powf(power.recip()));
         }
-        // Vectors that are orthogonal to rounding tell nothing but that roots have met.
+        // Left and right vector are orthogonal up to rounding: the condition number only shows that roots have
+        // merged.
         let error = if error.is_finite() { error } else { 4.0 * matrix_norm * f64::EPSILON.powf(0.25) };
         let error = error.max(backward_error);
         entry.root.error = if damped {
@@ -403,7 +411,8 @@ mod tests {
         Solver::new(model.dimension()).solve(model, &REFERENCE.with_friction(mu), Vectors::Right).expect("it solves")
     }
 
-    /// 30-digit arithmetic on the matrices of the paper's 9-degree-of-freedom model, case 1, printed to 10 digits.
+    /// Expected values: 30-digit arithmetic on the matrices of the paper's 9-degree-of-freedom model, case 1, printed
+    /// to 10 digits.
     #[test]
     fn nine_dof_frequencies() {
         let at_rest = [
@@ -424,7 +433,7 @@ mod tests {
             let spectrum = solve(&model, mu);
             assert_eq!(spectrum.mode_count, 9);
             for (root, omega) in spectrum.modes().iter().zip(expected) {
-                // Half a digit of the print.
+                // Tolerance: half a unit of the last printed digit.
                 assert!((root.lambda.im - omega).abs() < 0.6e-9 * omega.max(1.0), "{} is not {omega}", root.lambda.im);
             }
         }
@@ -439,7 +448,7 @@ mod tests {
         Model::new(1, vec![term(stiffness)], vec![term(damping)], ContactLaw::default(), None).expect("well formed")
     }
 
-    /// Two springs on two masses, stiffness scaled over 24 decades: `ω² = k (3 ± √5)/2`.
+    /// Two masses on two springs, with the stiffness scaled over 24 decades: `ω² = k (3 ± √5)/2`.
     #[test]
     fn symmetric_route_knows_no_scale() {
         for k in [1e-12, 1e-6, 1.0, 1e6, 1e12] {
@@ -454,7 +463,7 @@ mod tests {
         }
     }
 
-    /// `λ² + c λ + k = 0` by hand: under-damped, over-damped, free, divergent.
+    /// `λ² + c λ + k = 0` solved by hand: underdamped, overdamped, free and divergent.
     #[test]
     fn single_degree_of_freedom() {
         let under = solve(&one(25.0, 6.0), 0.0);
@@ -468,7 +477,7 @@ mod tests {
         assert_eq!(solve(&one(-9.0, 0.0), 0.0).nonoscillatory_growth_per_s(), vec![3.0, -3.0]);
     }
 
-    /// Proportional damping: the modes of `λ² + β λ + ω² = 0` for every undamped `ω²`, complex ones included.
+    /// Proportional damping: the roots of `λ² + β λ + ω² = 0` for every undamped `ω²`, complex ones included.
     #[test]
     fn damped_route_agrees_with_closed_form() {
         let model = nine_dof(1.0, 1.0, 1.0);
@@ -487,7 +496,8 @@ mod tests {
         }
     }
 
-    /// A vector that is not one is refused by its residual; a value that is not one by the traces where no vectors are asked for.
+    /// A falsified eigenvector is rejected by its residual. A falsified eigenvalue is rejected by the traces if no
+    /// vectors are requested.
     #[test]
     fn an_answer_that_is_none_is_refused() {
         use crate::spoil::{Spoil, with};
@@ -504,14 +514,14 @@ mod tests {
         assert_eq!(solve(Vectors::None), Ok(9));
     }
 
-    /// A root is unstable when its growth rate exceeds the threshold times its size.
+    /// A root is unstable if its growth rate exceeds the threshold times `|λ|`.
     #[test]
     fn the_threshold_of_instability() {
         let root = |growth: f64| Root { lambda: c64::new(growth, 1.0), ..solve(&one(25.0, 6.0), 0.0).roots[0] };
         assert!(!root(0.99e-6).is_unstable(1e-6) && root(1.01e-6).is_unstable(1e-6));
     }
 
-    /// `d(λ²)/dμ` from left and right vectors against a central difference of the roots.
+    /// `d(λ²)/dμ` from left and right vectors, compared with a central difference of the roots.
     #[test]
     fn friction_sensitivity_is_the_derivative() {
         let model = nine_dof(1.0, 1.0, 1.0);
@@ -522,7 +532,7 @@ mod tests {
         let (up, down) = (solve(&model, 0.5 + step), solve(&model, 0.5 - step));
         for k in 0..9 {
             let difference = (up.roots[k].square - down.roots[k].square) / (2.0 * step);
-            // Truncation (step²/6 of the third derivative) and rounding (ε/step) are both near 1e-10.
+            // Truncation (step²/6 times the third derivative) and rounding (ε/step) are both near 1e-10.
             assert!((spectrum.friction_sensitivity[k] - difference).norm() < 1e-8, "root {k}");
         }
     }

@@ -1,4 +1,5 @@
-//! Roots of the characteristic equation, their bounds, and all of them at one operating point.
+//! Roots of the characteristic equation with their error bounds, and the spectrum of all roots at one operating
+//! point.
 
 use faer::{Mat, c64};
 
@@ -8,21 +9,22 @@ use super::operating_point::OperatingPoint;
 /// One root of the characteristic equation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Root {
-    /// `λ = σ + iω`, 1/s; `ω ≥ 0`. A static root of an undamped model stands for the pair `±λ`, `λ ≥ 0`.
+    /// `λ = σ + iω`, 1/s; `ω ≥ 0`. A static root of an undamped model is listed as `λ ≥ 0` and represents the pair
+    /// `±λ`.
     pub lambda: c64,
-    /// `λ²`, 1/s²: analytic in the operating point where `λ` itself is not.
+    /// `λ²`, 1/s²: analytic in the operating point even where `λ` is not.
     pub square: c64,
-    /// `‖(λ²I + λC + K)x‖ / ((|λ|²‖I‖ + |λ|‖C‖ + ‖K‖)‖x‖)`, Frobenius norms; of a charted root, whose shape is not known, a bound
-    /// of the residual with the exact shape.
+    /// `‖(λ²I + λC + K)x‖ / ((|λ|²‖I‖ + |λ|‖C‖ + ‖K‖)‖x‖)`, Frobenius norms. For a charted root, whose shape is
+    /// unknown, a bound of the residual with the exact shape.
     pub residual: f64,
-    /// The pad's share of `Σ|q|²`, 0 to 1; NaN where pad and disc are not told apart, or on a chart where the root belongs to a
-    /// cluster: shares are no analytic functions where roots merge, and neither are means of them.
+    /// The pad's share of `Σ|q|²`, 0 to 1. NaN if coordinates are not separated into pad and disc, and for a charted
+    /// root of a cluster: where roots merge, neither the shares nor their mean are analytic functions.
     pub pad_participation: f64,
-    /// Bounds of what rounding can have done to it; NaN unless asked for.
+    /// Bounds of the error due to rounding; NaN unless requested.
     pub error: RootError,
 }
 
-/// Bounds of the error of a root.
+/// Bounds of the absolute error of a root.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RootError {
     /// Of `λ²`, 1/s².
@@ -34,11 +36,11 @@ pub struct RootError {
 }
 
 impl RootError {
-    /// Nothing is known.
+    /// No bound is known.
     pub const UNKNOWN: Self = Self { square: f64::NAN, omega: f64::NAN, sigma: f64::NAN };
 
-    /// From a bound `δ` of the error of `λ²`: `|δλ| ≤ δ / (|λ| + √(|λ|² - δ))`, near the origin `|λ| + √δ`. A root whose
-    /// square is known to be `real` and negative has no growth rate, exactly.
+    /// Bounds from a bound `δ` of the error of `λ²`: `|δλ| ≤ δ / (|λ| + √(|λ|² - δ))`; near the origin, where
+    /// `δ ≥ |λ|²`, `|λ| + √δ`. If `λ²` is known to be `real` and is negative, the growth rate is exactly zero.
     pub fn from_square(lambda: c64, square: f64, real: bool) -> Self {
         let size = magnitude(lambda);
         let rest = size * size - square;
@@ -47,14 +49,14 @@ impl RootError {
         Self { square, omega: error, sigma }
     }
 
-    /// From a bound of the error of `λ`.
+    /// Bounds from a bound of the error of `λ`.
     pub fn from_lambda(lambda: c64, error: f64) -> Self {
         Self { square: error * (2.0 * magnitude(lambda) + error), omega: error, sigma: error }
     }
 }
 
 impl Root {
-    /// Whether it oscillates (`ω > 0`), that is, whether it is a mode.
+    /// Whether the root oscillates (`ω > 0`) and therefore is a mode.
     pub fn oscillates(&self) -> bool {
         self.lambda.im > 0.0
     }
@@ -76,58 +78,59 @@ impl Root {
         if size > 0.0 { -self.lambda.re / size + 0.0 } else { 0.0 }
     }
 
-    /// Bound of its residual with the exact shape `x̂` of the root `λ̂` it stands for, from the bounds of its error and the Frobenius
-    /// `norms` of `I`, `C` and `K`: `(λ² - λ̂²) x̂ + (λ - λ̂) C x̂` is what is left there.
+    /// Bound of the residual of this root `λ` with the exact shape `x̂` of the exact root `λ̂`. It follows from the
+    /// error bounds and the Frobenius `norms` of `I`, `C` and `K`, since the residual vector is
+    /// `(λ² - λ̂²) x̂ + (λ - λ̂) C x̂`.
     pub fn residual_bound(&self, norms: [f64; 3]) -> f64 {
         let [unit, damping, stiffness] = norms;
         let size = magnitude(self.lambda);
         (self.error.square + self.error.omega * damping) / (size * size * unit + size * damping + stiffness)
     }
 
-    /// Whether it grows: `σ > threshold · |λ|`. At the origin, within rounding, nothing grows.
+    /// Whether the root is unstable: `σ > threshold · |λ|`. A root that is zero up to rounding is never unstable.
     pub fn is_unstable(&self, threshold: f64) -> bool {
         self.lambda.re > threshold * magnitude(self.lambda)
     }
 }
 
-/// What else than roots to compute.
+/// Which eigenvectors to compute.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Vectors {
-    /// None: no residuals, shapes or bounds; the roots are checked by their traces alone.
+    /// None: no residuals, shapes or bounds. The roots are checked by the traces of the matrix only.
     None,
     /// Right vectors only: residuals and shapes.
     Right,
-    /// Left vectors too, and from them the conditioning of every root, bounds of its error, and `d(λ²)/dμ`.
+    /// Left vectors too: also condition numbers, error bounds and `d(λ²)/dμ` of every root.
     Both,
 }
 
 /// The roots of a model at one operating point.
 ///
-/// `roots` holds the modes (`ω > 0`) first, ascending in `ω` and among equals descending in `σ`, then the static
-/// roots, descending in `σ`. An undamped model has exactly `n` roots, each standing for `±λ`; a damped one lists
-/// each static root by itself.
+/// `roots` holds the modes (`ω > 0`) first, ascending in `ω` and, for equal `ω`, descending in `σ`. The static roots
+/// follow, descending in `σ`. An undamped model has exactly `n` roots, each representing `±λ`; a damped one lists
+/// each static root separately.
 #[derive(Clone, Debug)]
 pub struct Spectrum {
-    /// The point it was solved at.
+    /// The operating point.
     pub point: OperatingPoint,
-    /// Every root, ordered as said above.
+    /// All roots, in the order given above.
     pub roots: Vec<Root>,
-    /// How many of them are modes.
+    /// Number of modes.
     pub mode_count: usize,
-    /// No damping took part: every root stands for `±λ`.
+    /// Whether all damping was zero, so that every root represents `±λ`.
     pub undamped: bool,
-    /// `n×roots`: right vectors `x`, one column for each root, norm 1; empty unless asked for.
+    /// `n×roots`: right vectors `x`, one column for each root, of norm 1; empty unless requested.
     pub shapes: Mat<c64>,
-    /// `n×roots`: left vectors `y`, empty unless asked for, of such length that a change `dC`, `dK` of the matrices moves an
-    /// undamped root by `d(λ²) = -yᴴ dK x`, a damped one by `dλ = -yᴴ (λ dC + dK) x`.
+    /// `n×roots`: left vectors `y`; empty unless requested. They are scaled so that changes `dK` and `dC` of the
+    /// matrices move an undamped root by `d(λ²) = -yᴴ dK x` and a damped one by `dλ = -yᴴ (λ dC + dK) x`.
     pub left: Mat<c64>,
-    /// `d(λ²)/dμ` for each root, 1/s²; empty unless asked for.
+    /// `d(λ²)/dμ` of each root, 1/s²; empty unless requested.
     pub friction_sensitivity: Vec<c64>,
     /// Frobenius norm of the matrix whose eigenvalues were computed: `K`, 1/s², or the scaled state matrix, 1/s.
     pub matrix_norm: f64,
 }
 
-/// Why there are no roots to be had.
+/// Why a solve failed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SolveError {
     #[error(transparent)]
@@ -143,12 +146,12 @@ pub enum SolveError {
 }
 
 impl Spectrum {
-    /// The modes: roots with `ω > 0`, ascending.
+    /// The modes: roots with `ω > 0`, ascending in frequency.
     pub fn modes(&self) -> &[Root] {
         &self.roots[..self.mode_count]
     }
 
-    /// Growth rates of the roots that do not oscillate, 1/s, descending; of an undamped model both signs.
+    /// Growth rates of the static roots, 1/s, descending; for an undamped model both signs are listed.
     pub fn nonoscillatory_growth_per_s(&self) -> Vec<f64> {
         let statics = &self.roots[self.mode_count..];
         let mut growth: Vec<f64> = statics.iter().map(|root| root.lambda.re).collect();
@@ -160,8 +163,8 @@ impl Spectrum {
     }
 }
 
-/// `λ` with `ω ≥ 0` from `λ²`. Both members of a complex pair of squares are modes: the one grows as fast as the other
-/// decays.
+/// `λ` with `ω ≥ 0` from `λ²`. The two members of a complex conjugate pair of squares give two modes, one growing as
+/// fast as the other decays.
 pub(super) fn square_root(square: c64) -> c64 {
     if square.im == 0.0 && square.re < 0.0 {
         c64::new(0.0, (-square.re).sqrt())
@@ -173,7 +176,7 @@ pub(super) fn square_root(square: c64) -> c64 {
     }
 }
 
-/// `|z|`: for real and imaginary numbers without a square root.
+/// `|z|`, without a square root for real and imaginary numbers.
 pub(super) fn magnitude(z: c64) -> f64 {
     if z.re == 0.0 {
         z.im.abs()
@@ -184,7 +187,8 @@ pub(super) fn magnitude(z: c64) -> f64 {
     }
 }
 
-/// Modes before static roots; modes ascending in `ω`, then descending in `σ`; static roots descending in `σ`.
+/// Order of roots: modes before static roots; modes ascending in `ω`, then descending in `σ`; static roots descending
+/// in `σ`.
 pub(super) fn order(a: &Root, b: &Root) -> std::cmp::Ordering {
     let by_growth = b.lambda.re.total_cmp(&a.lambda.re);
     match (a.oscillates(), b.oscillates()) {

@@ -1,5 +1,6 @@
-//! The spectrum followed in the friction coefficient at one load and speed: nodes dense enough that every root keeps
-//! its identity and no window of instability wider than the stated resolution hides between two of them.
+//! Stability map: the roots followed over the friction coefficient at one load and speed. Its nodes are dense enough
+//! that every root keeps its identity and that no window of instability wider than the stated resolution is missed
+//! between two nodes.
 
 use faer::c64;
 
@@ -12,29 +13,29 @@ use super::solver::Solver;
 use super::spectrum::{SolveError, Spectrum, Vectors};
 use super::tracking::{Continuation, continue_roots, tracked};
 
-/// Intervals the range of friction coefficients is cut into before refinement.
+/// Number of equal intervals the range of friction coefficients is divided into before refinement.
 const FIRST_INTERVALS: usize = 32;
-/// Times the range may be halved: the resolution is `range / 2^20`.
+/// Maximum number of halvings: the resolution is `range / 2^20`.
 const HALVINGS: i32 = 20;
-/// More nodes than this are not made; the map then says that it is not complete.
+/// Maximum number of nodes; if refinement would need more, the map is marked incomplete.
 const MAX_NODES: usize = 20_000;
 
-/// What to map.
+/// Range and options of a stability map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapOptions {
-    /// Lowest friction coefficient, at most 0: identities start at 0.
+    /// Lowest friction coefficient, at most 0 because identities are assigned at 0.
     pub mu_min: f64,
     /// Highest friction coefficient, at least 0.
     pub mu_max: f64,
-    /// Modes above are followed but not judged, Hz.
+    /// Upper limit of the band, Hz: modes above it are followed but not judged.
     pub band_max_hz: Option<f64>,
-    /// A root is unstable when `σ` exceeds this times `|λ|`.
+    /// A root is unstable if `σ` exceeds this times `|λ|`.
     pub instability_threshold: f64,
-    /// Whether to find the windows and their ends; without, modes are numbered alike in fewer solves.
+    /// Whether to compute the windows and their ends. Without them the identities are the same, from fewer solves.
     pub windows: bool,
 }
 
-/// Why there is no map.
+/// Why a map could not be built.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum MapError {
     #[error("at friction coefficient {mu}: {source}")]
@@ -43,55 +44,56 @@ pub enum MapError {
     Range { mu_min: f64, mu_max: f64 },
 }
 
-/// One solved point of the map.
+/// A solved point of the map.
 #[derive(Clone, Debug)]
 pub struct Node {
-    /// Its spectrum, with friction sensitivities.
+    /// The spectrum, with friction sensitivities.
     pub spectrum: Spectrum,
     /// Identity of each root; `None` for the static roots of a damped model, which are not followed.
     pub ids: Vec<Option<u32>>,
 }
 
 impl Node {
-    /// The friction coefficient it was solved at.
+    /// The friction coefficient of the node.
     pub fn mu(&self) -> f64 {
         self.spectrum.point.friction_coefficient
     }
 
-    /// The root with identity `id`.
+    /// Index of the root with identity `id`.
     pub fn find(&self, id: u32) -> Option<usize> {
         self.ids.iter().position(|&other| other == Some(id))
     }
 }
 
-/// The stability of a rig over the friction coefficient, at one load and speed.
+/// The roots and windows of instability of a rig over the friction coefficient, at one load and speed.
 #[derive(Clone, Debug)]
 pub struct StabilityMap {
-    /// Load and speed; the friction coefficient is of no meaning.
+    /// Load and speed of the map; the friction coefficient is not used.
     pub point: OperatingPoint,
     /// Solved points, ascending in friction coefficient.
     pub nodes: Vec<Node>,
     pub(super) numbering: Numbering,
-    /// Modes above are followed but not judged, Hz.
+    /// Upper limit of the band, Hz: modes above it are followed but not judged.
     pub(super) band_max_hz: Option<f64>,
-    /// Windows of instability, ascending in their lower end; empty unless asked for.
+    /// Windows of instability, ascending in their lower end; empty unless requested.
     pub windows: Vec<Window>,
-    /// Their ends, and how these move with load and speed.
+    /// Ends of the windows, with their derivatives with respect to load and speed.
     pub ends: Ends,
-    /// Windows narrower than this may have been missed.
+    /// Windows narrower than this in friction coefficient may be missed.
     pub resolution: f64,
-    /// False where the refinement was cut short by the number of nodes.
+    /// False if refinement stopped at the maximum number of nodes.
     pub complete: bool,
 }
 
-/// What squeals next, or squeals: the window of instability whose end is nearest to the present friction coefficient.
+/// The window of instability whose end is nearest to the present friction coefficient: what squeals, or what would
+/// squeal next.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NextWindow<'a> {
-    /// The window: the identities of its modes (a merging pair or a single mode) and how it comes about.
+    /// The window, with the identities of its modes (a merging pair or a single mode) and its kind.
     pub window: &'a Window,
-    /// Frequency at the nearest end, at the load and speed of the map, Hz; 0 for a divergence.
+    /// Frequency at the nearest end, at the load and speed of the map, Hz; 0 for divergence.
     pub frequency_hz: f64,
-    /// The nearest end: its friction coefficient, the margin to it and the bound of their error.
+    /// The nearest end: its friction coefficient, the margin and the error bound of both.
     pub end: NearestEnd,
 }
 
@@ -146,8 +148,9 @@ impl StabilityMap {
         Ok(map)
     }
 
-    /// Identities of the roots of `spectrum` by their shapes, solved at this map's load and speed or close to them: what looks for
-    /// the ends of windows follows a pair by. Modes that are shown are numbered by [`StabilityMap::ids`].
+    /// Identities of the roots of `spectrum`, assigned by shape. `spectrum` must be solved at the map's load and
+    /// speed or close to them. The search for window ends uses them to follow a pair; modes that are shown get their
+    /// identities from [`StabilityMap::ids`].
     pub(super) fn identify(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
         let mu = spectrum.point.friction_coefficient;
         let after = self.nodes.partition_point(|node| node.mu() < mu);
@@ -161,8 +164,9 @@ impl StabilityMap {
         }
     }
 
-    /// The window of instability that the friction coefficient of `point` lies in or is nearest to, seen from its nearest end;
-    /// `ends` are the ends of this map's windows, at this map's load and speed or carried from there. `None` without windows.
+    /// The window that contains the friction coefficient of `point`, or the nearest one, with its nearest end. `ends`
+    /// are the ends of this map's windows, at the map's load and speed or carried to those of `point`. `None` if
+    /// there are no windows.
     pub fn next_window(&self, ends: &Ends, point: &OperatingPoint) -> Option<NextWindow<'_>> {
         let end = ends.nearest(point)?;
         let window = self.windows.get(end.window)?;
@@ -170,12 +174,12 @@ impl StabilityMap {
         Some(NextWindow { window, frequency_hz, end })
     }
 
-    /// The smallest friction coefficient at which an instability begins.
+    /// The smallest friction coefficient at which a window begins.
     pub fn critical_friction(&self) -> Option<f64> {
         self.windows.iter().map(|window| window.mu_from).reduce(f64::min)
     }
 
-    /// Every number that a prediction can depend on, as bits: two maps with equal words predict the same.
+    /// The bits of every number a prediction can depend on: maps with equal words give equal predictions.
     pub fn words(&self) -> Vec<u64> {
         let mut words = vec![];
         for node in &self.nodes {
@@ -192,7 +196,7 @@ impl StabilityMap {
     }
 }
 
-/// The friction coefficients solved first, ascending: an even grid that contains 0.
+/// The friction coefficients of the initial nodes, ascending: an equidistant grid to which 0 is added.
 fn first_grid(mu_min: f64, mu_max: f64, intervals: usize) -> Vec<f64> {
     let step = (mu_max - mu_min) / intervals as f64;
     let mut grid: Vec<f64> = (0..=intervals).map(|k| mu_min + step * k as f64).collect();
@@ -200,13 +204,13 @@ fn first_grid(mu_min: f64, mu_max: f64, intervals: usize) -> Vec<f64> {
     grid.push(0.0);
     grid.sort_by(f64::total_cmp);
     grid.dedup_by(|a, b| (*a - *b).abs() < 1e-9 * step);
-    // Of two nearly equal values the first stays; 0 must be there exactly.
+    // Removing duplicates keeps the first of two nearly equal values, but the grid must contain 0 exactly.
     grid.iter_mut().filter(|mu| mu.abs() < 1e-9 * step).for_each(|mu| *mu = 0.0);
     grid.dedup();
     grid
 }
 
-/// Gives the roots at friction coefficient 0 their numbers and carries them both ways along the links.
+/// Numbers the roots at friction coefficient 0 and carries the identities along the links in both directions.
 fn identify_all(spectra: Vec<Spectrum>, links: &[Continuation]) -> Vec<Node> {
     let start = spectra.iter().position(|s| s.point.friction_coefficient == 0.0).unwrap_or(0);
     let mut nodes: Vec<Node> =
@@ -229,7 +233,8 @@ fn identify_all(spectra: Vec<Spectrum>, links: &[Continuation]) -> Vec<Node> {
     nodes
 }
 
-/// Identities of `to` from those of `from`; a root that continues none gets the next number.
+/// Identities of the roots of `to`, continued from those of `from`. A root that continues none gets the next unused
+/// number.
 fn carry(from: &Node, to: &Spectrum, source: impl Fn(usize) -> Option<usize>, next_id: &mut u32) -> Vec<Option<u32>> {
     let mut ids: Vec<Option<u32>> = vec![None; to.roots.len()];
     for (j, id) in ids.iter_mut().enumerate().take(tracked(to)) {
@@ -245,13 +250,13 @@ fn carry(from: &Node, to: &Spectrum, source: impl Fn(usize) -> Option<usize>, ne
 
 fn continued_ids(node: &Node, spectrum: &Spectrum) -> Vec<Option<u32>> {
     let link = continue_roots(&node.spectrum, spectrum);
-    // A root that continues none of the map's: a number no root of the map has.
+    // Roots that continue no root of the map get numbers that no root of the map has.
     let mut next_id = node.ids.iter().flatten().max().map_or(0, |id| id + 1_000_000);
     carry(node, spectrum, |j| link.source[j], &mut next_id)
 }
 
-/// Through a merging point the two identities of a pair are its own but cannot be told apart: the lower one is given
-/// to the growing mode while the pair is coupled, and to the lower frequency when it has separated again.
+/// Orders the two identities of a pair. After a merging point they cannot be told apart by shape: while the pair is
+/// coupled, the growing mode gets the lower identity; once the pair has separated, the lower frequency gets it.
 fn settle_pairs(from: &Node, to: &Spectrum, ids: &mut [Option<u32>]) {
     for j in 0..tracked(to) {
         let Some(partner) = mirror(to, j).filter(|&partner| partner > j) else { continue };
@@ -272,7 +277,7 @@ fn settle_pairs(from: &Node, to: &Spectrum, ids: &mut [Option<u32>]) {
     }
 }
 
-/// The root that mirrors root `j` at the imaginary axis (`λ → -λ̄`): the other half of an undamped flutter pair.
+/// The mirror image `-λ̄` of root `j` at the imaginary axis: the other member of an undamped flutter pair.
 pub(super) fn mirror(spectrum: &Spectrum, j: usize) -> Option<usize> {
     let root = spectrum.roots[j];
     if !root.oscillates() || root.lambda.re == 0.0 {
