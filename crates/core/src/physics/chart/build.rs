@@ -1,10 +1,11 @@
-//! Building a chart: solve at points of a box, follow the roots, cluster what is not analytic alone, split what does
-//! not converge.
+//! Builds a chart: solve at points of a box, follow the roots, cluster the roots that are not analytic on their own,
+//! and split boxes that do not converge.
 //!
-//! A box that fails hands its points down to its halves, so that nearly every solve serves a leaf. What is split off
-//! much smaller than the box that work began with waits, without its points; the box that holds the most conditions is
-//! next. So most conditions are charted early and the hard corners last, and a build that was interrupted goes on from
-//! its last such unit of work to the same chart.
+//! When a box is split, its halves inherit its points, so nearly every solve serves a leaf. Work is divided into
+//! units, each of which begins with the pending box that holds the most conditions. Boxes that become much smaller
+//! than the box the unit began with stay pending and lose their points. Most conditions are therefore charted early
+//! and the difficult corners last. An interrupted build resumes after its last finished unit and gives the same
+//! chart.
 
 use std::panic::resume_unwind;
 use std::sync::{Mutex, PoisonError};
@@ -19,26 +20,27 @@ use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::Solver;
 use crate::physics::spectrum::{SolveError, Spectrum};
 
-/// What to chart, and how well.
+/// Box and accuracy of a chart.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChartOptions {
-    /// One corner of the box of conditions.
+    /// Lower corner of the box of conditions; load and speed positive.
     pub low: OperatingPoint,
-    /// The opposite corner; speed and load positive.
+    /// Upper corner of the box.
     pub high: OperatingPoint,
-    /// Roots above are not charted one by one, Hz.
+    /// Upper limit of the band, Hz. Roots that are above it everywhere on a leaf are charted only as members of a
+    /// cluster.
     pub band_max_hz: Option<f64>,
-    /// Relative error of `λ²` that is asked for, away from merging points.
+    /// Required relative error of `λ²`, away from merging points.
     pub tolerance: f64,
-    /// Boxes that hold a smaller share of the conditions are not charted.
+    /// Boxes with a smaller share of the conditions are not charted.
     pub smallest_share: f64,
-    /// Dense solves after which what is left stays without a chart.
+    /// Maximum number of dense solves; boxes pending then are not charted.
     pub max_solves: usize,
-    /// Threads that solve.
+    /// Number of threads that solve.
     pub threads: usize,
 }
 
-/// Why there is no chart.
+/// Why a chart could not be built.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ChartError {
     #[error("{what} from {low} to {high}: expected a finite range{limit}")]
@@ -49,26 +51,27 @@ pub enum ChartError {
     Stopped,
 }
 
-/// Points besides those of the fit at which a leaf is checked.
+/// Number of held-out points at which each leaf is checked.
 const HELD_OUT: usize = 3;
-/// Boxes split off a unit of work that are smaller than it by this factor wait.
+/// A box split off within a unit of work stays pending if its share is below this fraction of the unit's.
 const UNIT: f64 = 0.04;
-/// Boxes that are tried side by side, whatever the number of threads: what is tried next depends on it.
+/// Number of boxes tried concurrently. It is independent of the number of threads because it decides the order of
+/// boxes.
 const SIDE_BY_SIDE: usize = 4;
 
-/// How far a build has come.
+/// Progress of a build.
 pub struct Progress<'a> {
-    /// What there is by now.
+    /// The chart so far.
     pub chart: &'a Chart,
-    /// Share of the box that is charted or given up.
+    /// Share of the conditions that is charted or left to dense solves.
     pub share: f64,
-    /// Whether a unit of work was finished: the chart is as good as any to go on from.
+    /// Whether a unit of work has just been finished: the chart can then be resumed from.
     pub unit_finished: bool,
 }
 
 /// Builds a chart of `model`.
 ///
-/// `go_on` is told the share of the box that is done, and stops the work by saying no.
+/// `go_on` receives the share of the box that is done; the build stops if it returns false.
 ///
 /// # Errors
 /// [`ChartError`].
@@ -76,10 +79,10 @@ pub fn build(model: &Model, options: &ChartOptions, go_on: &dyn Fn(f64) -> bool)
     resume(model, options, None, &mut |progress| go_on(progress.share))
 }
 
-/// Builds a chart of `model`, going on from one of the same model and options that was interrupted: the chart is the same as
-/// without the interruption.
+/// Builds a chart of `model`, resuming from `begun`, an interrupted chart of the same model and options. The result
+/// is the same as without the interruption.
 ///
-/// `go_on` is told how far it has come, and stops the work by saying no.
+/// `go_on` receives the progress; the build stops if it returns false.
 ///
 /// # Errors
 /// [`ChartError`].
@@ -112,10 +115,10 @@ pub fn resume(
     Ok(builder.chart)
 }
 
-/// One end of a box on every axis.
+/// A corner of a box: one coordinate for each axis.
 type Corner = [f64; MAX_AXES];
 
-/// The axes that matter for `model`, and the box in their coordinates.
+/// The axes that `model` depends on, and the lower and upper corner of the box in their coordinates.
 fn domain(model: &Model, options: &ChartOptions) -> Result<(Vec<Axis>, Corner, Corner), ChartError> {
     let (load, speed) = model.depends_on_load_and_speed();
     let mut axes = vec![Axis::Friction];
@@ -152,13 +155,14 @@ struct Work {
     slot: usize,
     low: Corner,
     high: Corner,
-    /// Share of the conditions that it holds.
+    /// Share of the conditions that lie in it.
     share: f64,
     samples: Vec<Sample>,
 }
 
 impl Work {
-    /// The lower and the upper half along an axis, each with what was solved there, pending in `chart`; and where they meet.
+    /// Splits the box along an axis: the coordinate of the split, and the lower and upper half, each with the samples
+    /// that lie in it. Both halves become pending in `chart`.
     fn halves(self, axis: usize, chart: &mut Chart) -> (f64, [Self; 2]) {
         let Self { low, high, samples, .. } = self;
         let at = 0.5 * (low[axis] + high[axis]);
@@ -191,7 +195,7 @@ pub(super) struct Builder<'a> {
 }
 
 impl Builder<'_> {
-    /// The box without an outcome that holds the most conditions.
+    /// The pending box that holds the most conditions.
     fn largest_pending(&self) -> Option<Work> {
         let pending = self.chart.boxes().filter(|(slot, ..)| matches!(self.chart.branches[*slot], Branch::Pending));
         let largest = pending.max_by(|a, b| self.chart.share(&a.1, &a.2).total_cmp(&self.chart.share(&b.1, &b.2)));
@@ -203,7 +207,7 @@ impl Builder<'_> {
         open.for_each(|branch| *branch = Branch::Dense);
     }
 
-    /// Charts a box, and its halves as long as they are not much smaller.
+    /// Charts a box, and recursively its halves until they are much smaller than it.
     fn unit(&mut self, unit: Work, go_on: &mut dyn FnMut(&Progress<'_>) -> bool) -> Result<(), ChartError> {
         let smallest = (UNIT * unit.share).max(self.options.smallest_share);
         let mut stack = vec![unit];
@@ -235,7 +239,7 @@ impl Builder<'_> {
         Ok(())
     }
 
-    /// Tries to chart some boxes, the solvers spread over them; with each outcome the number of solves it took.
+    /// Tries to chart some boxes concurrently. Returns the outcome and the number of solves of each.
     fn side_by_side(&mut self, boxes: &mut [Work]) -> Vec<(Outcome, usize)> {
         let mut solvers = std::mem::take(&mut self.solvers);
         let each = solvers.len().div_ceil(boxes.len());
@@ -259,7 +263,7 @@ impl Builder<'_> {
         outcomes.into_iter().map(|(_, outcome, solves)| (outcome, solves)).collect()
     }
 
-    /// Tries to chart a box; its samples gain what was solved, and `solves` how much that was.
+    /// Tries to chart a box. New samples are added to the box, and their number to `solves`.
     fn leaf(&self, work: &mut Work, solvers: &mut [Solver], solves: &mut usize) -> Outcome {
         let Work { low, high, samples, .. } = work;
         let axes = self.chart.axes.len();
@@ -275,7 +279,7 @@ impl Builder<'_> {
         let fresh: Vec<[f64; MAX_AXES]> =
             fresh.iter().map(|unit| std::array::from_fn(|k| low[k] + half[k] * (unit[k] + 1.0))).collect();
         *solves += fresh.len();
-        // Where a solve fails there is nothing to chart; what is around it may converge.
+        // If a solve fails the box cannot be charted, but the half without that point may converge.
         let Ok(solved) = self.sampler.solve_all(solvers, &fresh) else { return Outcome::Split(longest) };
         samples.extend(solved);
         let undamped = self.chart.undamped;
@@ -311,7 +315,7 @@ impl Builder<'_> {
         if self.check(&leaf, held_out) { Outcome::Converged(leaf) } else { Outcome::Split(longest) }
     }
 
-    /// Compares a leaf with dense solves that took no part in its fit; errors seen above a bound refuse it.
+    /// Checks a leaf against the solves at its held-out points; fails if an error exceeds its bound.
     fn check(&self, leaf: &Leaf, held_out: &[Sample]) -> bool {
         let alone = self.chart.with_only(leaf);
         let (mut scratch, mut modes) = (Scratch::default(), vec![]);
@@ -323,20 +327,20 @@ impl Builder<'_> {
     }
 }
 
-/// Points of a fit: a half more data than coefficients.
+/// Number of points of a fit: 1.5 times as many data as coefficients.
 fn points_wanted(basis: &Basis, axes: usize) -> usize {
     (3 * basis.len()).div_ceil(2 * Basis::orders(axes).len())
 }
 
-/// Whether a static root of a damped model, which is not charted, grows at one of the nodes or may grow between them:
-/// comes closer to zero than it moves over the box.
+/// Whether a static root of a damped model, which is not charted, grows at one of the points or may grow between
+/// them. It may if its distance from zero is less than its change over the box.
 fn may_diverge<'a>(spectra: impl Iterator<Item = &'a Spectrum>) -> bool {
     let largest = |s: &Spectrum| s.roots[s.mode_count..].iter().map(|root| root.lambda.re).reduce(f64::max);
     let (mut low, mut high) = (f64::INFINITY, f64::NEG_INFINITY);
     for growth in spectra.filter(|s| !s.undamped).filter_map(largest) {
         (low, high) = (low.min(growth), high.max(growth));
     }
-    // A free root stays at zero, exactly.
+    // A free root stays at exactly zero.
     high > 0.0 || (high > f64::NEG_INFINITY && high != low && high + (high - low) > 0.0)
 }
 
@@ -369,7 +373,8 @@ mod tests {
         }
     }
 
-    /// Nothing is beyond its bound, no root is missing, and away from merging points errors are at most the tolerance.
+    /// Builds a chart and compares it with dense solves: no error exceeds its bound, no root is missing, and away
+    /// from merging points errors are at most the tolerance.
     fn held_out(model: &Model, options: &ChartOptions, conditions: usize) -> HoldOut {
         let chart = build(model, options, &|_| true).expect("the chart can be built");
         let found = hold_out(model, options, &chart, conditions, 5).expect("dense solves succeed");
@@ -388,7 +393,7 @@ mod tests {
         assert!(found.charted > 1990, "{found:?}");
     }
 
-    /// One axis and two, with and without damping.
+    /// One axis and two axes, with and without damping.
     #[test]
     fn synthetic_rigs() {
         for (modes, damping_ratio, exponent) in [(20, 0.0, 0.0), (20, 0.0, 0.3), (80, 0.0, 0.0), (12, 2e-3, 0.3)] {
@@ -400,8 +405,8 @@ mod tests {
         }
     }
 
-    /// Static divergence: an undamped root is charted through `λ² = 0`; static roots of a damped model are not charted, and where
-    /// one grows no chart answers.
+    /// Static divergence. An undamped root is charted through `λ² = 0`. Static roots of a damped model are not
+    /// charted, and where one grows the chart gives no roots.
     #[test]
     fn static_roots() {
         for damping in [0.0, 0.02] {
@@ -438,7 +443,7 @@ mod tests {
         }
     }
 
-    /// A coefficient that is off, and a root that is gone, show in the traces: the chart has no answer then.
+    /// A wrong coefficient and a lost root violate the traces: the chart then gives no roots.
     #[test]
     fn a_wrong_coefficient_and_a_lost_root_are_told_by_the_traces() {
         let model = nine_dof(2.0, 2.0, 5.0);
@@ -455,7 +460,7 @@ mod tests {
         assert_eq!(evaluate(&chart), Ok(9));
         let (mut wrong, mut lost) = (chart.clone(), chart.clone());
         for leaf in &mut wrong.leaves {
-            // The constant of the mean of the first cluster.
+            // The constant coefficient of the mean of the first cluster.
             leaf.functions.coefficients[leaf.clusters[0].channel] *= 1.0 + 1e-6;
         }
         lost.leaves.iter_mut().for_each(|leaf| drop(leaf.clusters.pop()));
@@ -465,10 +470,11 @@ mod tests {
         }
     }
 
-    /// A static root of a damped model that comes closer to zero than it moves may pass it in between.
+    /// A static root of a damped model whose distance from zero is less than its change may cross zero between the
+    /// points.
     #[test]
     fn a_static_root_may_grow_between_the_points() {
-        // `λ² + 3 λ + k = 0`: the slower root decays by nearly k / 3.
+        // `λ² + 3 λ + k = 0`: the slower root is nearly `-k / 3`.
         let term = |value: f64, law| Term { matrix: faer::mat![[value]], law };
         let stiffness = vec![term(1.0, Law::FrictionStiffness)];
         let model = Model::new(1, stiffness, vec![term(3.0, Law::Constant)], ContactLaw::default(), None).unwrap();
@@ -481,7 +487,7 @@ mod tests {
         assert!(may(&[1.0, -0.1]), "it grows at one of the points");
     }
 
-    /// The number of threads changes nothing.
+    /// The chart is independent of the number of threads.
     #[test]
     fn any_number_of_threads_gives_the_same_chart() {
         let contact_law = ContactLaw { exponent: 0.3, ..Default::default() };
@@ -497,12 +503,12 @@ mod tests {
         }
     }
 
-    /// An interrupted build goes on to the same chart, to the last bit.
+    /// A build resumed after an interruption gives the same chart to the last bit.
     #[test]
     fn goes_on_to_the_same_chart() {
         let contact_law = ContactLaw { exponent: 0.3, ..Default::default() };
         let model = rig(&Synthetic { modes: 12, pairs: 12, damping_ratio: 2e-3, contact_law, seed: 2 }).unwrap();
-        // A narrow tolerance, so that there is more than one unit of work.
+        // The tolerance is tight so that there is more than one unit of work.
         let options = ChartOptions { tolerance: 1e-10, ..options((0.0, 50.0, 1.0), (1.5, 2000.0, 60.0), Some(5000.0)) };
         let mut units = vec![];
         let whole = resume(&model, &options, None, &mut |progress| {

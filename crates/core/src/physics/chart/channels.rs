@@ -1,18 +1,19 @@
-//! Expansions of many functions in one basis, evaluated together: a product of the basis values with a matrix.
+//! Expansions of many functions in one basis, evaluated together as a product of the basis values with a matrix.
 
 use super::chebyshev::Basis;
 
-/// Expansions of some functions on a box.
+/// Expansions of several functions (channels) on a box.
 #[derive(Clone, Debug)]
 pub struct Channels {
-    /// How many have coefficients of each total degree: those of high degree come first.
+    /// Number of channels with coefficients of each total degree. Channels are in descending order of degree.
     pub widths: Vec<usize>,
-    /// Degree by degree, polynomial by polynomial, channel fastest.
+    /// Coefficients by degree, then polynomial, then channel (fastest).
     pub coefficients: Vec<f64>,
 }
 
 impl Channels {
-    /// Of functions with their total degrees, highest first, and coefficients of `basis`.
+    /// Channels from functions, each given by its total degree and its coefficients in `basis`, in descending order
+    /// of degree.
     pub fn new(basis: &Basis, functions: &[(usize, Vec<f64>)]) -> Self {
         let width = |degree: usize| functions.iter().take_while(|(last, _)| *last >= degree).count();
         let widths: Vec<usize> = (0..=basis.degree()).map(width).collect();
@@ -25,11 +26,12 @@ impl Channels {
         Self { widths, coefficients }
     }
 
-    /// Their values where the polynomials of `basis` have `values`.
+    /// Values of all channels at the point where the polynomials of `basis` have `values`.
     pub fn evaluate(&self, basis: &Basis, values: &[f64], out: &mut Vec<f64>) {
         out.clear();
         out.resize(self.widths[0], 0.0);
-        // With the widest registers there are. The sums are the same with any: each channel is added up by itself.
+        // Uses the widest vector registers available. The result does not depend on their width: each channel is
+        // summed separately, in the same order.
         pulp::Arch::new().dispatch(
             #[inline(always)]
             || {
@@ -45,7 +47,7 @@ impl Channels {
     }
 }
 
-/// Adds `weights` times `rows` to `sums`, four rows at a time: each sum is then loaded and stored a fourth as often.
+/// Adds `weights` times `rows` to `sums`, four rows at a time, which divides loads and stores of the sums by four.
 #[inline(always)]
 fn accumulate(sums: &mut [f64], weights: &[f64], rows: &[f64]) {
     let width = sums.len();

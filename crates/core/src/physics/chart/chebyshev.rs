@@ -1,11 +1,12 @@
-//! Chebyshev polynomials of bounded total degree on a box, fitted to values, slopes and curvatures at scattered points.
+//! Chebyshev polynomials of bounded total degree on a box, fitted to values, slopes and curvatures at scattered
+//! points.
 
 use faer::prelude::*;
 use faer::{Mat, linalg::solvers::Qr};
 
 use super::MAX_AXES;
 
-/// Products of Chebyshev polynomials of at most `degree` in all, lowest degree first.
+/// Products of Chebyshev polynomials with a total degree of at most `degree`, in ascending order of degree.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Basis {
     axes: usize,
@@ -13,10 +14,10 @@ pub struct Basis {
     degrees: Vec<[u8; MAX_AXES]>,
 }
 
-/// Polynomials a smooth function of one variable is expanded in at most.
+/// Maximum number of polynomials in the expansion of a function of one variable.
 pub const MOST_DEGREES: usize = 32;
 
-/// Largest degree of a basis.
+/// Maximum total degree of a basis.
 const MAX_DEGREE: usize = 24;
 
 impl Basis {
@@ -34,7 +35,7 @@ impl Basis {
         Self { axes, degree, degrees }
     }
 
-    /// The total degree used for a number of axes: as high as keeps evaluation short.
+    /// The basis used for a number of axes. Its degree is limited by the evaluation time.
     pub fn for_axes(axes: usize) -> Self {
         Self::new(
             axes,
@@ -56,26 +57,26 @@ impl Basis {
         self.degree
     }
 
-    /// The polynomials of total degree `degree`, which stand together.
+    /// Index range of the polynomials of total degree `degree`, which are contiguous.
     pub fn of_degree(&self, degree: usize) -> std::ops::Range<usize> {
         let below = |degree: usize| (0..self.axes).fold(1, |count, k| count * (degree + k) / (k + 1));
         below(degree)..below(degree + 1)
     }
 
-    /// The sum of the sizes of all coefficients beyond total degree `degree`.
+    /// The sum of the magnitudes of all coefficients above total degree `degree`.
     pub fn beyond(&self, coefficients: &[f64], degree: usize) -> f64 {
         coefficients[self.of_degree(degree).end.min(coefficients.len())..].iter().map(|c| c.abs()).sum()
     }
 
-    /// Their values at `unit`, each coordinate in `[-1, 1]`.
+    /// Values of the polynomials at `unit`, each coordinate in `[-1, 1]`.
     pub fn values(&self, unit: &[f64; MAX_AXES], out: &mut Vec<f64>) {
         let tables = unit.map(table);
         out.clear();
         out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| tables[k][usize::from(d[k])]).product::<f64>()));
     }
 
-    /// What is known of a function at a point, as how often it is derived along each axis: its value, its slopes, its curvatures
-    /// (those of axes `a` and `b`, `a` up to `b`, at `b (b + 1) / 2 + a`).
+    /// The data of a function at a point, each given by the order of its derivative along every axis: the value, the
+    /// slopes and the second derivatives (that along axes `a ≤ b` at index `b (b + 1) / 2 + a` of the latter).
     pub fn orders(axes: usize) -> Vec<[usize; MAX_AXES]> {
         let along = |axes: &[usize]| std::array::from_fn(|k| axes.iter().filter(|&&axis| axis == k).count());
         let slopes = (0..axes).map(|axis| along(&[axis]));
@@ -83,14 +84,14 @@ impl Basis {
         std::iter::once([0; MAX_AXES]).chain(slopes).chain(curvatures).collect()
     }
 
-    /// Their derivatives at `unit`, `orders` times along each axis, at most twice in all.
+    /// Derivatives of the polynomials at `unit`, of order `orders` along the axes; total order at most two.
     fn derivatives(&self, unit: &[f64; MAX_AXES], orders: &[usize; MAX_AXES], out: &mut Vec<f64>) {
         let tables: [_; MAX_AXES] = std::array::from_fn(|k| derivatives(unit[k])[orders[k]]);
         out.clear();
         out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| tables[k][usize::from(d[k])]).product::<f64>()));
     }
 
-    /// The axis along which the two highest degrees of `coefficients` weigh most.
+    /// The axis along which the coefficients of the two highest degrees are largest.
     fn worst_axis(&self, coefficients: impl Iterator<Item = f64>) -> usize {
         let mut by_axis = [0.0; MAX_AXES];
         for (d, c) in self.degrees.iter().zip(coefficients).filter(|(d, _)| total(d) + 1 >= self.degree) {
@@ -109,7 +110,7 @@ pub fn nodes(m: usize) -> Vec<f64> {
     (0..m).map(|k| (std::f64::consts::PI * (2 * k + 1) as f64 / (2 * m) as f64).cos()).collect()
 }
 
-/// Coefficients of the interpolant through `values` at as many [`nodes`].
+/// Coefficients of the interpolating polynomial through `values` at as many [`nodes`].
 pub fn coefficients(values: &[f64]) -> Vec<f64> {
     let m = values.len();
     let cosine =
@@ -119,7 +120,7 @@ pub fn coefficients(values: &[f64]) -> Vec<f64> {
     (0..m).map(|degree| weight(degree) * sum(degree)).collect()
 }
 
-/// `T_0(x), T_1(x), ..` into `out`.
+/// Writes `T_0(x), T_1(x), ..` to `out`.
 fn polynomials(x: f64, out: &mut [f64]) {
     for k in 0..out.len() {
         out[k] = match k {
@@ -149,8 +150,8 @@ fn table(x: f64) -> [f64; MAX_DEGREE + 1] {
     out
 }
 
-/// `x T_k(x / range)`; not a number beyond the range, where the expansion it belongs to means nothing. Differences
-/// across the end are still taken.
+/// `x T_k(x / range)`; NaN beyond the range, where the expansion is not valid. A margin of 1e-3 allows differences
+/// across the end of the range.
 pub fn beside_zero(x: f64, degree: usize, range: f64) -> f64 {
     let scaled = x / range;
     if scaled.abs() > 1.0 + 1e-3 {
@@ -167,7 +168,7 @@ pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
     if y.abs() > 1.0 + 1e-3 {
         return f64::NAN;
     }
-    // T and U of the degrees so far: U_k = y U_{k-1} + T_k.
+    // `T` and `U` up to the present degree: `U_k = y U_{k-1} + T_k`.
     let (mut before, mut t, mut u) = (y, 1.0, 0.0);
     for _ in 0..degree {
         u = y * u + t;
@@ -176,31 +177,31 @@ pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
     t + degree as f64 * y * u
 }
 
-/// An expansion of one function.
+/// The expansion of a function.
 pub struct Fitted {
     /// Coefficients of the basis.
     pub coefficients: Vec<f64>,
-    /// What the expansion leaves out, estimated: the largest misfit of a value, or of a derivative over what the first degree
-    /// left out makes of a value; and what the highest total degree amounts to at most, over the points, or the one before it:
-    /// one alone may be small by accident.
+    /// Estimated truncation error: misfit plus tail. The misfit is the largest of any value, or of any derivative
+    /// scaled to the value that the first omitted degree would have. The tail is the largest value of the terms of
+    /// one of the two highest total degrees, over the points; the highest alone may be small by accident.
     pub missing: f64,
-    /// The axis along which it converges worst.
+    /// The axis along which the expansion converges worst.
     pub worst_axis: usize,
 }
 
-/// A least-squares fit of values, slopes and curvatures at given points.
+/// A least-squares fit to values, slopes and curvatures at given points.
 pub struct Fit {
     basis: Basis,
     rows: Mat<f64>,
     weights: Vec<f64>,
-    /// Rows of a point.
+    /// Number of rows for each point.
     per_point: usize,
     qr: Qr<f64>,
 }
 
 impl Fit {
-    /// For data at `units`: at each point what [`Basis::orders`] lists, all but the value left out where it is not `sound`.
-    /// `None` where the points do not determine the coefficients.
+    /// A fit to data at `units`: at each point the data that [`Basis::orders`] lists, but only the value where it is
+    /// not `sound`. `None` if the points do not determine the coefficients.
     pub fn new(basis: &Basis, units: &[[f64; MAX_AXES]], sound: &[bool]) -> Option<Self> {
         let orders = Basis::orders(basis.axes);
         let mut rows = Mat::zeros(units.len() * orders.len(), basis.len());
@@ -208,7 +209,8 @@ impl Fit {
         let mut row = vec![];
         let degree = basis.degree.max(1) as f64;
         for (unit, &sound) in units.iter().zip(sound) {
-            // A derivative in θ, x = cos θ, is of the order of the degree everywhere.
+            // The derivative of a polynomial with respect to `θ`, `x = cos θ`, is of the order of its degree
+            // everywhere.
             let scale = unit.map(|x| (1.0 - x * x).max(0.0).sqrt().max(1.0 / degree) / degree);
             for order in &orders {
                 basis.derivatives(unit, order, &mut row);
@@ -236,11 +238,11 @@ impl Fit {
         })
     }
 
-    /// The expansions of the columns of `data`, ordered as said at [`Fit::new`].
+    /// Expansions of the columns of `data`, with rows in the order given at [`Fit::new`].
     pub fn expand(&self, mut data: Mat<f64>) -> Vec<Fitted> {
         for (row, &weight) in self.weights.iter().enumerate() {
             for column in 0..data.ncols() {
-                // What is left out may be no number.
+                // Omitted data may be NaN.
                 data[(row, column)] = if weight > 0.0 { weight * data[(row, column)] } else { 0.0 };
             }
         }
@@ -259,7 +261,7 @@ impl Fit {
                 let size = |last: &Mat<f64>| values().map(|row| last[(row, column)].abs()).fold(0.0, f64::max);
                 let tail = last.iter().map(size).fold(0.0, f64::max);
                 let coefficients: Vec<f64> = (0..self.basis.len()).map(|row| coefficients[(row, column)]).collect();
-                // NaN, of data that are not numbers, must not be lost in a maximum.
+                // `f64::max` ignores NaN, so NaN data must be reported explicitly.
                 let missing = if coefficients[0].is_nan() { f64::NAN } else { misfit + tail };
                 Fitted { worst_axis: self.basis.worst_axis(coefficients.iter().copied()), coefficients, missing }
             })
@@ -272,7 +274,7 @@ mod tests {
     use super::*;
     use crate::physics::chart::samples::spread;
 
-    /// Central differences of step h err by h² f'''/6, below 1e-7 here.
+    /// Central differences with step `h` have errors of `h² f'''/6`, below 1e-7 here.
     #[test]
     fn slopes_are_those_of_differences() {
         for degree in 0..6 {
@@ -284,7 +286,7 @@ mod tests {
         }
     }
 
-    /// An analytic function of three variables, fitted and evaluated elsewhere.
+    /// An analytic function of three variables, fitted and evaluated at other points.
     #[test]
     fn fits_in_three_variables() {
         let f = |x: [f64; 3]| (0.7 * x[0] - 0.3 * x[1]).exp() / (5.0 + x[0] * x[1] + x[2]);

@@ -1,16 +1,17 @@
-//! Clusters of roots by their symmetric functions, which stay analytic where the roots themselves merge.
+//! Clusters of roots, represented by symmetric functions, which stay analytic where the roots themselves merge.
 //!
-//! A cluster of `k` roots `z` is its mean `c` and the monic polynomial `P(w) = Π (w - (z - c))`, whose coefficient of
-//! `w^(k-1)` is zero: `k` numbers, real for an undamped model (the cluster is closed under conjugation), else complex.
+//! A cluster of `k` roots `z` is represented by its mean `c` and the monic polynomial `P(w) = Π (w - (z - c))`, whose
+//! coefficient of `w^(k-1)` is zero. These are `k` numbers: real for an undamped model, where the cluster is closed
+//! under conjugation, otherwise complex.
 
 use faer::c64;
 
 use crate::physics::spectrum::{magnitude, square_root};
 
-/// The most roots of a cluster.
+/// Maximum number of roots of a cluster.
 pub const MAX_SIZE: usize = 4;
 
-/// Mean and the coefficients of `w^(k-2) .. w^0` of the roots `z`.
+/// The symmetric functions of the roots `z`: their mean, then the coefficients of `w^(k-2) .. w^0`.
 pub fn symmetric_functions(z: &[c64]) -> Vec<c64> {
     let mean = z.iter().sum::<c64>() / z.len() as f64;
     let mut polynomial = vec![c64::new(1.0, 0.0)];
@@ -24,7 +25,7 @@ pub fn symmetric_functions(z: &[c64]) -> Vec<c64> {
     std::iter::once(mean).chain(polynomial.into_iter().skip(2)).collect()
 }
 
-/// The slopes of [`symmetric_functions`] where the roots `z` have slopes `dz`.
+/// Slopes of the [`symmetric_functions`] of roots `z` with slopes `dz`.
 pub fn symmetric_slopes(z: &[c64], dz: &[c64]) -> Vec<c64> {
     let mut slopes = vec![c64::ZERO; z.len()];
     slopes[0] = mean(dz);
@@ -32,13 +33,13 @@ pub fn symmetric_slopes(z: &[c64], dz: &[c64]) -> Vec<c64> {
     slopes
 }
 
-/// The curvatures of [`symmetric_functions`] along two axes, where the roots `z` have slopes `dza` and `dzb` along them and
-/// curvatures `ddz`.
+/// Second derivatives of the [`symmetric_functions`] along two axes `a` and `b`, of roots `z` with slopes `dza` and
+/// `dzb` and second derivatives `ddz`.
 pub fn symmetric_curvatures(z: &[c64], dza: &[c64], dzb: &[c64], ddz: &[c64]) -> Vec<c64> {
     let mut curvatures = vec![c64::ZERO; z.len()];
     curvatures[0] = mean(ddz);
     add_first_order(&mut curvatures, z, ddz);
-    // Two factors of the polynomial change at a time.
+    // The product terms, in which two factors of the polynomial change.
     let (drift_a, drift_b) = (mean(dza), mean(dzb));
     for (i, a) in dza.iter().enumerate() {
         for (j, b) in dzb.iter().enumerate().filter(|&(j, _)| j != i) {
@@ -54,7 +55,7 @@ fn mean(z: &[c64]) -> c64 {
     z.iter().sum::<c64>() / z.len() as f64
 }
 
-/// The change of the polynomial's coefficients as far as it is linear in that of the roots, `dz`.
+/// Adds the change of the polynomial's coefficients that is linear in the change `dz` of the roots.
 fn add_first_order(coefficients: &mut [c64], z: &[c64], dz: &[c64]) {
     let drift = mean(dz);
     for (i, &dz) in dz.iter().enumerate() {
@@ -64,7 +65,7 @@ fn add_first_order(coefficients: &mut [c64], z: &[c64], dz: &[c64]) {
     }
 }
 
-/// The coefficients of the product of the factors `w - (z - c)` but for some, highest power first.
+/// Coefficients of the product of the factors `w - (z - c)`, without those in `left_out`, highest power first.
 fn product_without(z: &[c64], left_out: &[usize]) -> Vec<c64> {
     let centre = mean(z);
     let mut others = vec![c64::new(1.0, 0.0)];
@@ -78,12 +79,12 @@ fn product_without(z: &[c64], left_out: &[usize]) -> Vec<c64> {
     others
 }
 
-/// The roots of a cluster of `functions.len()` from its symmetric functions, and a bound of each one's error from
-/// bounds of theirs.
+/// Writes the roots of a cluster of `functions.len()` roots, each with an error bound, from its symmetric functions
+/// and their error bounds.
 ///
-/// If the coefficients are off by at most `δ_m`, then `ρ = Σ δ_m |w|^(k-m)` bounds the true polynomial at a computed
-/// root `w`, and a true root lies within `k ρ / |P'(w)|` and within `ρ^(1/k)` of it (Laguerre; Henrici 1974, 6.4).
-/// The second is what remains at a merging point: half the digits.
+/// If the coefficients have errors of at most `δ_m`, then `ρ = Σ δ_m |w|^(k-m)` bounds the true polynomial at a
+/// computed root `w`. A true root lies within `k ρ / |P'(w)|` and within `ρ^(1/k)` of it (Laguerre; Henrici 1974,
+/// 6.4). At a merging point only the second bound is finite: half the digits remain.
 pub fn roots(functions: &[c64], errors: &[f64], out: &mut [(c64, f64); MAX_SIZE]) {
     let k = functions.len();
     let mean = functions[0];
@@ -110,7 +111,7 @@ pub fn roots(functions: &[c64], errors: &[f64], out: &mut [(c64, f64); MAX_SIZE]
     }
 }
 
-/// The roots of a cluster less their mean.
+/// The roots of a cluster minus their mean.
 pub fn offsets(functions: &[c64]) -> [c64; MAX_SIZE] {
     let mut w = [c64::ZERO; MAX_SIZE];
     match functions.len() {
@@ -124,7 +125,7 @@ pub fn offsets(functions: &[c64]) -> [c64; MAX_SIZE] {
     w
 }
 
-/// All roots of `w^k + a_0 w^(k-2) + a_1 w^(k-3) + ..` at once (Aberth 1973).
+/// All roots of `w^k + a_0 w^(k-2) + a_1 w^(k-3) + ..` simultaneously (Aberth 1973).
 fn simultaneous(a: &[c64], w: &mut [c64]) {
     let k = w.len();
     let radius = a.iter().enumerate().map(|(m, a)| a.norm().powf(1.0 / (m + 2) as f64)).fold(0.0, f64::max);
@@ -139,7 +140,7 @@ fn simultaneous(a: &[c64], w: &mut [c64]) {
     for _ in 0..60 {
         let mut largest: f64 = 0.0;
         for i in 0..k {
-            // Horner for P and P'; the coefficient of w^(k-1) is zero.
+            // Horner's scheme for `P` and `P'`; the coefficient of `w^(k-1)` is zero.
             let (mut p, mut slope) = (c64::new(1.0, 0.0), c64::ZERO);
             for m in 0..k {
                 slope = slope * w[i] + p;
@@ -167,7 +168,7 @@ fn simultaneous(a: &[c64], w: &mut [c64]) {
 mod tests {
     use super::*;
 
-    /// Roots to symmetric functions and back, clusters of one to four, merging pairs included.
+    /// Roots to symmetric functions and back: clusters of one to four roots, merging pairs included.
     #[test]
     fn there_and_back() {
         let z = |re: f64, im: f64| c64::new(re, im);
@@ -189,7 +190,7 @@ mod tests {
                     .copied()
                     .unwrap();
                 assert!((nearest - root).norm() < 1e-11, "{nearest} is not {root}");
-                // Rounding of the mean, 4 ε, is not in the bound asked for.
+                // The bound does not include the rounding of the mean, 4 ε.
                 assert!((nearest - root).norm() <= bound + 2e-15, "{nearest}, {root}: bound {bound}");
             }
         }

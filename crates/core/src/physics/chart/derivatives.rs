@@ -1,4 +1,4 @@
-//! How roots move with the axes of a chart, to first and second order, from their left and right vectors.
+//! First and second derivatives of roots along the axes of a chart, from left and right vectors.
 
 use faer::{Mat, MatRef, c64};
 
@@ -6,37 +6,38 @@ use super::MAX_AXES;
 use crate::physics::spectrum::Spectrum;
 use crate::physics::tracking::tracked;
 
-/// Pairs of axes, one of each two.
+/// Maximum number of unordered pairs of axes, an axis with itself included.
 pub const PAIRS: usize = MAX_AXES * (MAX_AXES + 1) / 2;
 
-/// Every pair `(a, b)` of axes with `a` up to `b`, that pair at `b (b + 1) / 2 + a`.
+/// Every pair `(a, b)` of axes with `a ≤ b`, at index `b (b + 1) / 2 + a`.
 pub fn pairs(axes: usize) -> impl Iterator<Item = [usize; 2]> {
     (0..axes).flat_map(|b| (0..=b).map(move |a| [a, b]))
 }
 
-/// The derivative of the stiffness and of the damping, `n×n`, where there is one.
+/// Derivatives of stiffness and damping, `n×n`; `None` for a matrix that does not change.
 pub type Change = [Option<Mat<f64>>; 2];
 
-/// Of every tracked root `z`: `λ²` of an undamped model, `λ` of a damped one. They are no numbers where a root is multiple, or
-/// the matrices have no derivative.
+/// Derivatives of every followed root `z`: `λ²` of an undamped model, `λ` of a damped one. NaN or infinite where a
+/// root is multiple or the matrices have no derivative.
 pub struct Derivatives {
-    /// Along each axis.
+    /// First derivatives along each axis.
     pub slopes: Vec<[c64; MAX_AXES]>,
-    /// Along the [`pairs`] of axes.
+    /// Second derivatives along the [`pairs`] of axes.
     pub curvatures: Vec<[c64; PAIRS]>,
 }
 
 impl Derivatives {
-    /// From the changes of the matrices along each axis, `first`, and along each pair of axes, `second`.
+    /// Computes the derivatives from those of the matrices: `first` along each axis, `second` along each pair of
+    /// axes. `left` holds the left vectors, `n×roots`.
     ///
-    /// With `Qₐ = λ Cₐ + Kₐ` and sums over every other root `j`, mirror images included: `λₐ = -yᴴ Qₐ x` and
+    /// With `Qₐ = λ Cₐ + Kₐ` and the sum over every other root `j`, complex conjugates included: `λₐ = -yᴴ Qₐ x` and
     ///
     /// `λ_ab = -yᴴ Q_ab x - λₐ yᴴ C_b x - λ_b yᴴ Cₐ x - 2 λₐ λ_b yᴴ x + Σ (Uₐ V_b + U_b Vₐ) / (λ - λⱼ)`,
     /// `Uₐ = yᴴ Qₐ xⱼ + λₐ (λ - λⱼ) yᴴ xⱼ`, `Vₐ = yⱼᴴ Qₐ x + λₐ (λ - λⱼ) yⱼᴴ x`,
     ///
-    /// from `Q(λ)⁻¹ = Σ xⱼ yⱼᴴ / (λ - λⱼ)` and `yⱼᴴ C x = -(λ + λⱼ) yⱼᴴ x` (Lancaster, "On eigenvalues of matrices dependent on a
-    /// parameter", Numer. Math. 6, 1964, for the linear problem). Of an undamped model `λ²` takes the place of `λ`, and only
-    /// what has a `Q` in it is left.
+    /// from `Q(λ)⁻¹ = Σ xⱼ yⱼᴴ / (λ - λⱼ)` and `yⱼᴴ C x = -(λ + λⱼ) yⱼᴴ x` (Lancaster, "On eigenvalues of matrices
+    /// dependent on a parameter", Numer. Math. 6, 1964, for the linear problem). For an undamped model `λ²` takes the
+    /// place of `λ`, and only the terms that contain `Q` remain.
     pub fn new(spectrum: &Spectrum, left: MatRef<'_, c64>, first: &[Change], second: &[Change]) -> Self {
         let undamped = spectrum.undamped;
         let value = |k: usize| if undamped { spectrum.roots[k].square } else { spectrum.roots[k].lambda };
@@ -49,7 +50,7 @@ impl Derivatives {
             .iter()
             .map(|change| change.each_ref().map(|m| m.as_ref().map(|matrix| sides.diagonal(matrix, count))))
             .collect();
-        // Of what only a damped model has.
+        // `yᴴ x` of all pairs; only a damped model needs it.
         let overlaps = (!undamped).then(|| sides.products(None));
 
         let (mut slopes, mut curvatures) = (vec![[c64::ZERO; MAX_AXES]; count], vec![[c64::ZERO; PAIRS]; count]);
@@ -68,7 +69,7 @@ impl Derivatives {
                 }
             }
             let others = (0..spectrum.roots.len()).filter(|&j| j != i).map(|j| (j, false));
-            // Of a damped model every mode has its mirror image besides.
+            // In a damped model the complex conjugate of every mode is a root too.
             let images = (0..if undamped { 0 } else { spectrum.mode_count }).map(|j| (j, true));
             for (j, mirrored) in others.chain(images) {
                 let gap = z - if mirrored { value(j).conj() } else { value(j) };
@@ -84,7 +85,7 @@ impl Derivatives {
                 let per = 1.0 / gap;
                 for (curvature, [a, b]) in curvature.iter_mut().zip(pairs(axes)) {
                     let product = u[a] * v[b] + u[b] * v[a];
-                    // Roots that nothing couples may be equal.
+                    // Uncoupled roots may be equal: the gap is zero then.
                     if product != c64::ZERO {
                         *curvature += product * per;
                     }
@@ -107,7 +108,7 @@ fn parts(vectors: MatRef<'_, c64>) -> [Mat<f64>; 2] {
 }
 
 impl Sides {
-    /// `yᵢᴴ M xⱼ` and `yᵢᵀ M xⱼ` of all roots; `M` is the identity unless given.
+    /// `yᵢᴴ M xⱼ` and `yᵢᵀ M xⱼ` of all pairs of roots; `M` is the identity if not given.
     fn products(&self, matrix: Option<&Mat<f64>>) -> Products {
         let moved = matrix.map(|matrix| self.right.each_ref().map(|part| matrix * part));
         let [wr, wi] = moved.as_ref().unwrap_or(&self.right);
@@ -133,25 +134,26 @@ impl Sides {
     }
 }
 
-/// `yᵢᴴ M xⱼ` and `yᵢᵀ M xⱼ`; the second tells of mirror images, whose vectors are conjugate.
+/// `yᵢᴴ M xⱼ` and `yᵢᵀ M xⱼ`; the second is needed for complex conjugate roots, whose vectors are conjugate.
 struct Products {
     plain: Mat<c64>,
     transposed: Mat<c64>,
 }
 
 impl Products {
-    /// `yᵢᴴ M xⱼ`, where `j` may be a mirror image.
+    /// `yᵢᴴ M xⱼ`, with the complex conjugate of root `j` if `mirrored`.
     fn to(&self, i: usize, j: usize, mirrored: bool) -> c64 {
         if mirrored { self.transposed[(i, j)].conj() } else { self.plain[(i, j)] }
     }
 
-    /// `yⱼᴴ M xᵢ`, where `j` may be a mirror image.
+    /// `yⱼᴴ M xᵢ`, with the complex conjugate of root `j` if `mirrored`.
     fn from(&self, j: usize, i: usize, mirrored: bool) -> c64 {
         if mirrored { self.transposed[(j, i)] } else { self.plain[(j, i)] }
     }
 }
 
-/// What `of` says of the stiffness, and `z` times what it says of the damping.
+/// `of(stiffness) + z of(damping)`, the value of `of` for `Qₐ = Kₐ + z Cₐ`; a matrix that does not change counts as
+/// zero.
 fn weighed<T>(change: &[Option<T>; 2], z: c64, of: impl Fn(&T) -> c64) -> c64 {
     let [stiffness, damping] = change.each_ref().map(|part| part.as_ref().map_or(c64::ZERO, &of));
     stiffness + z * damping

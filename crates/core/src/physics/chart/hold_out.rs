@@ -1,4 +1,4 @@
-//! Charts held against dense solves at conditions that took no part in building them.
+//! Compares charts with dense solves at held-out points.
 
 use faer::c64;
 
@@ -12,30 +12,31 @@ use crate::physics::spectrum::{Root, SolveError, Spectrum, Vectors};
 use crate::physics::synthetic::Uniform;
 use crate::physics::tracking::tracked;
 
-/// What a comparison found.
+/// Result of a comparison.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct HoldOut {
-    /// Conditions that the chart answered.
+    /// Number of points at which the chart gave roots.
     pub charted: usize,
-    /// Conditions for which it has no leaf.
+    /// Number of points without a leaf.
     pub not_converged: usize,
-    /// Conditions at which its roots do not agree with the traces.
+    /// Number of points at which the charted roots violate the traces.
     pub incomplete: usize,
-    /// Roots that differ from dense ones by more than the bounds of both.
+    /// Number of charted roots that differ from their dense root by more than the bounds of both.
     pub violations: usize,
-    /// The largest difference from a dense root, as a share of the bounds of both.
+    /// The largest difference from a dense root, divided by the sum of both bounds.
     pub largest_share: f64,
-    /// Largest relative error of `λ²` outside merging points: neighbours closer than `MERGING`, relative.
+    /// Largest relative error of `λ²` away from merging points, where the nearest root is at least `MERGING` away,
+    /// relative.
     pub largest_error: f64,
-    /// The 99th percentile of those.
+    /// The 99th percentile of these errors.
     pub p99_error: f64,
     /// Largest relative error of the mean `λ²` of two merging roots.
     pub largest_mean_error: f64,
-    /// Largest bound relative to `|λ²|`, outside merging points.
+    /// Largest error bound relative to `|λ²|`, away from merging points.
     pub largest_bound: f64,
 }
 
-/// A condition of the box, each value uniform.
+/// A random operating point of the box, uniformly distributed in each condition.
 pub(crate) fn draw(options: &ChartOptions, uniform: &mut Uniform) -> OperatingPoint {
     let mut between = |low: f64, high: f64| low + 0.5 * (uniform.draw() + 1.0) * (high - low);
     let ChartOptions { low, high, .. } = options;
@@ -46,10 +47,10 @@ pub(crate) fn draw(options: &ChartOptions, uniform: &mut Uniform) -> OperatingPo
     }
 }
 
-/// Compares `chart` with dense solves at `conditions` random conditions of the box of `options`.
+/// Compares `chart` with dense solves at `conditions` random operating points of the box of `options`.
 ///
 /// # Errors
-/// [`SolveError`] where a dense solve fails.
+/// [`SolveError`] if a dense solve fails.
 pub fn hold_out(
     model: &Model,
     options: &ChartOptions,
@@ -116,7 +117,8 @@ impl HoldOut {
     }
 }
 
-/// The dense root nearest to each charted one, each taken once, and how far off it is as a share of the bounds of both.
+/// For each charted root, the nearest dense root and the difference as a fraction of the sum of both bounds. Each
+/// dense root is used once; `None` if none is left.
 fn partners(modes: &[Root], spectrum: &Spectrum) -> Vec<Option<(usize, f64)>> {
     let rounding = ROUNDING * f64::EPSILON * spectrum.matrix_norm;
     let mut left: Vec<usize> = (0..tracked(spectrum)).collect();
@@ -132,12 +134,12 @@ fn partners(modes: &[Root], spectrum: &Spectrum) -> Vec<Option<(usize, f64)>> {
     modes.iter().map(partner).collect()
 }
 
-/// Whether a share is that of an error within its bound; NaN is none.
+/// Whether an error is within its bound, given as a fraction of it; false for NaN.
 fn within(share: f64) -> bool {
     share <= 1.0
 }
 
-/// Whether every charted root has a dense root within the bounds of both, each dense root taken once.
+/// Whether every charted root has a dense root within the bounds of both, each dense root used once.
 pub(super) fn within_bounds(modes: &[Root], spectrum: &Spectrum) -> bool {
     partners(modes, spectrum).iter().all(|partner| partner.is_some_and(|(_, share)| within(share)))
 }

@@ -1,5 +1,5 @@
-//! From followed roots to a leaf: clusters whose symmetric functions converge, their expansions and bounds, and how they are
-//! laid out.
+//! Makes a leaf from followed roots: finds clusters whose symmetric functions converge, expands and bounds them, and
+//! arranges the coefficients.
 
 use faer::{Mat, c64};
 
@@ -10,22 +10,22 @@ use super::derivatives::pairs;
 use super::samples::Sample;
 use super::{Channels, Cluster, Leaf, MAX_AXES};
 
-/// Bounds are this many times what was estimated or seen.
+/// Factor by which error bounds exceed estimated and observed errors.
 const SAFETY: f64 = 4.0;
-/// Error of a charted share of the pad; where it is not reached the share is NaN.
+/// Required error of a charted pad participation; if it is not reached, the participation is NaN.
 pub const SHARE_TOLERANCE: f64 = 1e-4;
-/// Distance of two roots, relative to their size, below which they count as merging.
+/// Relative distance below which two roots are considered merging.
 pub const MERGING: f64 = 1e-4;
 
-/// The samples of a box, and which of their roots are one.
+/// The samples of a box, with their roots connected to branches.
 pub struct Branches<'a> {
     pub samples: Vec<&'a Sample>,
     pub units: Vec<[f64; MAX_AXES]>,
-    /// Half the widths of the box.
+    /// Half the width of the box along each axis.
     pub half: [f64; MAX_AXES],
-    /// `[sample][branch]`.
+    /// Index of the root, by `[sample][branch]`.
     pub roots: Vec<Vec<usize>>,
-    /// Number of followed roots.
+    /// Number of branches, which is the number of followed roots.
     pub count: usize,
     /// Rounding error of a well-conditioned root.
     pub rounding: f64,
@@ -37,12 +37,12 @@ impl Branches<'_> {
         self.samples[sample].z[self.roots[sample][branch]]
     }
 
-    /// Slopes along the unit coordinates.
+    /// Slope with respect to the unit coordinate of an axis.
     fn slope(&self, sample: usize, branch: usize, axis: usize) -> c64 {
         self.samples[sample].slopes[self.roots[sample][branch]][axis] * self.half[axis]
     }
 
-    /// Curvatures along the unit coordinates of axes `a` and `b`, `a` up to `b`.
+    /// Second derivative with respect to the unit coordinates of axes `a` and `b`, `a ≤ b`.
     fn curvature(&self, sample: usize, branch: usize, [a, b]: [usize; 2]) -> c64 {
         let along = self.samples[sample].curvatures[self.roots[sample][branch]][b * (b + 1) / 2 + a];
         along * self.half[a] * self.half[b]
@@ -58,7 +58,8 @@ impl Branches<'_> {
 }
 
 impl Builder<'_> {
-    /// Clusters the branches of the band until every symmetric function converges; else the axis to split along.
+    /// Clusters the branches of the band until every symmetric function converges. The error is the axis to split
+    /// along.
     pub(super) fn cluster(&self, branches: &Branches<'_>, fit: &Fit) -> Result<Vec<(Vec<usize>, Expansion)>, usize> {
         let omega = |z: c64| if branches.undamped { (-z.re).max(0.0).sqrt() } else { z.im };
         let limit = self.options.band_max_hz.map_or(f64::INFINITY, |hz| hz * std::f64::consts::TAU);
@@ -74,7 +75,7 @@ impl Builder<'_> {
             if members.len() >= MAX_SIZE {
                 return Err(axis);
             }
-            // Whatever comes closest to a member joins, with all it was already clustered with.
+            // The branch nearest to any member joins the cluster, with its own cluster if it has one.
             let nearest = (0..branches.count)
                 .filter(|k| !members.contains(k))
                 .map(|k| (closeness(branches, &members, k), k))
@@ -97,11 +98,11 @@ impl Builder<'_> {
         Ok(settled)
     }
 
-    /// The expansions of the symmetric functions of some branches.
+    /// Expands the symmetric functions of the branches `members`.
     fn expand(&self, branches: &Branches<'_>, fit: &Fit, members: &[usize]) -> Expansion {
         let (axes, size, count) = (self.chart.axes.len(), members.len(), branches.samples.len());
         let parts = if branches.undamped { 1 } else { 2 };
-        // An error of λ counts twice in λ².
+        // A relative error of `λ` counts twice in `λ²`.
         let tolerance = self.options.tolerance / parts as f64;
         let per_point = Basis::orders(axes).len();
         let mut data = Mat::zeros(count * per_point, size * parts);
@@ -139,7 +140,7 @@ impl Builder<'_> {
             }
         }
         let mut expansion = Expansion { channels: vec![], errors: vec![0.0; size], degree: 0, failing: Some(0) };
-        // A cluster that is not closed under conjugation lacks its mirror image.
+        // Complex functions in an undamped model: the cluster lacks the conjugate of a member.
         if stray > 1e-6 {
             return expansion;
         }
@@ -164,8 +165,9 @@ impl Builder<'_> {
             }
         }
         expansion.channels = fitted.into_iter().map(|fitted| fitted.coefficients).collect();
-        // What is not needed is cut off, for all functions of the cluster alike. The sum of the sizes of what is cut bounds it, and is
-        // reached where one coefficient outweighs the others: errors of 1.00 of a bound are seen, and at most 0.1 of what is allowed.
+        // Truncation at a common degree for all functions of the cluster. The sum of the magnitudes of the dropped
+        // coefficients bounds the error. The bound is attained if one of them dominates: errors equal to their bound
+        // have been observed. The dropped sum is at most 0.1 of the allowed error.
         let basis = &self.chart.basis;
         let beyond = |column: usize, degree: usize| basis.beyond(&expansion.channels[column], degree);
         let enough =
@@ -179,7 +181,8 @@ impl Builder<'_> {
         expansion
     }
 
-    /// Lays the coefficients out and adds what the charted roots leave of the traces.
+    /// Expands the remainders of the traces and the pad participations, and arranges all coefficients as a leaf. The
+    /// error is the axis to split along.
     pub(super) fn assemble(
         &self,
         branches: &Branches<'_>,
@@ -252,7 +255,7 @@ impl Builder<'_> {
             beside.extend(share.map(|(degree, channel)| (degree, Some(k), channel)));
             clusters.push(Cluster { channel: 0, errors, share: None });
         }
-        // Channels of high degree first: those that take part in a degree stand together.
+        // Channels of high degree come first, so that the channels with coefficients of a degree are contiguous.
         functions.sort_by_key(|(degree, ..)| std::cmp::Reverse(*degree));
         beside.sort_by_key(|(degree, ..)| std::cmp::Reverse(*degree));
         let mut columns = vec![];
@@ -266,7 +269,7 @@ impl Builder<'_> {
             }
         }
         let beside: Vec<_> = beside.into_iter().map(|(degree, _, channel)| (degree, channel)).collect();
-        // Nearly in the order of their frequencies, so that the roots are quickly sorted.
+        // Clusters nearly in order of frequency, which makes sorting the roots fast.
         let mut clusters: Vec<_> = lowest.into_iter().zip(clusters).collect();
         clusters.sort_by_key(|(lowest, _)| *lowest);
         let clusters = clusters.into_iter().map(|(_, cluster)| cluster).collect();
@@ -281,8 +284,8 @@ impl Builder<'_> {
         })
     }
 
-    /// Coefficients of the pad's share of every root that is alone, where they converge. Slopes of shares are not known: the
-    /// fit is of as low a degree as the points allow.
+    /// Degree and coefficients of the pad participation of every single root, where they converge. Slopes of
+    /// participations are not available, so the degree is limited by the number of points.
     fn shares(&self, branches: &Branches<'_>, settled: &[(Vec<usize>, Expansion)]) -> Vec<Option<(usize, Vec<f64>)>> {
         let axes = self.chart.axes.len();
         let points = branches.units.len();
@@ -304,14 +307,14 @@ impl Builder<'_> {
         let data = Mat::from_fn(points * per_point, settled.len(), |row, k| {
             if row % per_point == 0 { share(row / per_point, k) } else { 0.0 }
         });
-        // NaN is no share.
+        // The comparison is false for NaN, which marks a participation that is not available.
         let converged = |fitted: &Fitted| SAFETY * fitted.missing <= SHARE_TOLERANCE;
         fit.expand(data).into_iter().map(|f| converged(&f).then_some((degree, f.coefficients))).collect()
     }
 }
 
-/// Lowers `allowed` to the error of each symmetric function of the roots `z` that leaves each of them the asked tolerance; the
-/// nearest other root counts as no closer than [`MERGING`].
+/// Lowers `allowed` to the errors of the symmetric functions of the roots `z` that keep each root within the
+/// tolerance. The nearest other root is taken to be [`MERGING`] away, however far it is.
 fn allow(z: &[c64], mean: c64, tolerance: f64, allowed: &mut [f64]) {
     let size = mean.norm();
     allowed[0] = allowed[0].min(if z.len() == 1 { 0.8 } else { 0.4 } * tolerance * size);
@@ -329,7 +332,7 @@ fn allow(z: &[c64], mean: c64, tolerance: f64, allowed: &mut [f64]) {
     }
 }
 
-/// How close branch `k` comes to any of `members` or to its mirror image, relative to its size.
+/// Smallest relative distance of branch `k` from any of `members` or its complex conjugate, over all samples.
 fn closeness(branches: &Branches<'_>, members: &[usize], k: usize) -> f64 {
     let gap = |node: usize| {
         let z = branches.z(node, k);
@@ -345,8 +348,8 @@ fn closeness(branches: &Branches<'_>, members: &[usize], k: usize) -> f64 {
 pub struct Expansion {
     channels: Vec<Vec<f64>>,
     errors: Vec<f64>,
-    /// Total degree beyond which coefficients are not needed.
+    /// Truncation degree: coefficients of higher total degree are not needed.
     degree: usize,
-    /// The axis along which it does not converge.
+    /// The axis along which it converges worst, if it does not converge.
     failing: Option<usize>,
 }

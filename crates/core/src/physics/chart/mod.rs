@@ -1,10 +1,11 @@
-//! Charts: the roots of a model over a box of conditions, as piecewise Chebyshev expansions of the symmetric functions
-//! of clusters of roots. Built once, in the background; evaluated in microseconds, with bounds.
+//! Charts: the roots of a model over a box of conditions, as piecewise Chebyshev expansions of the symmetric
+//! functions of clusters of roots. A chart is built once, in the background, and evaluated in microseconds, with
+//! error bounds.
 //!
-//! On each leaf of the box every root of the band belongs to a cluster: alone where it is analytic by itself, with the
-//! roots it merges with elsewhere. What the charted roots leave of the traces of the matrix and of its square is
-//! expanded too, so that every evaluation is checked against traces that are known exactly: a root that was missed or
-//! taken twice shows.
+//! On each leaf of the box every root of the band belongs to a cluster. A root that is analytic on the leaf is a
+//! cluster of its own; roots that merge somewhere share one. The remainders, which are the traces of the matrix and
+//! of its square minus the contributions of the charted roots, are expanded too. Every evaluation is checked against
+//! the exact traces, so a root that is missing or counted twice is detected.
 
 pub mod build;
 mod channels;
@@ -29,16 +30,16 @@ use cluster::MAX_SIZE;
 pub(crate) use samples::radical_inverse;
 pub use words::{BUILDER, FORMAT};
 
-/// A condition that a chart depends on; its coordinate inside a box.
+/// A condition that a chart depends on, and its coordinate inside a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Axis {
-    /// Friction coefficient, as it is.
+    /// Friction coefficient; the coordinate is `μ`.
     Friction,
-    /// Normal load, by its logarithm.
+    /// Normal load; the coordinate is its logarithm.
     Load,
-    /// Disc speed, by minus its inverse, which lateral friction is linear in; one direction of rotation.
+    /// Disc speed, of one sign; the coordinate is `-1/ω`, in which lateral friction is linear.
     Speed,
-    /// Load over speed, where nothing else of either matters.
+    /// Ratio of load to speed, if the model depends on both only through it.
     LoadOverSpeed,
 }
 
@@ -61,7 +62,7 @@ impl Axis {
         }
     }
 
-    /// A measure of conditions: equal steps of it hold equally many, if speeds and loads are evenly spread.
+    /// Coordinate in which conditions are uniformly distributed, if loads and speeds are.
     fn condition(self, coordinate: f64) -> f64 {
         match self {
             Self::Friction => coordinate,
@@ -71,10 +72,10 @@ impl Axis {
     }
 }
 
-/// The most axes of a chart.
+/// Maximum number of axes of a chart.
 const MAX_AXES: usize = 3;
 
-/// Why a chart has no answer at a point.
+/// Why a chart gives no roots at a point.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum NotCharted {
     #[error("outside the charted conditions")]
@@ -88,7 +89,7 @@ pub enum NotCharted {
 /// A node of the tree of boxes.
 #[derive(Clone, Debug)]
 enum Branch {
-    /// Split along an axis at a coordinate.
+    /// Split along an axis at a coordinate; `below` and `above` are indices of branches.
     Split {
         axis: usize,
         at: f64,
@@ -96,20 +97,21 @@ enum Branch {
         above: usize,
     },
     Leaf(usize),
-    /// Not converged: a dense solve is due there.
+    /// Not converged: a dense solve is needed there.
     Dense,
-    /// Not yet tried: a dense solve is due there meanwhile.
+    /// Not tried yet: a dense solve is needed there until it is.
     Pending,
 }
 
-/// Some roots of a leaf.
+/// Roots of a leaf that are expanded together.
 #[derive(Clone, Debug)]
 struct Cluster {
-    /// Where its channels begin among the functions.
+    /// Index of its first channel in [`Leaf::functions`].
     channel: usize,
-    /// Bound of the error of each symmetric function.
+    /// Error bound of each symmetric function.
     errors: Vec<f64>,
-    /// Where, beside the functions, the pad's share of a root that is alone is expanded, to [`leaf::SHARE_TOLERANCE`].
+    /// For a single root, the channel of [`Leaf::beside`] with its pad participation, accurate to
+    /// [`leaf::SHARE_TOLERANCE`]; `None` if that did not converge.
     share: Option<usize>,
 }
 
@@ -119,24 +121,23 @@ impl Cluster {
     }
 }
 
-/// A box on which everything converged.
+/// A box on which every expansion converged.
 #[derive(Clone, Debug)]
 struct Leaf {
     low: [f64; MAX_AXES],
     high: [f64; MAX_AXES],
     clusters: Vec<Cluster>,
-    /// Number of roots that are followed, charted or not: the same all over the box.
+    /// Number of followed roots, charted or not; constant over the box.
     tracked: usize,
-    /// The symmetric functions of the clusters.
+    /// Expansions of the symmetric functions of the clusters.
     functions: Channels,
-    /// What else a prediction needs: what the charted roots leave of the traces, in the first two channels, and shares of the
-    /// pad.
+    /// The other expansions: the two remainders of the traces, in the first channels, and the pad participations.
     beside: Channels,
     /// Error bounds of the two remainders.
     remainder_errors: [f64; 2],
 }
 
-/// The channels of [`Leaf::beside`] that hold what the charted roots leave of the traces.
+/// Number of channels of [`Leaf::beside`] that hold remainders of the traces.
 const REMAINDERS: usize = 2;
 
 /// The roots of a model over a box of conditions.
@@ -148,13 +149,13 @@ pub struct Chart {
     basis: Basis,
     branches: Vec<Branch>,
     leaves: Vec<Leaf>,
-    /// Roots are charted by `λ²` where no damping takes part, by `λ` otherwise.
+    /// Whether the model is undamped: `λ²` is charted then, otherwise `λ`.
     undamped: bool,
-    /// Dense solves that building it took.
+    /// Number of dense solves the build has taken.
     solves: usize,
 }
 
-/// What evaluation needs besides the chart; reused, it makes evaluation free of allocation.
+/// Work arrays of an evaluation. Reusing them makes evaluation free of allocation.
 #[derive(Clone, Debug, Default)]
 pub struct Scratch {
     basis: Vec<f64>,
@@ -163,36 +164,36 @@ pub struct Scratch {
 }
 
 impl Chart {
-    /// Number of boxes it consists of.
+    /// Number of leaves.
     pub fn leaf_count(&self) -> usize {
         self.leaves.len()
     }
 
-    /// Dense solves that building it took.
+    /// Number of dense solves the build has taken.
     pub fn solve_count(&self) -> usize {
         self.solves
     }
 
-    /// Bytes it holds.
+    /// Size of the coefficients in bytes.
     pub fn size_bytes(&self) -> usize {
         let numbers = |leaf: &Leaf| leaf.functions.coefficients.len() + leaf.beside.coefficients.len();
         self.leaves.iter().map(|leaf| 8 * numbers(leaf)).sum()
     }
 
-    /// Share of the conditions, evenly spread over friction coefficient, load and speed, that have no leaf; where load and speed
-    /// matter by their ratio alone, evenly spread over the speeds at any one load.
+    /// Share of the conditions not covered by a leaf. Conditions are taken as uniformly distributed over friction
+    /// coefficient, load and speed; on an axis of load over speed, over the speeds at any one load.
     pub fn dense_share(&self) -> f64 {
         1.0 - self.leaves.iter().map(|leaf| self.share(&leaf.low, &leaf.high)).sum::<f64>()
     }
 
-    /// Share of the conditions that a box holds.
+    /// Share of all conditions that lie in a box.
     fn share(&self, low: &[f64; MAX_AXES], high: &[f64; MAX_AXES]) -> f64 {
         let width = |axis: &Axis, low: f64, high: f64| axis.condition(high) - axis.condition(low);
         let along = |k: usize| width(&self.axes[k], low[k], high[k]) / width(&self.axes[k], self.low[k], self.high[k]);
         (0..self.axes.len()).map(along).product()
     }
 
-    /// Every box of the tree, with its place among the branches.
+    /// Every box of the tree, with its index among the branches.
     fn boxes(&self) -> impl Iterator<Item = (usize, [f64; MAX_AXES], [f64; MAX_AXES])> {
         let mut open = vec![(0, self.low, self.high)];
         std::iter::from_fn(move || {
@@ -206,13 +207,13 @@ impl Chart {
         })
     }
 
-    /// Share of the conditions that is charted or given up.
+    /// Share of the conditions that is either charted or left to dense solves for good.
     fn settled_share(&self) -> f64 {
         let pending = self.boxes().filter(|(slot, ..)| matches!(self.branches[*slot], Branch::Pending));
         1.0 - pending.map(|(_, low, high)| self.share(&low, &high)).sum::<f64>()
     }
 
-    /// A chart of one leaf, to try it.
+    /// A chart of a single leaf, used to check it.
     fn with_only(&self, leaf: &Leaf) -> Self {
         Self {
             axes: self.axes.clone(),
@@ -226,17 +227,18 @@ impl Chart {
         }
     }
 
-    /// Whether every box was charted or given up; otherwise a build can go on from it.
+    /// Whether no box is pending; otherwise a build can be resumed from this chart.
     pub fn is_complete(&self) -> bool {
         !self.branches.iter().any(|branch| matches!(branch, Branch::Pending))
     }
 
-    /// The charted roots at `p`, appended to `out` in no particular order, with bounds of their residuals, with shares of the
-    /// pad where they are charted, and checked against what is `known` there (see [`Traces`](super::Traces)); and what there is
-    /// besides them. A chart gives no identities: [`StabilityMap`](super::StabilityMap) does.
+    /// Appends the charted roots at `p` to `out`, in no particular order, with bounds of their residuals and, where
+    /// charted, pad participations. The roots are checked against `known`, the exact sums and norms at `p` (see
+    /// [`Traces`](super::Traces)). The returned census counts the roots that numbering needs. A chart gives no
+    /// identities: [`StabilityMap`](super::StabilityMap) does.
     ///
     /// # Errors
-    /// [`NotCharted`]; `out` is then as it was.
+    /// [`NotCharted`]; `out` is unchanged then.
     pub fn evaluate(
         &self,
         p: &OperatingPoint,
@@ -281,17 +283,17 @@ impl Chart {
         Ok(Census { undamped: self.undamped, tracked: leaf.tracked, statics })
     }
 
-    /// Whether `p` is in a box that converged.
+    /// Whether `p` lies in a leaf.
     pub fn covers(&self, p: &OperatingPoint) -> bool {
         self.coordinates(p).is_ok_and(|x| self.find(&x).is_ok())
     }
 
-    /// The coordinates of `p`.
+    /// Coordinates of `p` in the box of the chart.
     fn coordinates(&self, p: &OperatingPoint) -> Result<[f64; MAX_AXES], NotCharted> {
         let mut x = [0.0; MAX_AXES];
         for (k, axis) in self.axes.iter().enumerate() {
             x[k] = axis.coordinate(p);
-            // Written so that NaN is outside.
+            // The negated form treats NaN as outside.
             if !(x[k] >= self.low[k] && x[k] <= self.high[k]) {
                 return Err(NotCharted::Outside);
             }
@@ -310,11 +312,11 @@ impl Chart {
         }
     }
 
-    /// The charted roots at `p` alone, appended to `out` in no particular order: `λ²` of an undamped model, `λ` of a damped
-    /// one, without bounds and unchecked.
+    /// Appends the values of the charted roots at `p` to `out`, in no particular order: `λ²` of an undamped model,
+    /// `λ` of a damped one. Bounds and the check against the traces are omitted.
     ///
     /// # Errors
-    /// [`NotCharted`]; `out` is then as it was.
+    /// [`NotCharted`]; `out` is unchanged then.
     pub fn values(&self, p: &OperatingPoint, scratch: &mut Scratch, out: &mut Vec<c64>) -> Result<(), NotCharted> {
         let leaf = self.expand(p, scratch)?;
         for cluster in &leaf.clusters {
@@ -329,7 +331,7 @@ impl Chart {
         Ok(())
     }
 
-    /// The symmetric functions of a cluster out of the channels of its leaf.
+    /// The symmetric functions of a cluster, read from the channels of its leaf.
     fn functions(&self, cluster: &Cluster, channels: &[f64]) -> [c64; MAX_SIZE] {
         let mut functions = [c64::ZERO; MAX_SIZE];
         for (m, function) in functions[..cluster.size()].iter_mut().enumerate() {
@@ -342,7 +344,7 @@ impl Chart {
         functions
     }
 
-    /// The leaf that holds `p`, with the functions of its clusters and the basis evaluated there.
+    /// The leaf that contains `p`. `scratch` then holds the basis polynomials and the symmetric functions at `p`.
     fn expand(&self, p: &OperatingPoint, scratch: &mut Scratch) -> Result<&Leaf, NotCharted> {
         let x = self.coordinates(p)?;
         let leaf = &self.leaves[self.find(&x)?];
@@ -355,7 +357,8 @@ impl Chart {
         Ok(leaf)
     }
 
-    /// The root for a charted `z`; `apart` where an undamped one is known not to be one of a complex pair.
+    /// The root for a charted value `z`. `apart` states that an undamped `z` is real, not one of a complex conjugate
+    /// pair.
     fn charted(&self, z: c64, error: f64, apart: bool) -> Root {
         let (lambda, square, error) = if self.undamped {
             let lambda = square_root(z);

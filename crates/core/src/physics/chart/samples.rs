@@ -1,4 +1,5 @@
-//! Solved points of a box: roots, their slopes and curvatures along the axes, and which root is which from point to point.
+//! Solved points of a box: roots with slopes and curvatures along the axes, and the connection of roots from point to
+//! point.
 
 use faer::{Mat, c64};
 
@@ -10,42 +11,44 @@ use crate::physics::solver::{ROUNDING, Solver};
 use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
 use crate::physics::tracking::{continue_roots, tracked};
 
-/// Condition of a root above which its slope has lost too many digits, and its curvature as well.
+/// Condition number of a root above which its slope and curvature are too inaccurate to be used.
 const SOUND_CONDITION: f64 = 2e3;
-/// Step of a central difference of the laws, in the coordinate of an axis: truncation and rounding are both near 1e-11.
+/// Step of a central difference of the laws, in the coordinate of an axis. Truncation and rounding are both near
+/// 1e-11.
 const STEP: f64 = 1e-5;
-/// Step of a second difference, as a share of half the box: rounding is near 1e-10 of a law, and a curvature weighs less than
-/// a hundredth of a value.
+/// Step of a second difference, relative to half the width of the box. Rounding is near 1e-10 of a law, and a
+/// curvature has less than a hundredth of the weight of a value.
 const WIDE_STEP: f64 = 1e-3;
 
 /// A solved point.
 pub struct Sample {
-    /// Its coordinates.
+    /// Coordinates of the point.
     pub at: [f64; MAX_AXES],
-    /// What was found there; the left vectors are gone.
+    /// Its spectrum, without left vectors.
     pub spectrum: Spectrum,
-    /// Each tracked root: `λ²` of an undamped model, `λ` of a damped one.
+    /// Value of each followed root: `λ²` of an undamped model, `λ` of a damped one.
     pub z: Vec<c64>,
-    /// Their slopes along each axis, and their curvatures.
+    /// Slope of each root along each axis, and its second derivatives along each pair of axes.
     pub slopes: Vec<[c64; MAX_AXES]>,
     pub curvatures: Vec<[c64; PAIRS]>,
-    /// Their condition numbers.
+    /// Condition number of each root.
     pub conditions: Vec<f64>,
-    /// The sums of first and second powers of all roots and what else is known exactly; the slopes and curvatures of the sums.
+    /// Exact sums of first and second powers of all roots, with their slopes and curvatures.
     pub totals: Exact,
     pub total_slopes: [[f64; 2]; MAX_AXES],
     pub total_curvatures: [[f64; 2]; PAIRS],
-    /// What rounding can do to a well-conditioned root.
+    /// Rounding error of a well-conditioned root.
     pub rounding: f64,
 }
 
 impl Sample {
-    /// Whether the slope of root `k` can be used, and its curvature.
+    /// Whether the slope and curvature of root `k` can be used.
     pub fn is_sound(&self, k: usize) -> bool {
         self.conditions[k] <= SOUND_CONDITION && self.has_curvature(k)
     }
 
-    /// Whether root `k` has a curvature: not where a law ends, or a multiple root lacks a vector.
+    /// Whether root `k` has a finite curvature. It has none where a law is undefined nearby or a multiple root is
+    /// defective.
     pub fn has_curvature(&self, k: usize) -> bool {
         self.curvatures[k].iter().all(|curvature| curvature.is_finite())
     }
@@ -58,7 +61,7 @@ pub struct Sampler<'a> {
     pub axes: Vec<Axis>,
     pub low: [f64; MAX_AXES],
     pub high: [f64; MAX_AXES],
-    /// What no axis sets.
+    /// Supplies the conditions that no axis sets.
     pub base: OperatingPoint,
 }
 
@@ -72,7 +75,7 @@ impl Sampler<'_> {
         p
     }
 
-    /// Solves at `x`.
+    /// Solves at coordinates `x`.
     ///
     /// # Errors
     /// [`SolveError`].
@@ -123,7 +126,7 @@ impl Sampler<'_> {
         })
     }
 
-    /// The sum of some differences of the stiffness and of the damping, where there is one.
+    /// The sum of differences of the stiffness and of the damping; `None` for a matrix that does not change.
     fn change(&self, differences: &[Difference]) -> Result<Change, SolveError> {
         let n = self.model.dimension();
         let mut sums: Change = [None, None];
@@ -138,7 +141,7 @@ impl Sampler<'_> {
         Ok(sums)
     }
 
-    /// The central difference along an axis at `x`, within the box.
+    /// The central difference along an axis at `x`, with both points inside the box.
     fn difference(&self, x: &[f64; MAX_AXES], axis: usize) -> Difference {
         let (mut below, mut above) = (*x, *x);
         below[axis] = (x[axis] - STEP).max(self.low[axis]);
@@ -147,8 +150,8 @@ impl Sampler<'_> {
         Difference { below: self.point(&below), above: self.point(&above), per }
     }
 
-    /// The differences whose sum is the second derivative along axes `a` and `b` at `x`. Laws go on a little beyond an end in
-    /// friction and load; where the speed is an end the derivative is taken beside it.
+    /// The differences whose sum is the second derivative along axes `a` and `b` at `x`. In friction and load, laws
+    /// are defined slightly beyond the box. At an end of an axis of speed the derivative is taken one step inside.
     fn second_difference(&self, x: &[f64; MAX_AXES], [a, b]: [usize; 2]) -> [Difference; 2] {
         let step = |k: usize| 0.5 * WIDE_STEP * (self.high[k] - self.low[k]);
         let mut centre = *x;
@@ -170,10 +173,10 @@ impl Sampler<'_> {
         upper_and_lower.map(|(below, above, per)| Difference { below, above, per })
     }
 
-    /// Solves at all of `points`, spread over `solvers`, in their order.
+    /// Solves at all `points` with several solvers in parallel; the samples are in the order of the points.
     ///
     /// # Errors
-    /// [`SolveError`] of the first that failed.
+    /// [`SolveError`] of the first point that failed.
     pub fn solve_all(&self, solvers: &mut [Solver], points: &[[f64; MAX_AXES]]) -> Result<Vec<Sample>, SolveError> {
         if let [solver] = solvers {
             return points.iter().map(|x| self.solve(solver, x)).collect();
@@ -199,16 +202,16 @@ impl Sampler<'_> {
     }
 }
 
-/// `(f(above) - f(below)) per`.
+/// The difference quotient `(f(above) - f(below)) per`.
 struct Difference {
     below: OperatingPoint,
     above: OperatingPoint,
     per: f64,
 }
 
-/// `count` points of `[-1, 1]^axes`, far from each other and from `taken` in the angles `θ`, `x = cos θ`: there the points
-/// that serve polynomials are evenly spread. Corners are among them: there an expansion is farthest from what it was fitted to,
-/// and what it leaves out is largest.
+/// `count` points of `[-1, 1]^axes` that are far from each other and from `taken`, measured in the angles `θ` with
+/// `x = cos θ`: points evenly spread in `θ` suit polynomials. Corners are candidates too, because the truncation
+/// error of an expansion is largest there.
 pub fn spread(axes: usize, taken: &[[f64; MAX_AXES]], count: usize) -> Vec<[f64; MAX_AXES]> {
     let angle = |unit: f64| unit.clamp(-1.0, 1.0).acos();
     let pi = std::f64::consts::PI;
@@ -233,7 +236,8 @@ pub fn spread(axes: usize, taken: &[[f64; MAX_AXES]], count: usize) -> Vec<[f64;
         .collect()
 }
 
-/// The digits of `index` in `base`, mirrored at the point (van der Corput 1935; Halton 1960).
+/// The radical inverse of `index`: its digits in `base`, mirrored at the radix point (van der Corput 1935; Halton
+/// 1960).
 pub(crate) fn radical_inverse(mut index: usize, base: usize) -> f64 {
     let (mut value, mut digit) = (0.0, 1.0 / base as f64);
     while index > 0 {
@@ -244,8 +248,9 @@ pub(crate) fn radical_inverse(mut index: usize, base: usize) -> f64 {
     value
 }
 
-/// Which root of each sample continues which of `samples[start]`, carried from sample to nearest sample:
-/// `[sample][branch]`. `None` where a root is lost.
+/// Connects the roots of all samples to branches, numbered like the roots of `samples[start]`. Each sample is
+/// connected to the nearest sample already done. Returns the root index by `[sample][branch]`, or `None` if a root is
+/// lost.
 pub fn follow(samples: &[&Sample], units: &[[f64; MAX_AXES]], start: usize) -> Option<Vec<Vec<usize>>> {
     let count = samples[start].z.len();
     if samples.iter().any(|sample| sample.z.len() != count) {
@@ -254,7 +259,7 @@ pub fn follow(samples: &[&Sample], units: &[[f64; MAX_AXES]], start: usize) -> O
     let mut known: Vec<Option<Vec<usize>>> = vec![None; samples.len()];
     known[start] = Some((0..count).collect());
     let distance = |a: usize, b: usize| (0..MAX_AXES).map(|k| (units[a][k] - units[b][k]).powi(2)).sum::<f64>();
-    // For each sample not yet known the nearest that is.
+    // For every sample, the nearest sample that is already connected, with the squared distance.
     let mut nearest: Vec<(f64, usize)> = (0..samples.len()).map(|k| (distance(k, start), start)).collect();
     for _ in 1..samples.len() {
         let next = (0..samples.len())
@@ -282,7 +287,8 @@ mod tests {
     use crate::physics::model::ContactLaw;
     use crate::physics::synthetic::{Synthetic, rig};
 
-    /// Central differences of slopes, of step h = 1e-4: of the order of h² and of rounding, 1e-11 / h, in what a root moves by.
+    /// Curvatures compared with central differences of slopes with step `h = 1e-4`. The differences have errors of
+    /// order `h²` (truncation) and `1e-11 / h` (rounding), relative to the change of the root.
     #[test]
     fn curvatures_are_those_of_differences_of_slopes() {
         for (damping_ratio, axes) in

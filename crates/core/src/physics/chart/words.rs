@@ -1,14 +1,14 @@
-//! A chart as words of 64 bits, and back: what is kept, compared and hashed.
+//! Serialisation of a chart as 64-bit words, for storing, comparing and hashing.
 
 use super::chebyshev::Basis;
 use super::cluster::MAX_SIZE;
 use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
-/// Changes whenever the words, or what a build makes of a model, mean something else than before.
+/// Format version: incremented when the meaning of the words or the result of a build changes.
 pub const FORMAT: u64 = 6;
 
-/// The sources that say what a build makes of a model: whoever keeps charts keeps them by these too, so that a chart of an older
-/// builder is never taken for one of this.
+/// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
+/// builder is never used.
 pub const BUILDER: [&str; 15] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
@@ -30,7 +30,7 @@ pub const BUILDER: [&str; 15] = [
 const AXES: [Axis; 4] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed];
 
 impl Chart {
-    /// Everything there is to a chart: two with equal words predict the same.
+    /// The complete content of the chart: charts with equal words give equal predictions.
     pub fn words(&self) -> Vec<u64> {
         let mut words = vec![FORMAT, u64::from(self.undamped), self.solves as u64, self.axes.len() as u64];
         words.extend(self.axes.iter().map(|axis| *axis as u64));
@@ -64,7 +64,7 @@ impl Chart {
         words
     }
 
-    /// The chart of [`Chart::words`]; `None` where the words are those of no chart.
+    /// The chart of [`Chart::words`]; `None` if the words do not describe a chart.
     pub fn from_words(words: &[u64]) -> Option<Self> {
         let mut words = Reader(words);
         if words.next()? != FORMAT {
@@ -87,7 +87,7 @@ impl Chart {
     }
 }
 
-/// What is still to be read.
+/// The words not read yet.
 struct Reader<'a>(&'a [u64]);
 
 impl Reader<'_> {
@@ -117,7 +117,7 @@ impl Reader<'_> {
         AXES.get(self.count(AXES.len())?).copied()
     }
 
-    /// Branch `k` of `count`: what it splits into stands behind it.
+    /// Branch `k` of `count`. The branches it splits into must follow it.
     fn branch(&mut self, k: usize, count: usize) -> Option<Branch> {
         let words: [u64; 4] = [self.next()?, self.next()?, self.next()?, self.next()?];
         Some(match words {
