@@ -1,4 +1,5 @@
-//! A rig against the full model it stands for: what `verify` tells and what a rig file carries in `[reduction]`.
+//! Compares a rig with the full model it was reduced from: the command `verify` and the table `[reduction]` of a rig
+//! file.
 
 use anyhow::{Context, ensure};
 use faer::c64;
@@ -11,23 +12,23 @@ use crate::reduction::{
 };
 use crate::rig::Rig;
 
-/// Band where neither rig nor full model names one, Hz.
+/// Default upper end of the band, if neither rig nor full model gives one, Hz.
 pub const DEFAULT_BAND_HZ: f64 = 5000.0;
-/// Roots that decay faster are neither held nor compared, 1/s.
+/// Roots that decay faster than this are not compared, 1/s.
 pub const DECAY_PER_S: f64 = 20.0;
 
-/// How a reduced model differs from the full one: the table `[reduction]` of a rig file.
+/// Certificate of a rig: its errors against the full model at held-out points. The table `[reduction]` of a rig file.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Certificate {
     /// `content_hash` of the full model.
     pub full_model_hash: String,
-    /// How the rig was reduced, in words.
+    /// How the rig was reduced, as text.
     #[serde(default)]
     pub method: String,
-    /// Frequencies up to this were compared, Hz.
+    /// Upper end of the compared band, Hz.
     pub band_hz: f64,
-    /// Held-out operating points.
+    /// Number of held-out operating points.
     pub points: usize,
     /// Largest `|Δf| / f`.
     pub max_frequency_error: f64,
@@ -35,28 +36,28 @@ pub struct Certificate {
     pub max_growth_error_per_s: f64,
     /// Largest `|Δλ| / |λ|`.
     pub max_relative_error: f64,
-    /// Loads and speeds at which windows of instability were compared.
+    /// Number of pairs of load and speed at which windows of instability were compared.
     #[serde(default)]
     pub windows_compared_at: usize,
-    /// Largest difference of an end of a window of instability; none where both models have no windows.
+    /// Largest difference between the ends of corresponding windows; `None` if no windows correspond.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub critical_friction_error: Option<f64>,
-    /// Unstable modes of the full model that the rig does not have, over all points, and windows it does not have.
+    /// Missed: unstable modes, summed over all points, and windows that only the full model has.
     pub missed: usize,
-    /// Unstable modes and windows of the rig that the full model does not have.
+    /// Invented: unstable modes, summed over all points, and windows that only the rig has.
     pub invented: usize,
-    /// Modes of the full model, stable or not, that have no partner in the rig, over all points.
+    /// Modes of the full model, stable or not, without a partner in the rig, summed over all points.
     #[serde(default)]
     pub unpaired: usize,
 }
 
 impl Certificate {
-    /// Whether the rig has what the full model has in the band, and nothing else.
+    /// Whether rig and full model have the same modes, unstable modes and windows in the band.
     pub fn is_complete(&self) -> bool {
         self.missed == 0 && self.invented == 0 && self.unpaired == 0 && !self.max_relative_error.is_nan()
     }
 
-    /// A line for people.
+    /// The certificate in one line of text.
     pub fn told(&self) -> String {
         let (critical, what) = match (self.windows_compared_at, self.critical_friction_error) {
             (0, _) => (", windows of instability not compared".to_owned(), "unstable modes"),
@@ -80,20 +81,20 @@ impl Certificate {
     }
 }
 
-/// What is compared.
+/// Options of a comparison.
 #[derive(Clone, Debug)]
 pub struct Against {
-    /// Held-out operating points.
+    /// Number of held-out operating points.
     pub points: usize,
-    /// Which ones.
+    /// Seed of their random choice.
     pub seed: u64,
-    /// Highest frequency, Hz, in place of the rig's or the full model's.
+    /// Upper end of the band, Hz, overriding that of the rig or the full model.
     pub band_hz: Option<f64>,
-    /// Whether windows of instability are compared too.
+    /// Whether windows of instability are compared.
     pub windows: bool,
 }
 
-/// The errors at one operating point.
+/// Errors at one operating point.
 #[derive(Clone, Debug, Serialize)]
 pub struct PointReport {
     pub normal_load_n: f64,
@@ -103,13 +104,13 @@ pub struct PointReport {
     pub max_frequency_error: f64,
     pub max_growth_error_per_s: f64,
     pub max_relative_error: f64,
-    /// Growth rate, 1/s, and frequency, Hz.
+    /// Growth rate (1/s) and frequency (Hz) of each missed mode.
     pub missed: Vec<[f64; 2]>,
     pub invented: Vec<[f64; 2]>,
     pub unpaired: usize,
 }
 
-/// A window of instability of one model or of both.
+/// A window of instability of the full model, the rig or both.
 #[derive(Clone, Debug, Serialize)]
 pub struct WindowReport {
     pub normal_load_n: f64,
@@ -126,7 +127,7 @@ pub struct WindowEnds {
     pub frequency_hz: f64,
 }
 
-/// Everything `verify` found.
+/// The result of `verify`: the certificate and its details.
 #[derive(Clone, Debug, Serialize)]
 pub struct Verified {
     pub certificate: Certificate,
@@ -134,11 +135,12 @@ pub struct Verified {
     pub windows: Vec<WindowReport>,
 }
 
-/// Compares a rig with its full model at held-out operating points of the rig's range, and their windows of instability
-/// at the reference and at the corners of that range. `full_solver` solves the full model; `progress` hears what is done.
+/// Compares a rig with its full model: roots at held-out operating points within the rig's range, and windows of
+/// instability at the reference and at the corners of that range. `full_solver` solves the full model; `progress`
+/// receives a description of the step and its progress.
 ///
 /// # Errors
-/// A full model that cannot be solved, or a rig.
+/// A full model or rig that cannot be solved, modal damping in the full model, or no points.
 pub fn verify_against(
     rig: &Rig,
     full: &FullModelFile,
@@ -207,7 +209,7 @@ pub fn verify_against(
         windows.extend(compared.missed.iter().map(|full| report(Some(full), None)));
         windows.extend(compared.invented.iter().map(|rig| report(None, Some(rig))));
     }
-    // Where nothing could be compared nothing is known.
+    // Without a compared mode the errors are unknown, hence NaN.
     let nothing = if points.iter().all(|point| point.modes == 0) { f64::NAN } else { 0.0 };
     let largest = |of: fn(&PointReport) -> f64| nothing + points.iter().map(of).fold(0.0, f64::max);
     let certificate = Certificate {
@@ -231,7 +233,7 @@ fn ends(window: &Window) -> WindowEnds {
     WindowEnds { mu_from: window.mu_from, mu_to: window.mu_to, frequency_hz: window.frequency_hz }
 }
 
-/// Operating points of the rig's chart, friction coefficients from 0 to the highest that is searched.
+/// Random operating points: load and speed from the range of the chart, friction coefficient from the range searched.
 fn held_out(rig: &Rig, against: &Against) -> Vec<OperatingPoint> {
     use rand::{RngExt, SeedableRng};
     let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(against.seed);
@@ -246,7 +248,8 @@ fn held_out(rig: &Rig, against: &Against) -> Vec<OperatingPoint> {
         .collect()
 }
 
-/// Where windows are compared: at the reference, and at the corners of the rig's range of loads and speeds where they matter.
+/// Loads and speeds at which windows are compared: the reference, and the corners of the chart's range. A condition on
+/// which the model does not depend stays at its reference value.
 fn places(rig: &Rig) -> Vec<OperatingPoint> {
     let mut places = vec![rig.reference];
     let (load, speed) = rig.model.depends_on_load_and_speed();
