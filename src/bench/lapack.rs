@@ -1,4 +1,4 @@
-//! LAPACK beside the program: scipy in a child process that solves the same matrices in turn.
+//! LAPACK for comparison: a child process with scipy that solves the same matrices as the program.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
@@ -7,15 +7,15 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use anyhow::{Context, ensure};
 use faer::{MatRef, c64};
 
-/// The program that the child runs.
+/// Source of the Python program that the child runs.
 const SCRIPT: &str = include_str!("../../tests/peers/lapack.py");
 
-/// A Python with scipy that solves what it is given.
+/// A Python process with scipy that solves eigenvalue problems.
 pub struct Lapack {
     child: Child,
     stdin: Option<ChildStdin>,
     stdout: BufReader<ChildStdout>,
-    /// What it says of itself.
+    /// The versions that the child reports.
     pub versions: String,
 }
 
@@ -23,7 +23,7 @@ impl Lapack {
     /// Starts `python`.
     ///
     /// # Errors
-    /// Where it does not start, or has no scipy.
+    /// Python does not start or has no scipy.
     pub fn start(python: &Path) -> anyhow::Result<Self> {
         let mut child = Command::new(python)
             .args(["-c", SCRIPT])
@@ -40,10 +40,11 @@ impl Lapack {
         Ok(peer)
     }
 
-    /// The eigenvalues of `matrix`, with both vectors computed or without, and the time it took, s.
+    /// Computes the eigenvalues of `matrix`, and its left and right vectors if `vectors`. Returns the time taken in s,
+    /// then the eigenvalues.
     ///
     /// # Errors
-    /// Where the child has ended.
+    /// The child has ended.
     pub fn solve(&mut self, matrix: MatRef<'_, f64>, vectors: bool) -> anyhow::Result<(f64, Vec<c64>)> {
         let n = matrix.nrows();
         let stdin = self.stdin.as_mut().context("no pipe")?;

@@ -1,8 +1,9 @@
-//! Run time against error of the routes from a condition to its roots, on synthetic rigs.
+//! Run time and error of every route from an operating point to its roots, on synthetic rigs.
 //!
-//! Every route gets the same conditions, one after another, so that what else the machine does falls on all of them. Errors are
-//! those of `λ²` against roots to thirty digits ([`crate::physics::reference`]) of a seeded choice of modes; where rounding does not tell two
-//! roots apart, those of the mean of the pair and of its discriminant. Every answer is checked before it is timed.
+//! At each operating point all routes are measured in turn, so that other load on the machine affects all of them
+//! alike. Errors are relative errors of `λ²` against roots to thirty digits ([`crate::physics::reference`]) of a seeded
+//! choice of modes. Where rounding does not separate two roots, they are the errors of the pair's mean and
+//! discriminant. Every answer is checked before it is timed.
 
 pub mod lapack;
 
@@ -23,7 +24,7 @@ use crate::physics::{
 };
 use lapack::Lapack;
 
-/// Which rigs.
+/// Which synthetic rigs are measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Kind {
     /// No damping, a linear contact: only the friction coefficient matters
@@ -36,88 +37,90 @@ pub enum Kind {
     Damped,
 }
 
-/// What to measure.
+/// Options of a measurement.
 #[derive(Clone, Copy, Debug)]
 pub struct Plan {
     pub kind: Kind,
     pub conditions: usize,
-    /// Modes compared with the reference per condition.
+    /// Number of modes compared with the reference at each operating point.
     pub compared: usize,
-    /// Random conditions at which every root of the chart is held against a dense solve.
+    /// Number of random operating points at which every root of the chart is compared with a dense solve.
     pub held_out: usize,
     pub pairs: usize,
     pub seed: u64,
     pub band_max_hz: f64,
     pub tolerance: f64,
-    /// What a chart does not hold by then stays without one.
+    /// Time limit of building the chart. Leaves not finished by then are solved densely.
     pub chart_limit: Duration,
     pub threads: usize,
 }
 
-/// What one route did on one rig.
+/// Run time and errors of one route on one rig.
 #[derive(Clone, Debug, Serialize)]
 pub struct Route {
     pub modes: usize,
     pub route: &'static str,
-    /// Conditions it answered.
+    /// Number of operating points at which the route gave an answer.
     pub conditions: usize,
     pub median_us: f64,
     pub p99_us: f64,
-    /// Median of the ratio to LAPACK's time for the same work, condition by condition.
+    /// Median over the operating points of the ratio to LAPACK's time for the same problem.
     pub to_lapack: Option<f64>,
-    /// Relative error of `λ²`.
+    /// Median and largest relative error of `λ²`.
     pub median_error: f64,
     pub largest_error: f64,
-    /// Relative error of the mean of merging pairs, and of their discriminant relative to the mean's square.
+    /// Largest relative error of the mean of merging pairs, and of their discriminant relative to the square of the
+    /// mean.
     pub largest_pair_mean_error: Option<f64>,
     pub largest_discriminant_error: Option<f64>,
-    /// Roots compared with their bounds, and how many were off by more.
+    /// Number of roots compared with their error bounds, and how many broke them.
     pub bounds_checked: usize,
     pub bounds_broken: usize,
 }
 
-/// What was prepared before the first condition.
+/// Preparation on one rig, before the first operating point, and counts of what was compared.
 #[derive(Clone, Debug, Serialize)]
 pub struct Offline {
     pub modes: usize,
-    /// Of the rig.
+    /// Seed of the rig.
     pub seed: u64,
-    /// Where pairs merge in friction, or growth rates pass zero where there is damping; and conditions within 1e-6 of one.
+    /// Number of merging points (with damping: zero crossings of growth rates), and of operating points within 1e-6 of
+    /// one.
     pub merging_points: usize,
     pub near_merging: usize,
-    /// Modes that nothing couples, which every dense solve does without.
+    /// Number of decoupled modes, which every dense solve excludes.
     pub decoupled_modes: usize,
     pub map_s: f64,
     pub chart_s: f64,
-    /// False where the chart would have taken longer than it was given.
+    /// False if the time limit ended the build.
     pub chart_complete: bool,
     pub chart_solves: usize,
     pub chart_leaves: usize,
     pub chart_bytes: usize,
-    /// Share of the box that did not converge, or was not come to, and is solved densely.
+    /// Share of the box that is solved densely, because it did not converge or was not reached in time.
     pub chart_dense_share: f64,
-    /// Dense solves that the chart made unnecessary, of as many conditions.
+    /// Number of dense solves that the chart saved, out of `conditions`.
     pub dense_solves_skipped: usize,
     pub conditions: usize,
-    /// Merging pairs among what was compared, and roots that the reference did not find.
+    /// Number of merging pairs compared, and of roots for which the reference did not converge.
     pub pairs_compared: usize,
     pub not_refined: usize,
-    /// None where it was not asked for.
+    /// `None` if not requested.
     pub held_out: Option<HeldOut>,
 }
 
-/// Every root of a chart against dense solves at random conditions.
+/// Every root of a chart compared with dense solves at random operating points.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct HeldOut {
-    /// Conditions that the chart answered, those it has no leaf for, those at which it contradicts the traces.
+    /// Number of points that the chart answered, that lie on no converged leaf, and at which the trace check failed.
     pub charted: usize,
     pub not_converged: usize,
     pub incomplete: usize,
-    /// Roots off by more than the bounds of both.
+    /// Number of roots whose difference exceeds the sum of both bounds.
     pub bounds_broken: usize,
-    /// The largest error as a share of its bound.
+    /// Largest difference relative to its bound.
     pub largest_share: f64,
-    /// Relative error of `λ²` outside merging points, and of the mean of merging pairs.
+    /// Largest relative error of `λ²` away from merging points, and of the mean of merging pairs.
     pub largest_error: f64,
     pub largest_pair_mean_error: f64,
 }
@@ -131,7 +134,7 @@ const ROUTES: [&str; 6] = [
     "LAPACK both vectors",
 ];
 
-/// What a route collected.
+/// Times and errors collected for one route.
 #[derive(Clone, Debug, Default)]
 struct Samples {
     time_us: Vec<f64>,
@@ -169,7 +172,9 @@ impl Samples {
         })
     }
 
-    /// Compares `roots`, by the number that was solved for, with what was refined. `mirrored`: a bound for each root is there.
+    /// Adds the errors of one cluster of roots at one operating point. `roots` are all roots of the route, as `λ²` if
+    /// the model is undamped and `λ` otherwise, each with its error bound if the route gives one. `refined` is the
+    /// cluster to thirty digits.
     fn compare(&mut self, spectrum: &Spectrum, refined: &Refined, roots: &[(c64, Option<f64>)]) {
         // Relative errors of λ² are twice those of λ.
         let factor = if spectrum.undamped { 1.0 } else { 2.0 };
@@ -203,7 +208,7 @@ impl Samples {
     }
 }
 
-/// Seeded conditions, one tenth of them within 1e-6 of merging points.
+/// Seeded operating points, one tenth of them within 1e-6 of a merging point.
 fn conditions(plan: &Plan, merging: &[f64], reference: &OperatingPoint) -> Vec<OperatingPoint> {
     let mut uniform = Uniform::new(plan.seed.wrapping_add(1000));
     let mut share = move || 0.5 * (uniform.draw() + 1.0);
@@ -218,23 +223,23 @@ fn conditions(plan: &Plan, merging: &[f64], reference: &OperatingPoint) -> Vec<O
             if !is_near_merging(k, merging) {
                 return p;
             }
-            // Where they merge depends on load and speed: these are kept.
+            // Merging points depend on load and speed, so those of the reference are kept.
             let at = merging[((which * merging.len() as f64) as usize).min(merging.len() - 1)];
             reference.with_friction((at + off).clamp(0.0, 1.0))
         })
         .collect()
 }
 
-/// Whether the k-th condition is near a merging point: one of ten, where there are any.
+/// Whether the k-th operating point is near a merging point: every tenth is, if there are merging points.
 fn is_near_merging(k: usize, merging: &[f64]) -> bool {
     k % 10 == 9 && !merging.is_empty()
 }
 
-/// Rigs are drawn until one has merging points, this many times at most.
+/// Largest number of rigs drawn to find one with merging points.
 const MOST_SEEDS: u64 = 40;
 
-/// The first rig, from the plan's seed on, that has merging points in the band at the load and speed of `reference`, with its seed and
-/// them; the last one drawn where none has any.
+/// Draws rigs, starting from the seed of the plan, until one has merging points in the band at the load and speed of
+/// `reference`. Returns its seed, its model and its merging points; the last rig drawn if none has any.
 fn squealing(modes: usize, plan: &Plan, reference: &OperatingPoint) -> anyhow::Result<(u64, Model, Vec<f64>)> {
     let options = MapOptions {
         mu_min: 0.0,
@@ -268,10 +273,10 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> anyhow::Result<Model> {
     Ok(rig(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })?)
 }
 
-/// Everything about rigs of `modes` modes; `say` is told how far it has come.
+/// Measures all routes on a rig of `modes` modes; `say` receives progress messages.
 ///
 /// # Errors
-/// Where a rig cannot be solved, or an answer is wrong.
+/// A rig that cannot be solved, an answer that fails its check, or a band without modes.
 pub fn measure(
     modes: usize,
     plan: &Plan,
@@ -316,7 +321,7 @@ pub fn measure(
         if done % 20 == 0 {
             say(&format!("condition {done} of {}", points.len()));
         }
-        // Answers first.
+        // First the answers are computed and checked.
         let values = solver.solve(&model, p, Vectors::None)?;
         let spectrum = solver.solve(&model, p, Vectors::Both).with_context(|| format!("{p:?}"))?;
         charted.clear();
@@ -353,7 +358,7 @@ pub fn measure(
                 samples[route].compare(&spectrum, refined, &theirs);
             }
         }
-        // Then the clock, one route after another.
+        // Then the routes are timed, one after another.
         let mut time = |route: usize, seconds: f64| samples[route].time_us.push(1e6 * seconds);
         let mut ours = [0.0; 2];
         for (route, vectors) in [(0, Vectors::None), (1, Vectors::Both)] {
@@ -366,7 +371,8 @@ pub fn measure(
             }
         }
         if on_chart {
-            // Once unseen: the dense solves before have emptied the caches, which charts in a row would not find so.
+            // One untimed evaluation first: the dense solves evicted the chart from the caches, as they would not in a
+            // run of charted predictions.
             bare.clear();
             chart.values(p, &mut scratch, &mut bare)?;
             bare.clear();
@@ -381,7 +387,7 @@ pub fn measure(
             time(3, begun.elapsed().as_secs_f64());
         }
         if lapack.is_some() {
-            // Charts are held against LAPACK's values.
+            // Charted routes are compared with LAPACK's time without vectors.
             for (route, theirs) in [(0, 4), (1, 5), (2, 4), (3, 4)] {
                 if route < 2 || on_chart {
                     let last = |k: usize| samples[k].time_us.last().copied().unwrap_or(f64::NAN);
@@ -416,7 +422,7 @@ pub fn measure(
     Ok((routes, offline))
 }
 
-/// The whole box of conditions.
+/// A chart over the whole box of conditions.
 fn chart_options(plan: &Plan) -> ChartOptions {
     let corner = |normal_load_n, disc_speed_rad_s, friction_coefficient| OperatingPoint {
         normal_load_n,
@@ -434,7 +440,7 @@ fn chart_options(plan: &Plan) -> ChartOptions {
     }
 }
 
-/// The chart of that box, as far as it comes in its time.
+/// Builds the chart, as far as the time limit allows.
 fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str)) -> anyhow::Result<Chart> {
     let begun = Instant::now();
     let mut so_far = None;
@@ -452,11 +458,11 @@ fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str))
     }
 }
 
-/// Nearest roots closer than this, relative to themselves, are compared as a pair.
+/// Nearest roots whose relative distance is below this are compared as a pair.
 const NEARLY_MERGED: f64 = 1e-2;
 
-/// A few modes of the band to thirty digits, each with those that it merges with, the nearest pair among them where it is close to
-/// merging; `None` for one that was not found.
+/// Refines a few modes of the band to thirty digits, each with the modes it merges with. The nearest pair is among them
+/// if it is close to merging. `None` for a cluster whose refinement did not converge.
 fn refined(
     model: &Model,
     p: &OperatingPoint,
