@@ -1,4 +1,4 @@
-//! The paper's tables and figures, made again: data, figures and one page that sets ours beside the paper's numbers.
+//! Reproduces the paper's tables and figures: data, figures and a page that shows them with the paper's numbers.
 
 mod nine_dof;
 mod tribometer;
@@ -8,22 +8,22 @@ use crate::html::{figure, page, section};
 pub use nine_dof::nine_dof;
 pub use tribometer::{Heard, MODES, PartModes, Study};
 
-/// A table or figure of the paper, made again.
+/// A reproduced table or figure of the paper.
 #[derive(Clone, Debug)]
 pub struct Item {
-    /// Its files are called that.
+    /// Base name of its files.
     pub name: &'static str,
-    /// `Table 1: …`.
+    /// Its title, such as `Table 1: …`.
     pub title: String,
-    /// What there is to say about it, markup.
+    /// Explanation, as HTML.
     pub text: String,
-    /// The data.
+    /// The data as CSV.
     pub csv: String,
-    /// The drawing, where it is a figure.
+    /// The figure as SVG; `None` for a table.
     pub svg: Option<String>,
 }
 
-/// All of it on one page.
+/// A page with all items, as HTML.
 pub fn index(items: &[Item]) -> String {
     let mut body = "<h1>The paper's tables and figures, made again</h1>\n\
          <p class=\"lead\">Every number is computed; the paper's own stand beside. Each table and figure is also a file of \
@@ -42,7 +42,7 @@ pub fn index(items: &[Item]) -> String {
     page("squealcast: the paper's tables and figures", &body)
 }
 
-/// A table of text cells under its header.
+/// An HTML table of text cells.
 fn table(header: &[&str], rows: &[Vec<String>]) -> String {
     let row = |cells: &mut dyn Iterator<Item = String>| format!("<tr>{}</tr>\n", cells.collect::<String>());
     let head = row(&mut header.iter().map(|cell| format!("<th scope=\"col\">{cell}</th>")));

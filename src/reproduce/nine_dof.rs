@@ -1,4 +1,4 @@
-//! Section 3 of the paper: the slider on a belt, nine degrees of freedom, whole and reduced.
+//! Section 3 of the paper: a slider on a belt with nine degrees of freedom, full and reduced.
 
 use super::{Item, table};
 use crate::display::curves::Curves;
@@ -7,19 +7,21 @@ use crate::plot::{self, Point, Unit};
 use crate::rig::Rig;
 use crate::session::map_options;
 
-/// Table 1 of the paper, rad/s: full model, reduced model 1, reduced model 2; as printed, mode 2 before mode 3.
+/// Table 1 of the paper, rad/s: full model, reduced model 1, reduced model 2. As printed, so mode 2 comes before mode
+/// 3.
 const TABLE_1: [&[f64]; 3] = [
     &[1.0, 1.0720, 1.0720, 1.3809, 1.5698, 1.7718, 1.999, 2.2313, 5.4970],
     &[1.0, 1.0797, 1.0795, 1.4529, 2.1606],
     &[1.0, 1.0796, 1.0796, 1.4624, 1.5596, 2.1245],
 ];
 
-/// A figure of the paper: what it draws and what the paper reads off it.
+/// A figure of the paper: the models it shows and the values the paper reads from it.
 struct Figure {
     name: &'static str,
     title: &'static str,
     full: &'static str,
-    /// Drawn as lines over the dots of the full model; none where the full model itself is drawn.
+    /// Reduced model, drawn as lines over the dots of the full model; `None` if the figure shows the full model as
+    /// lines.
     reduced: Option<&'static str>,
     mu_max: f64,
     paper: &'static str,
@@ -70,10 +72,10 @@ const FIGURES: [Figure; 5] = [
     },
 ];
 
-/// Friction coefficients at which the full model is drawn as dots.
+/// Number of intervals between the friction coefficients at which the full model is drawn as dots.
 const DOTS: usize = 160;
 
-/// Table 1 and Figs. 4 to 8.
+/// Reproduces Table 1 and Figs. 4 to 8.
 ///
 /// # Errors
 /// An embedded rig that cannot be solved, a figure that cannot be drawn.
@@ -159,7 +161,7 @@ impl Figure {
         Ok(StabilityMap::build(&rig.model, &mut Solver::new(rig.model.dimension()), &rig.reference, &options)?)
     }
 
-    /// The modes of the full model here and there.
+    /// The modes of the full model at `DOTS + 1` equidistant friction coefficients.
     fn dots(&self, rig: &Rig) -> anyhow::Result<Vec<Point>> {
         let mut solver = Solver::new(rig.model.dimension());
         let mut dots = vec![];
@@ -193,7 +195,7 @@ mod tests {
         for line in items[0].csv.lines().skip(1) {
             let cells: Vec<&str> = line.split(',').collect();
             let [ours, paper] = [2, 4].map(|column| cells[column].parse::<f64>().unwrap());
-            // Printed to four decimals, but for one slip and one entry of three.
+            // The paper prints four decimals, except for one misprint and one entry of three decimals.
             let limit = match paper {
                 1.0797 => 2.5e-4,
                 1.999 => 5e-4,
@@ -203,7 +205,7 @@ mod tests {
             compared += 1;
         }
         assert_eq!(compared, 20);
-        // 30-digit values of the critical friction coefficients.
+        // Critical friction coefficients, from computations with 30 digits.
         for (item, values) in [
             (&items[1], &["0.8200149594", "2.8222527641"][..]),
             (&items[2], &["0.9676788485"]),

@@ -1,4 +1,4 @@
-//! Section 4 of the paper: a pad on a disc, whole and reduced, on this project's tribometer.
+//! Section 4 of the paper: a pad on a disc, full and reduced, on this project's tribometer.
 
 use std::f64::consts::TAU;
 
@@ -17,17 +17,17 @@ use crate::reduction::{
 };
 use crate::rig::{Rig, RigFile};
 
-/// Modes of each part in the paper's reduced models RM 1 to RM 4.
+/// Number of modes of each part in the paper's reduced models RM 1 to RM 4.
 pub const MODES: [usize; 4] = [10, 40, 80, 245];
-/// The contact stiffness that the paper identified for each of them. It prints N/m; so soft a contact could not feel how many
-/// modes there are, and N/mm fits its figures.
+/// Contact stiffness that the paper identified for each of them. The paper prints N/m, but so soft a contact would not
+/// be sensitive to the number of modes. N/mm agrees with its figures and is assumed.
 const PAPER_STIFFNESS_N_PER_MM: [f64; 4] = [3684.0, 8605.0, 10970.0, 12510.0];
-/// Natural frequencies that are compared, and in the paper's Table 4.
+/// Number of natural frequencies compared, as in the paper's Table 4.
 const FREQUENCIES: usize = 18;
-/// Table 3 of the paper, Hz: what, test, Abaqus.
+/// Table 3 of the paper, Hz: name, test, Abaqus.
 const TABLE_3: [(&str, f64, f64); 3] =
     [("upper part", 314.8, 331.44), ("lower part", 1301.5, 1300.6), ("whole at rest", 474.2, 510.91)];
-/// Table 4 of the paper, Hz: the full model, RM 1 to RM 4.
+/// Table 4 of the paper, Hz: full model, RM 1 to RM 4.
 const TABLE_4: [[f64; 5]; FREQUENCIES] = [
     [510.91, 510.88, 510.90, 510.89, 510.91],
     [550.79, 544.86, 549.74, 553.48, 552.01],
@@ -48,27 +48,27 @@ const TABLE_4: [[f64; 5]; FREQUENCIES] = [
     [3161.2, 3222.6, 3156.1, 3166.9, 3167.2],
     [3255.8, 3255.6, 3259.9, 3264.1, 3257.8],
 ];
-/// Frequencies at which the paper's rig vibrated and at which its reduced model merges, Hz.
+/// Frequencies that the paper measured on its squealing rig, and those at which modes of its reduced model merge, Hz.
 const PAPER_MEASURED_HZ: [f64; 2] = [492.0, 1705.0];
 const PAPER_MERGING_HZ: [f64; 2] = [531.0, 1411.1];
-/// Intervals between the friction coefficients at which the full model is solved.
+/// Number of intervals between the friction coefficients at which the full model is solved.
 const DOTS: usize = 10;
-/// Friction coefficients go up to this, as the paper's do.
+/// Largest friction coefficient, as in the paper.
 const MU_MAX: f64 = 1.0;
 
-/// The most [`MODES`] of pad and disc, as far as the contact feels them.
+/// The largest number of [`MODES`] of pad and disc, at the contact interface.
 pub struct PartModes {
     omega_squared: Vec<Vec<f64>>,
-    /// A rig of all of them, without and with the residual of the others.
+    /// Rigs with all of these modes, without and with residual flexibility.
     plain: Vec<RigFile>,
     with_residual: Vec<RigFile>,
 }
 
 impl PartModes {
-    /// What the contact feels of what was `kept`.
+    /// The interface data of the modes in `kept`.
     ///
     /// # Errors
-    /// Modes that make no rig.
+    /// Modes that cannot be exported as a rig.
     pub fn new(full: &FullModelFile, kept: &[Kept]) -> anyhow::Result<Self> {
         let files = |residual: bool| {
             let mut sides = modal_sides(full, kept)?;
@@ -83,21 +83,22 @@ impl PartModes {
     }
 }
 
-/// A full model of the tribometer, the [`MODES`] of its parts with residuals, and a parametric basis of it.
+/// What Section 4 is reproduced from: a full model of the tribometer, the [`MODES`] of its parts with residual
+/// flexibility, and a parametric basis of the full model.
 pub struct Study<'a> {
     pub full: &'a FullModelFile,
     pub modes: &'a PartModes,
     pub basis: &'a ParametricBasis,
 }
 
-/// What is being done.
+/// A progress report.
 pub enum Heard<'a> {
     Said(&'a str),
-    /// The full model is being solved, for this.
+    /// The full model is being solved for this purpose.
     Solving(&'a str, FullProgress),
 }
 
-/// What the full model itself says.
+/// Results of the full model.
 struct Truth {
     at_rest_hz: Vec<f64>,
     windows: Vec<Window>,
@@ -105,25 +106,25 @@ struct Truth {
     band_hz: f64,
 }
 
-/// A reduced model and what it says.
+/// A reduced model and its natural frequencies.
 struct Reduced {
     name: String,
     stiffness_n_per_m: f64,
     at_rest_hz: Vec<f64>,
     model: Model,
-    /// Modes above are not shown.
+    /// Upper end of the band: modes above are not shown.
     band_hz: f64,
 }
 
-/// Its curves and windows of instability.
+/// Curves and windows of instability of one model.
 struct Mapped {
     curves: Vec<Point>,
     windows: Vec<Window>,
 }
 
 impl Study<'_> {
-    /// Tables 3 and 4, Figs. 13 to 15 and the critical friction coefficients; `solver` solves the full model, `hear` is told
-    /// what is being done.
+    /// Reproduces Tables 3 and 4, Figs. 13 to 15 and the critical friction coefficients. `solver` solves the full
+    /// model; `hear` receives progress reports.
     ///
     /// # Errors
     /// A model that cannot be solved, a figure that cannot be drawn.
@@ -148,7 +149,7 @@ impl Study<'_> {
         let basis = self.reduced(name, model, None, 1.0)?;
 
         say("following the modes of the reduced models over the friction coefficient");
-        // All but the largest with residual, which would take as long as all others.
+        // All models but the largest with residual flexibility, which would take as long as all others together.
         let followed: Vec<&Reduced> = paper.iter().chain(&ours[..3]).chain([&basis]).collect();
         let maps = self.maps(&followed)?;
         let mut items = vec![
@@ -171,7 +172,8 @@ impl Study<'_> {
         contact.sum()
     }
 
-    /// The full model at rest, its windows of instability, and its modes here and there.
+    /// Results of the full model: natural frequencies at rest, windows of instability, and modes at `DOTS + 1` friction
+    /// coefficients.
     fn truth(&self, solver: &mut FullSolver<'_>, hear: &mut dyn FnMut(Heard<'_>)) -> anyhow::Result<Truth> {
         let (full, reference) = (self.full, self.full.settings.reference);
         let band_hz = full.settings.band_max_hz.context("the full model has no band")?;
@@ -204,11 +206,12 @@ impl Study<'_> {
         Ok(Truth { at_rest_hz, windows, dots, band_hz })
     }
 
-    /// So many modes of each part with the contact stiffness that fits the full model at rest best.
+    /// A reduced model with `modes` modes of each part, and the contact stiffness that best fits the natural
+    /// frequencies of the full model at rest.
     fn identified(&self, modes: usize, truth: &Truth) -> anyhow::Result<(Reduced, Identified)> {
         let files = &self.modes.plain;
         let rig = with_modes(files, modes, 1.0)?;
-        // K = K_open + factor (K_closed - K_open): contact springs alone.
+        // K = K_open + factor (K_closed - K_open): the difference is the contact springs.
         let n = rig.model.dimension();
         let [mut open, mut closed, mut damping] = [0; 3].map(|_| Mat::<f64>::zeros(n, n));
         let at_rest = self.at_rest();
@@ -225,7 +228,7 @@ impl Study<'_> {
             Ok(squares.into_iter().map(|square| square.max(0.0).sqrt() / TAU).collect())
         })?;
         let rig = with_modes(files, modes, found.best.factor)?;
-        // Without residuals a rig does not say where its modes end.
+        // Without residual flexibility a rig has no cut-off of its own; it is computed here.
         let highest = self.modes.omega_squared.iter().map(|squares| squares[modes - 1].max(0.0).sqrt() / TAU);
         let cutoff_hz = highest.fold(f64::INFINITY, f64::min);
         let reduced = self.reduced(String::new(), rig.model, Some(cutoff_hz.min(truth.band_hz)), found.best.factor)?;
@@ -240,7 +243,7 @@ impl Study<'_> {
         Ok(Reduced { name, stiffness_n_per_m: factor * self.stiffness_n_per_m(), at_rest_hz, model, band_hz })
     }
 
-    /// The modes of every model over the friction coefficient, the models side by side.
+    /// Follows the modes of every model over the friction coefficient, one thread per model.
     fn maps(&self, models: &[&Reduced]) -> anyhow::Result<Vec<Mapped>> {
         let settings = &self.full.settings;
         let map = |reduced: &Reduced| -> anyhow::Result<Mapped> {
@@ -336,7 +339,7 @@ fn map_options(instability_threshold: f64, band_hz: f64) -> MapOptions {
     MapOptions { mu_min: 0.0, mu_max: MU_MAX, band_max_hz: Some(band_hz), instability_threshold, windows: true }
 }
 
-/// A rig of kind 2 with the lowest `modes` of each part, and `factor` times its contact stiffness.
+/// A rig of kind 2 with the lowest `modes` modes of each part and its contact stiffness multiplied by `factor`.
 fn with_modes(files: &[RigFile], modes: usize, factor: f64) -> anyhow::Result<Rig> {
     let mut files = files.to_vec();
     let mut table: toml::Table = std::str::from_utf8(&files[0].bytes)?.parse()?;
@@ -386,7 +389,7 @@ fn figure_13(found: &Identified, reduced: &Reduced) -> anyhow::Result<Item> {
     Ok(Item { name: "figure-13", title, text, csv, svg: Some(svg) })
 }
 
-/// `|f / f_full - 1|`, %, of each frequency.
+/// `|f / f_full - 1|` of each frequency, in %.
 fn errors_percent(found: &[f64], full: &[f64]) -> Vec<f64> {
     found.iter().zip(full).map(|(found, full)| 100.0 * (found / full - 1.0).abs()).collect()
 }
@@ -395,7 +398,7 @@ fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
 }
 
-/// An error in percent.
+/// Formats an error in %.
 fn percent(error: f64) -> String {
     match error {
         0.0 => "0".to_owned(),
@@ -474,7 +477,7 @@ fn table_4(truth: &Truth, paper: &[Reduced], ours: &[Reduced], basis: &Reduced) 
     Item { name: "table-4", title, text, csv, svg: None }
 }
 
-/// Ends of the windows of instability, and the frequencies that were measured.
+/// Table of the windows of instability of all models, with the frequencies the paper measured.
 fn critical(truth: &Truth, models: &[&Reduced], maps: &[Mapped]) -> Item {
     let mut csv = "model,window,mu_from,mu_to,frequency_hz,error_of_mu_from_percent\n".to_owned();
     let row = |model: &str, number: &str, window: &Window, error: String| {
