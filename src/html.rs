@@ -1,8 +1,8 @@
-//! Pages that stand by themselves: one look, no request to anywhere.
+//! Self-contained HTML pages in a common style, which load nothing from elsewhere.
 
 const STYLE: &str = include_str!("display/assets/report.css");
 
-/// A whole page; `body` is markup.
+/// A whole page; `body` is HTML.
 pub fn page(title: &str, body: &str) -> String {
     format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
@@ -13,12 +13,12 @@ pub fn page(title: &str, body: &str) -> String {
     )
 }
 
-/// A section under its heading.
+/// A section with a heading; `title` and `body` are HTML.
 pub fn section(title: &str, body: &str) -> String {
     format!("<section>\n<h2>{title}</h2>\n{body}</section>\n")
 }
 
-/// What something is, name by name; texts that are no markup.
+/// A table of names and values, both plain text.
 pub fn facts<N: AsRef<str>, V: AsRef<str>>(rows: impl IntoIterator<Item = (N, V)>) -> String {
     let row = |(name, value): (N, V)| {
         format!("<tr><th scope=\"row\">{}</th><td>{}</td></tr>\n", escaped(name.as_ref()), escaped(value.as_ref()))
@@ -26,11 +26,11 @@ pub fn facts<N: AsRef<str>, V: AsRef<str>>(rows: impl IntoIterator<Item = (N, V)
     format!("<table class=\"facts\"><tbody>\n{}</tbody></table>\n", rows.into_iter().map(row).collect::<String>())
 }
 
-/// A figure of [`crate::plot`] with a caption, which is markup.
+/// A figure of [`crate::plot`] with a caption in HTML.
 pub fn figure(svg: &str, caption: &str) -> String {
-    // Without the declaration a file of its own would have.
+    // Drops the XML declaration, which only a separate file needs.
     let svg = svg.find("<svg").map_or(svg, |start| &svg[start..]);
-    // Reached by keyboard too, where it is wider than the screen and scrolls.
+    // Focusable, so that the keyboard can scroll it if it is wider than the screen.
     format!(
         "<figure><p class=\"wide\">Wider than the screen: scroll it sideways →</p>\
          <div class=\"figure\" tabindex=\"0\" role=\"group\" aria-label=\"Figure, scrolls sideways\">{svg}</div>\
@@ -38,7 +38,7 @@ pub fn figure(svg: &str, caption: &str) -> String {
     )
 }
 
-/// Text that is no markup.
+/// Escapes plain text for HTML.
 pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

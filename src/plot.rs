@@ -1,4 +1,4 @@
-//! Figures, all with one look: axes with units, print-ready SVG.
+//! Figures as print-ready SVG, in a common style: axes with units, legends, shaded windows of instability.
 
 use std::collections::BTreeMap;
 
@@ -16,9 +16,9 @@ use crate::physics::Window;
 use crate::physics::identification::{Identified, Trial};
 use crate::wire::level;
 
-/// The library places points on whole units; this many to a px keeps curves smooth.
+/// Drawing units per px. The plotting library rounds positions to whole units; a finer grid keeps curves smooth.
 const FINE: u32 = 8;
-/// Colours of neighbouring curves, those of the page on white: told apart by the colour-blind too.
+/// Colours of neighbouring curves, the same as on the page over white. The colour-blind can tell them apart, too.
 pub(crate) const COLOURS: [RGBColor; 7] = [
     RGBColor(26, 53, 216),
     RGBColor(122, 0, 18),
@@ -29,13 +29,13 @@ pub(crate) const COLOURS: [RGBColor; 7] = [
     RGBColor(176, 60, 0),
 ];
 
-/// Dashes tell modes of the same colour apart: px drawn and px left out.
+/// Dash patterns that distinguish modes of the same colour: px drawn and px left out.
 const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
-/// Room for the entries of a legend, px, and the most it can have; more modes than that are told by nobody.
+/// Width of a legend, px, and its largest number of entries. More modes could not be told apart.
 const LEGEND_WIDTH: usize = 891;
 const LEGEND_MOST: usize = 27;
 
-/// One mode at one friction coefficient.
+/// A mode at one friction coefficient: a point of its curve.
 #[derive(Clone, Copy, Debug)]
 pub struct Point {
     pub mu: f64,
@@ -44,27 +44,27 @@ pub struct Point {
     pub growth_rate_per_s: f64,
 }
 
-/// In what frequencies are drawn.
+/// Unit of the frequency axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Unit {
     Hz,
     RadPerS,
 }
 
-/// A curve; those of the same label have the same style.
+/// A curve. Curves with the same label have the same style.
 struct Line<'a> {
     style: u32,
     label: String,
     points: Vec<&'a Point>,
 }
 
-/// What is drawn against the friction coefficient.
+/// Contents of a figure over the friction coefficient.
 struct AgainstFriction<'a> {
     lines: Vec<Line<'a>>,
     dots: &'a [Point],
     windows: Vec<(f64, Option<f64>)>,
     mu: (f64, f64),
-    /// A friction coefficient with a line of its own.
+    /// A friction coefficient marked by a vertical line.
     marked: Option<f64>,
     unit: Unit,
 }
@@ -74,11 +74,11 @@ struct AgainstFriction<'a> {
 #[error("cannot draw the figure: {0}")]
 pub struct PlotError(String);
 
-/// Growth rates and frequencies of followed modes against the friction coefficient, one above the other, with the
-/// windows of instability shaded.
+/// Growth rates and frequencies of followed modes over the friction coefficient, in two panels, with shaded windows of
+/// instability.
 ///
 /// # Errors
-/// [`PlotError`] where the drawing library refuses.
+/// [`PlotError`] if the plotting library fails.
 pub fn sweep(title: &str, points: &[Point], windows: &[Window]) -> Result<String, PlotError> {
     AgainstFriction {
         lines: by_mode(points),
@@ -91,10 +91,10 @@ pub fn sweep(title: &str, points: &[Point], windows: &[Window]) -> Result<String
     .draw(title)
 }
 
-/// Curves of one model as lines and of another as dots, up to `mu_max`; the windows are those of the lines.
+/// Curves of one model as lines and of another as dots, up to `mu_max`. `windows` are those of the lines.
 ///
 /// # Errors
-/// [`PlotError`] where the drawing library refuses.
+/// [`PlotError`] if the plotting library fails.
 pub fn against_full(
     title: &str,
     lines: &[Point],
@@ -107,10 +107,10 @@ pub fn against_full(
     AgainstFriction { lines: by_mode(lines), dots, windows, mu: (0.0, mu_max), marked: None, unit }.draw(title)
 }
 
-/// Curves of several models as lines, each model in a style of its own under its name, and of another as dots.
+/// Curves of several models as lines, with one style and legend entry per model, and of another model as dots.
 ///
 /// # Errors
-/// [`PlotError`] where the drawing library refuses.
+/// [`PlotError`] if the plotting library fails.
 pub fn several(title: &str, models: &[(String, Vec<Point>)], dots: &[Point], mu_max: f64) -> Result<String, PlotError> {
     let lines = models.iter().enumerate().flat_map(|(k, (name, points))| {
         by_mode(points).into_iter().map(move |line| Line { style: k as u32, label: name.clone(), ..line })
@@ -119,7 +119,7 @@ pub fn several(title: &str, models: &[(String, Vec<Point>)], dots: &[Point], mu_
     AgainstFriction { lines, dots, windows: vec![], mu, marked: None, unit: Unit::Hz }.draw(title)
 }
 
-/// A line for each mode.
+/// One curve per mode.
 fn by_mode(points: &[Point]) -> Vec<Line<'_>> {
     let mut modes: BTreeMap<u32, Vec<&Point>> = BTreeMap::new();
     for point in points {
@@ -128,10 +128,10 @@ fn by_mode(points: &[Point]) -> Vec<Line<'_>> {
     modes.into_iter().map(|(id, points)| Line { style: id, label: format!("mode {id}"), points }).collect()
 }
 
-/// The curves of a stability map up to `mu_to`, as [`sweep`] draws them; a line marks the friction coefficient `marked`.
+/// The curves of a stability map up to `mu_to`, drawn as by [`sweep`]. A line marks the friction coefficient `marked`.
 ///
 /// # Errors
-/// [`PlotError`] where the drawing library refuses.
+/// [`PlotError`] if the plotting library fails.
 pub fn map(title: &str, curves: &Curves, mu_to: f64, marked: Option<f64>) -> Result<String, PlotError> {
     let windows = curves.windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
     let from = curves.mu.first().copied().unwrap_or(0.0);
@@ -139,7 +139,7 @@ pub fn map(title: &str, curves: &Curves, mu_to: f64, marked: Option<f64>) -> Res
     AgainstFriction { lines: by_mode(&lines), dots: &[], windows, mu, marked, unit: Unit::Hz }.draw(title)
 }
 
-/// The points of some curves up to `mu_to`.
+/// The points of curves up to `mu_to`.
 pub fn points(curves: &Curves, mu_to: f64) -> Vec<Point> {
     let mut points = vec![];
     for mode in &curves.modes {
@@ -198,12 +198,12 @@ impl AgainstFriction<'_> {
     }
 }
 
-/// A session over time, in seconds after `from_s`: ranges of load, speed, friction, growth and margin, of the measured
-/// vibration where there is one, and the unstable frequencies; shaded where squeal was predicted. Dots are
-/// frequencies measured at or above `threshold_db`.
+/// A session over time, in seconds after `from_s`: one panel each for the ranges of load, speed, friction coefficient,
+/// growth rate, margin and (if measured) vibration level, and one for the unstable frequencies. Predicted squeal is
+/// shaded. Dots are measured frequencies with a level of at least `threshold_db`.
 ///
 /// # Errors
-/// [`PlotError`] where the drawing library refuses.
+/// [`PlotError`] if the plotting library fails.
 pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -> Result<String, PlotError> {
     const LABELS: [&str; 5] = ["load, N", "speed, rad/s", "friction", "growth, 1/s", "margin"];
     type Range = fn(&Bin) -> Option<(f32, f32)>;
@@ -265,7 +265,7 @@ pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -
         };
         let heights = unstable().into_iter().map(|mode| mode.1).chain(measured().into_iter().map(|heard| heard.1));
         let (low, high) = padded(range(heights));
-        // Not closer than that: a frequency that hardly changes is a line, not noise.
+        // A least height of the axis, so that a nearly constant frequency appears as a line and not as noise.
         let room = (0.05 * (low + high) - 0.5 * (high - low)).max(0.0);
         let y = (low - room, high + room);
         let mut chart = axes(area, time, y, "time, s", "unstable, Hz")?;
@@ -281,7 +281,7 @@ pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -
     })
 }
 
-/// A figure of so many px.
+/// A figure of the given width and height, px.
 fn figure(
     title: &str,
     (width, height): (u32, u32),
@@ -301,7 +301,7 @@ fn figure(
     Ok(svg.replacen(&fine, &format!("width=\"{width}\" height=\"{height}\""), 1))
 }
 
-/// Which line is which mode, above the axes: it covers no curve.
+/// Draws the legend of curves above the axes, where it covers no curve.
 fn legend(area: &Area<'_>, entries: &[(u32, &str)], columns: usize) -> Result<(), PlotError> {
     for (k, &(id, label)) in entries.iter().enumerate() {
         let (x, y) = legend_place(k, columns);
@@ -318,19 +318,19 @@ fn legend(area: &Area<'_>, entries: &[(u32, &str)], columns: usize) -> Result<()
     Ok(())
 }
 
-/// Where the k-th entry of a legend begins.
+/// Position of the k-th entry of a legend.
 fn legend_place(k: usize, columns: usize) -> (i32, i32) {
     let (width, size) = ((LEGEND_WIDTH / columns) as i32, |px: i32| px * FINE as i32);
     (size(84 + width * (k % columns) as i32), size(12 + 24 * (k / columns) as i32))
 }
 
-/// What an entry is, beside its line or mark.
+/// Draws the label of a legend entry, to the right of its line or marker.
 fn legend_text(area: &Area<'_>, (x, y): (i32, i32), label: &str) -> Result<(), PlotError> {
     let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(Pos::new(HPos::Left, VPos::Center));
     area.draw(&Text::new(label.to_owned(), (x + 34 * FINE as i32, y), text)).map_err(failed)
 }
 
-/// The line of a mode.
+/// Draws the curve of a mode.
 fn curve(chart: &mut Chart<'_>, id: u32, points: Vec<(f64, f64)>) -> Result<(), PlotError> {
     match DASHES[id as usize / COLOURS.len() % DASHES.len()] {
         None => drop(chart.draw_series(LineSeries::new(points, style(id))).map_err(failed)?),
@@ -346,21 +346,21 @@ fn style(id: u32) -> ShapeStyle {
     COLOURS[id as usize % COLOURS.len()].stroke_width(2 * FINE)
 }
 
-/// Behind what is unstable.
+/// Fill that marks windows of instability and squeal.
 fn shade() -> ShapeStyle {
     RGBColor(213, 94, 0).mix(0.12).filled()
 }
 
-/// Entries of that figure's legend in a row.
+/// Number of columns of the legend of [`front`].
 const FRONT_COLUMNS: usize = 5;
 
-/// Error against run time of the routes to a prediction, both axes logarithmic, a curve for each number of modes and a
-/// mark for each route. From each route's median error a line goes up to its largest.
+/// Error over run time of the routes to a prediction, on logarithmic axes: one curve per number of modes, one marker
+/// per route at its median error. A line leads from there to the largest error.
 ///
 /// # Errors
-/// [`PlotError`] where the drawing library refuses.
+/// [`PlotError`] if the plotting library fails.
 pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
-    // Errors of nothing at all are drawn at the lower edge.
+    // Errors of zero are drawn at the lower edge.
     let at = |route: &Route, error: f64| (route.median_us.log10(), error.max(1e-18).log10());
     let drawn: Vec<&Route> = routes.iter().filter(|route| route.median_error.is_finite()).collect();
     let mut curves: BTreeMap<usize, Vec<&Route>> = BTreeMap::new();
@@ -405,7 +405,7 @@ pub fn front(title: &str, routes: &[Route]) -> Result<String, PlotError> {
     })
 }
 
-/// The mark of the k-th route.
+/// The marker of the k-th route.
 fn marker<'a, C: Clone + 'static>(k: usize, place: C, colour: RGBColor) -> DynElement<'static, SVGBackend<'a>, C> {
     let size = 5 * FINE;
     match k % 6 {
@@ -418,15 +418,15 @@ fn marker<'a, C: Clone + 'static>(k: usize, place: C, colour: RGBColor) -> DynEl
     }
 }
 
-/// The errors of natural frequencies over the contact stiffness, as the paper's Fig. 13: mean below, largest above, the
-/// range in which the rms error is below twice its minimum shaded, the minimiser marked. `stiffness_n_per_m` is that of
-/// a factor of 1; without it the axis is the factor.
+/// Errors of natural frequencies over the contact stiffness, as in the paper's Fig. 13: the mean and the largest error.
+/// The range in which the rms error is below twice its minimum is shaded and the minimiser is marked.
+/// `stiffness_n_per_m` corresponds to a factor of 1; if `None`, the axis shows the factor.
 ///
 /// # Errors
-/// [`PlotError`] where the drawing library refuses.
+/// [`PlotError`] if the plotting library fails.
 pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option<f64>) -> Result<String, PlotError> {
     let at = |factor: f64| (factor * stiffness_n_per_m.unwrap_or(1.0)).log10();
-    // Errors of nothing at all are drawn at the lower edge.
+    // Errors of zero are drawn at the lower edge.
     let height = |error: f64| (100.0 * error).max(1e-12).log10();
     let mut trials: Vec<&Trial> = found.curve.iter().chain([&found.best]).collect();
     trials.sort_by(|a, b| a.factor.total_cmp(&b.factor));
@@ -442,7 +442,7 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
         let [from, to] = found.doubled;
         let (from, to) = (from.map_or(x.0, &at), to.map_or(x.1, &at));
         chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
-        // Behind the curves, whose lowest points it would hide.
+        // Drawn first: in front of the curves it would hide their minima.
         let best = at(found.best.factor);
         let marked = RGBColor(150, 150, 150).stroke_width(FINE);
         chart.draw_series(LineSeries::new([(best, y.0), (best, y.1)], marked)).map_err(failed)?;
@@ -462,7 +462,7 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
     })
 }
 
-/// Bins without a gap between them that all have something, with it.
+/// Runs of consecutive bins for which `of` returns a value, as bin index and value.
 fn stretches<T>(history: &History, of: impl Fn(&Bin) -> Option<T>) -> Vec<Vec<(i64, T)>> {
     let mut stretches: Vec<Vec<(i64, T)>> = vec![];
     for bin in history.bins() {
@@ -479,7 +479,7 @@ type Tick = fn(f64, (f64, f64)) -> String;
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Chart<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
-/// Axes with units, the same for every figure.
+/// Axes with units, in the common style.
 fn axes<'a>(
     area: &Area<'a>,
     x: (f64, f64),
@@ -490,7 +490,7 @@ fn axes<'a>(
     axes_with_ticks(area, x, y, (x_label, y_label), (tick, tick))
 }
 
-/// The same with labels of the ticks by functions of the value and the range.
+/// The same axes, with functions that format ticks from the value and the range of the axis.
 fn axes_with_ticks<'a>(
     area: &Area<'a>,
     x: (f64, f64),
@@ -523,13 +523,13 @@ fn axes_with_ticks<'a>(
     Ok(chart)
 }
 
-/// The label of a tick. Rounding leaves a zero that is none, and may be negative.
+/// The label of a tick. A value that is zero up to rounding becomes 0.
 fn tick(value: f64, (low, high): (f64, f64)) -> String {
     let value = if value.abs() < 1e-9 * (high - low) { 0.0 } else { value };
     FloatPrettyPrinter { allow_scientific: false, min_decimal: 1, max_decimal: 5 }.print(value)
 }
 
-/// The label of a tick of a logarithmic axis: whole powers of ten.
+/// The label of a tick on a logarithmic axis over many decades: only whole powers of ten.
 fn power_of_ten(value: f64, _range: (f64, f64)) -> String {
     let digits = ['⁰', '¹', '²', '³', '⁴', '⁵', '⁶', '⁷', '⁸', '⁹'];
     let power = value.round();
@@ -540,7 +540,7 @@ fn power_of_ten(value: f64, _range: (f64, f64)) -> String {
     format!("10{}{raised}", if power < 0.0 { "⁻" } else { "" })
 }
 
-/// The label of a tick of a logarithmic axis within few decades: the value, two digits of it.
+/// The label of a tick on a logarithmic axis over few decades: the value with two digits.
 fn logarithmic(value: f64, _range: (f64, f64)) -> String {
     let value = 10f64.powf(value);
     let power = value.log10().floor();
@@ -558,12 +558,12 @@ fn logarithmic(value: f64, _range: (f64, f64)) -> String {
     }
 }
 
-/// The whole powers of ten around a range of logarithms.
+/// The whole powers of ten that enclose a range of logarithms.
 fn decades((low, high): (f64, f64)) -> (f64, f64) {
     ((low - 0.04 * (high - low)).floor(), (high + 0.04 * (high - low)).ceil())
 }
 
-/// Smallest and largest of `values`; something to draw on where there is nothing.
+/// Smallest and largest of `values`, widened if they are equal; `(0, 1)` if there are no values.
 fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
     match (low < high, low.is_finite()) {
