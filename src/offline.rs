@@ -1,7 +1,7 @@
-//! A session without buses and without waiting: what was measured is predicted and recorded as fast as possible.
+//! A session without buses: predicts and records measured inputs as fast as possible.
 //!
-//! Time is that of the stamps, silence included. Unlike a node's, no prediction here waits for its stability map: the map is
-//! computed before the input that needs it.
+//! Time is that of the stamps, also for silences. In contrast to a node, every stability map is computed before the
+//! input that needs it.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -19,11 +19,11 @@ use crate::session::{Event, Session, Want};
 use crate::settings::Settings;
 use crate::wire::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
 
-/// Stamp of the first input of a simulated offline session, ns since the epoch: 2024-01-01T00:00:00Z, so that the same
-/// command makes the same messages.
+/// Stamp of the first input of a simulated offline session, ns since the epoch: 2024-01-01T00:00:00Z. Fixed, so that
+/// equal commands give equal messages.
 pub const START_NS: i64 = 1_704_067_200_000_000_000;
 
-/// Messages that may wait for the disk.
+/// Largest number of messages waiting to be written to disk.
 const MOST_QUEUED: usize = 1000;
 
 /// Why a session could not be recorded.
@@ -35,7 +35,7 @@ pub enum OfflineError {
     Dropped { dropped: u64, reason: String },
 }
 
-/// Something that was measured, and when it was recorded.
+/// A measured quantity with the times of its recording.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Measured {
     pub log_time_ns: u64,
@@ -43,7 +43,7 @@ pub struct Measured {
     pub quantity: Quantity,
 }
 
-/// What was measured.
+/// A measured quantity.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Quantity {
     Conditions(OperatingPoint),
@@ -51,7 +51,7 @@ pub enum Quantity {
 }
 
 impl Measured {
-    /// Recorded when it was measured.
+    /// A quantity whose recording times equal its stamp.
     pub fn at_its_stamp(quantity: Quantity) -> Self {
         let stamp = match &quantity {
             Quantity::Conditions(input) => input.header.stamp,
@@ -62,21 +62,21 @@ impl Measured {
     }
 }
 
-/// A session that was predicted.
+/// Summary of a session that was predicted and recorded.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Predicted {
-    /// Of its recording.
+    /// Directory of its recording.
     pub directory: PathBuf,
     pub inputs: u64,
-    /// Predictions by level: OK, WARN, SQUEAL, FAULT.
+    /// Number of predictions of each level: OK, WARN, SQUEAL, FAULT.
     pub levels: [u64; 4],
-    /// Why a stability map could not be computed, the first time.
+    /// Why the first stability map that failed could not be computed.
     pub map_failure: Option<String>,
 }
 
-/// Predicts what was `measured` with `rig` and records the session into a new directory in `directory`. Predictions are read
-/// off `chart` where one is given. `points` are the conditions in `measured`, in the same order, to solve ahead of the
-/// session; they may end early.
+/// Predicts the `measured` inputs with `rig` and records the session into a new directory in `directory`. Predictions
+/// are charted if `chart` is given. `points` are the conditions in `measured`, in the same order, to be solved ahead of
+/// the session; they may end early.
 ///
 /// # Errors
 /// [`OfflineError`].
@@ -110,7 +110,7 @@ pub fn record(
     offline.finish()
 }
 
-/// A session on its way into a recording.
+/// A session that is being recorded.
 struct Offline {
     rig: Arc<Rig>,
     recorder: Recorder,
@@ -118,7 +118,7 @@ struct Offline {
     solver: Solver,
     /// Stamp and log time of the latest input.
     last: Option<(Time, u64)>,
-    /// No map can be computed at this load and speed.
+    /// Load and speed at which the map cannot be computed; not tried again.
     given_up: Option<physics::OperatingPoint>,
     inputs: u64,
     levels: [u64; 4],
@@ -147,23 +147,23 @@ impl Offline {
     }
 
     fn write(&self, log_time_ns: u64, publish_time_ns: u64, payload: Payload) {
-        // Nothing is live here: wait for the disk rather than drop.
+        // Nothing is live here: wait for the disk instead of dropping messages.
         while self.recorder.status().queued > MOST_QUEUED {
             std::thread::sleep(Duration::from_millis(1));
         }
         self.recorder.record(Message { log_time_ns, publish_time_ns, payload });
     }
 
-    /// Records an event, then hands it to the session.
+    /// Records a session event, then passes it to the session.
     fn event(&mut self, stamp: Time, log_time_ns: u64, record: SessionEvent, event: Event) {
         let header = Header { stamp, ..Default::default() };
         self.write(log_time_ns, log_time_ns, Payload::SessionEvent(SessionEvent { header, ..record }));
         self.step(log_time_ns, event);
     }
 
-    /// One step of the session; its prediction is recorded, and what it would use is returned.
+    /// One step of the session. Records its prediction and returns the computation it requests.
     fn step(&mut self, log_time_ns: u64, event: Event) -> Option<Want> {
-        // Settings are the rig's own here, and no event changes them: nothing can be refused.
+        // Settings are those of the rig and no event changes them, so the session refuses nothing.
         let effects = self.session.step(event).unwrap_or_default();
         let (prediction, want) = (effects.publish.cloned(), effects.want);
         if let Some(prediction) = prediction {
@@ -173,7 +173,7 @@ impl Offline {
         want
     }
 
-    /// Records what the session starts from.
+    /// Records the initial state of the session: rig, settings and chart.
     fn begin(&mut self, stamp: Time, log_time_ns: u64, chart: Option<Arc<Chart>>) {
         self.write(log_time_ns, log_time_ns, Payload::RigInfo(rig_info(&self.rig)));
         let header = Header { stamp, ..Default::default() };
@@ -188,7 +188,7 @@ impl Offline {
         }
     }
 
-    /// The silence before an input, where its stamp is that much later than the one before.
+    /// Inserts a silence before an input whose stamp follows the previous one by more than the silence timeout.
     fn silence(&mut self, stamp: Time, log_time_ns: u64) {
         let timeout = Duration::try_from_secs_f64(self.session.settings().silence_timeout_s).ok();
         let timeout_ns = timeout.and_then(|timeout| i64::try_from(timeout.as_nanos()).ok());
@@ -203,7 +203,7 @@ impl Offline {
         self.last = Some((stamp, log_time_ns));
     }
 
-    /// Computes the map that the prediction for `input` needs, where there is none.
+    /// Computes the stability map that the prediction for `input` needs, if the session does not have it.
     fn prepare(&mut self, input: &OperatingPoint, log_time_ns: u64) {
         let point = input.point();
         if self.session.lacks_map(&point) {

@@ -1,9 +1,9 @@
-//! Predicting a recorded session again and comparing, byte for byte.
+//! Predicts a recorded session again and compares byte for byte.
 //!
 //! Exactly the inputs that were predicted are predicted again, in the recorded order, with the recorded session events
-//! between them; stability maps and ends of windows are computed anew at the load and speed their events name.
-//! Sensitivities are left out: nothing depends on them. Dense spectra of inputs to come are solved side by side, ahead of the
-//! session (`ahead`).
+//! between them. Stability maps and ends of windows are recomputed at the load and speed that their events give.
+//! Sensitivities are ignored, because no prediction depends on them. Dense spectra of coming inputs are solved in
+//! parallel ahead of the session (`ahead`).
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::Arc;
@@ -21,35 +21,36 @@ use crate::session::{Event, Session};
 use crate::settings::Settings;
 use crate::wire::{self, Prediction, SessionEvent, Time, event_kind};
 
-/// Differences described one by one; the rest is only counted.
+/// Number of differences described in words; all others are only counted.
 const DESCRIBED: usize = 10;
 
-/// What came of it.
+/// Result of a verification.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Verification {
-    /// Operating points in the recording, and those of them that were predicted.
+    /// Number of operating points in the recording, and how many of them were predicted.
     pub inputs: u64,
     pub predicted: u64,
-    /// Predictions that are the same, byte for byte.
+    /// Number of predictions that agree byte for byte.
     pub identical: u64,
-    /// Predictions that differ.
+    /// Number of predictions that differ.
     pub different: u64,
-    /// Recorded predictions that were not predicted now, and the other way round.
+    /// Number of predictions that are only in the recording, and that were only computed now.
     pub missing: u64,
     pub extra: u64,
-    /// Stability maps, ends of windows and charts whose hash differs.
+    /// Number of stability maps, ends of windows and charts whose hash differs.
     pub different_maps: u64,
-    /// Largest relative difference of a frequency, and difference of a growth rate in 1/s, over modes of equal identity.
+    /// Largest relative difference of frequencies, and largest difference of growth rates (1/s), of modes of equal
+    /// identity.
     pub frequency_difference: f64,
     pub growth_rate_difference_per_s: f64,
-    /// The first differences in words.
+    /// Descriptions of the first differences.
     pub described: Vec<String>,
-    /// What of the recording could not be read.
+    /// Damaged parts of the recording.
     pub damage: Vec<FileDamage>,
 }
 
 impl Verification {
-    /// Whether every prediction came out the same.
+    /// Whether all predictions and all computed maps, ends and charts agree.
     pub fn agrees(&self) -> bool {
         self.different + self.missing + self.extra + self.different_maps == 0
     }
@@ -61,16 +62,16 @@ impl Verification {
     }
 }
 
-/// Where the charts of a verification come from.
+/// Where a verification takes charts from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Charts {
-    /// A chart that is kept on disk serves if it has the recorded hash.
+    /// From disk, if the chart there has the recorded hash; otherwise built.
     Kept,
-    /// Charts are built anew, so that the builder is verified too.
+    /// Always built, which verifies the builder too.
     Anew,
 }
 
-/// Why nothing could be compared.
+/// Why a recording could not be verified.
 #[derive(Debug, thiserror::Error)]
 pub enum VerifyError {
     #[error("the recording holds no prediction that can be read{}", .damage.iter().map(|d| format!("; {d}")).collect::<String>())]
@@ -85,9 +86,11 @@ pub enum VerifyError {
     Encode(String),
 }
 
-/// Predicts the session in `recording` again with `rig` and compares. A file from the middle of a session begins with the settings,
-/// map, ends and chart in force, so that it comes out the same by itself; but whether its first input repeats the one before, and
-/// whether the hysteresis of SQUEAL held then, is not in it.
+/// Predicts the session in `recording` again with `rig` and compares.
+///
+/// A file from the middle of a session can be verified alone, because it begins with the settings, map, ends and chart
+/// in force. It lacks two things: whether its first input reused the previous prediction, and whether the hysteresis of
+/// SQUEAL was active.
 ///
 /// # Errors
 /// [`VerifyError`].
@@ -110,7 +113,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
     let mut solver = Solver::new(rig.model.dimension());
     let mut computed: VecDeque<Prediction> = VecDeque::new();
     let step = |session: &mut Session, computed: &mut VecDeque<Prediction>, event: Event| {
-        // A parameter that the session refuses changed nothing when it was recorded either.
+        // A parameter that the session refuses now was refused when recorded, too, and changed nothing.
         let effects = session.step(event).unwrap_or_default();
         computed.extend(effects.publish.cloned());
     };
@@ -154,18 +157,20 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
     Ok(found)
 }
 
-/// The latest session event of each kind, and of each setting: each file of a recording begins with a copy of them.
+/// The latest session event of each kind and name. Used to skip the copies of events at the start of each file of a
+/// recording.
 #[derive(Default)]
 struct NewEvents(HashMap<(u8, String), Bytes>);
 
 impl NewEvents {
-    /// Whether an event is not a copy of one before, to the byte. Its stamp, in nanoseconds, is among these.
+    /// Whether an event differs in any byte from the last one of its kind and name. The bytes include the stamp in
+    /// nanoseconds.
     fn take(&mut self, event: &SessionEvent, cdr: &Bytes) -> bool {
         self.0.insert((event.kind, event.name.clone()), cdr.clone()).is_none_or(|before| before != cdr)
     }
 }
 
-/// The event that was recorded, a stability map computed anew.
+/// Converts a recorded session event. Maps, ends and charts are recomputed and their hashes compared.
 fn session_event(
     event: SessionEvent,
     rig: &Rig,
@@ -210,7 +215,7 @@ fn session_event(
                 Charts::Anew => None,
             };
             let kept = kept.and_then(|file| file.load().ok().flatten());
-            // Whoever built it, a chart with the recorded hash is the recorded one, to the last bit.
+            // A chart with the recorded hash is bit-identical to the recorded one, whoever built it.
             let chart = match kept.filter(|chart| chart.is_complete() && chart_hash(chart) == event.hash) {
                 Some(chart) => chart,
                 None => session_chart(rig, std::thread::available_parallelism().map_or(1, usize::from), &|| true)
