@@ -1,25 +1,25 @@
-//! The settings of a session: what can be changed while the node runs, with validation.
+//! The settings of a session, which can be changed while the node runs, with their validation.
 
 use crate::rig::Rig;
 
-/// When to warn, when to reuse, when to fault.
+/// Thresholds of levels, dead-bands for reuse, and the silence timeout.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// WARN when the margin to the nearest end of a window is below this.
+    /// WARN if the margin to the nearest end of a window is below this.
     pub warn_margin: f64,
-    /// SQUEAL when a mode's damping ratio falls below this.
+    /// SQUEAL if a mode's damping ratio falls below this.
     pub squeal_damping_ratio: f64,
-    /// SQUEAL ends when every damping ratio is above the limit by this much.
+    /// SQUEAL ends when every damping ratio exceeds the limit by at least this.
     pub squeal_hysteresis: f64,
     /// FAULT after this much silence, s.
     pub silence_timeout_s: f64,
-    /// Changes of load up to this reuse the previous prediction, N.
+    /// Dead-band of load: the previous prediction is reused for changes up to this, N.
     pub dead_band_load_n: f64,
-    /// Changes of speed up to this reuse the previous prediction, rad/s.
+    /// Dead-band of speed: the previous prediction is reused for changes up to this, rad/s.
     pub dead_band_speed_rad_s: f64,
-    /// Changes of friction coefficient up to this reuse the previous prediction.
+    /// Dead-band of the friction coefficient: the previous prediction is reused for changes up to this.
     pub dead_band_friction: f64,
-    /// How far load and speed may move, relative, from where windows were computed before they no longer count.
+    /// Largest relative change of load or speed from those of the stability map for which its windows are still used.
     pub map_tolerance: f64,
 }
 
@@ -32,7 +32,7 @@ pub enum SettingError {
     OutOfRange { name: String, value: f64, low: f64, high: f64 },
 }
 
-/// A parameter: its name, what it does, and its closed range.
+/// A parameter: name, description and closed range.
 pub struct Parameter {
     pub name: &'static str,
     pub description: &'static str,
@@ -41,7 +41,7 @@ pub struct Parameter {
     field: fn(&mut Settings) -> &mut f64,
 }
 
-/// Every parameter of a session, with its unit in its name.
+/// All parameters of a session. Names carry units.
 pub const PARAMETERS: [Parameter; 8] = [
     Parameter {
         name: "warn_margin",
@@ -101,10 +101,10 @@ pub const PARAMETERS: [Parameter; 8] = [
     },
 ];
 
-/// Refuses an unknown name or a value outside its range.
+/// Looks up a parameter and checks `value` against its range.
 ///
 /// # Errors
-/// [`SettingError`].
+/// [`SettingError`] for an unknown name or a value outside the range.
 pub fn validate(name: &str, value: f64) -> Result<&'static Parameter, SettingError> {
     let Some(parameter) = PARAMETERS.iter().find(|p| p.name == name) else {
         let known: Vec<_> = PARAMETERS.iter().map(|p| p.name).collect();
@@ -119,7 +119,7 @@ pub fn validate(name: &str, value: f64) -> Result<&'static Parameter, SettingErr
 }
 
 impl Settings {
-    /// The settings a session with `rig` starts with.
+    /// The initial settings of a session with `rig`.
     pub fn for_rig(rig: &Rig) -> Self {
         Self {
             warn_margin: rig.warning.margin,
@@ -136,13 +136,13 @@ impl Settings {
     /// Changes one setting.
     ///
     /// # Errors
-    /// [`SettingError`]; nothing is changed then.
+    /// [`SettingError`], in which case nothing is changed.
     pub fn set(&mut self, name: &str, value: f64) -> Result<(), SettingError> {
         *(validate(name, value)?.field)(self) = value;
         Ok(())
     }
 
-    /// Every setting by name.
+    /// All settings, by name.
     pub fn values(&self) -> impl Iterator<Item = (&'static str, f64)> {
         let mut copy = *self;
         PARAMETERS.iter().map(move |p| (p.name, *(p.field)(&mut copy)))

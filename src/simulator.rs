@@ -1,5 +1,4 @@
-//! The rig simulator: load, speed and friction coefficient over time, and the vibration that comes of it, with noise from
-//! a seed.
+//! The rig simulator: load, speed and friction coefficient over time and the resulting vibration, with seeded noise.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -8,21 +7,21 @@ use serde::Deserialize;
 use crate::input_file;
 use crate::physics::OperatingPoint;
 
-/// The `frame_id` of simulated measurements, by which recordings and displays know them.
+/// The `frame_id` of simulated measurements, by which recordings and displays recognise them.
 pub const FRAME_ID: &str = "simulated";
 
-/// Conditions over time: straight lines between points, with noise around them.
+/// Conditions over time: linear between points, with noise added.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Profile {
-    /// Ascending in time; before the first and after the last the value is held.
+    /// Points in ascending time. Before the first and after the last the value is constant.
     pub point: Vec<ProfilePoint>,
     /// Standard deviations of the noise.
     #[serde(default)]
     pub noise: Noise,
 }
 
-/// One corner of a profile.
+/// One point of a profile.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProfilePoint {
@@ -59,7 +58,7 @@ pub enum ProfileError {
 }
 
 impl Profile {
-    /// The paper's test, 500 N and 13 rad/s with a friction coefficient between 0.3 and 0.4, then a ramp from 0 to 1.
+    /// The paper's test (500 N, 13 rad/s, friction coefficients between 0.3 and 0.4), then a ramp from 0 to 1.
     pub fn paper() -> Self {
         Self::of_friction(&[
             (0.0, 0.30),
@@ -74,7 +73,7 @@ impl Profile {
         ])
     }
 
-    /// The same in an order in which something happens soon: the ramp up to 1 and back, then the paper's test.
+    /// The same parts in an order that soon reaches squeal: a ramp up to 1 and back, then the paper's test.
     pub fn demo() -> Self {
         Self::of_friction(&[
             (0.0, 0.35),
@@ -89,7 +88,7 @@ impl Profile {
         ])
     }
 
-    /// The paper's load and speed, the friction coefficient along straight lines between `(time_s, value)`, with noise.
+    /// A profile with the paper's load and speed and the given friction coefficients `(time_s, value)`, with noise.
     fn of_friction(corners: &[(f64, f64)]) -> Self {
         let point = |&(time_s, friction_coefficient): &(f64, f64)| ProfilePoint {
             time_s,
@@ -101,7 +100,7 @@ impl Profile {
         Self { point: corners.iter().map(point).collect(), noise }
     }
 
-    /// A profile from a TOML file.
+    /// Loads a profile from a TOML file.
     ///
     /// # Errors
     /// [`ProfileError`], naming file, field, value and limit.
@@ -152,7 +151,7 @@ impl Profile {
         self.point.last().map_or(0.0, |last| last.time_s)
     }
 
-    /// The conditions at a time, without noise.
+    /// The conditions at a time without noise; `None` for an empty profile.
     fn at(&self, time_s: f64) -> Option<OperatingPoint> {
         let after = self.point.partition_point(|corner| corner.time_s <= time_s);
         let left = self.point.get(after.saturating_sub(1))?;
@@ -168,37 +167,38 @@ impl Profile {
     }
 }
 
-/// When the simulated rig squeals: a tone while the friction coefficient, without noise, is above a limit.
+/// Squeal of the simulated rig: a tone of this frequency while the friction coefficient (without noise) exceeds
+/// `above_mu`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tone {
     pub above_mu: f64,
     pub frequency_hz: f64,
 }
 
-/// What is measured of the vibration.
+/// Highest peak of a measured vibration spectrum.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Peak {
     pub frequency_hz: f64,
     pub level_db: f64,
 }
 
-/// Level of a tone, and of the rest, dB.
+/// Level of the tone, and of the background noise, dB.
 const TONE_DB: f64 = 95.0;
 const BACKGROUND_DB: f64 = 50.0;
-/// Standard deviation of both.
+/// Standard deviation of both levels.
 const LEVEL_NOISE_DB: f64 = 2.0;
 
-/// A simulated rig: the same seed gives the same measurements.
+/// A simulated rig. Equal seeds give equal measurements.
 #[derive(Clone, Debug)]
 pub struct Simulator {
     profile: Profile,
     noise: ChaCha8Rng,
-    /// Its own, so that the conditions are the same whether the vibration is measured or not.
+    /// A separate random stream, so that measuring vibration does not change the conditions.
     vibration_noise: ChaCha8Rng,
 }
 
 impl Simulator {
-    /// A rig that follows `profile` again and again.
+    /// A rig that repeats `profile` periodically.
     pub fn new(profile: Profile, seed: u64) -> Self {
         let noise = ChaCha8Rng::seed_from_u64(seed);
         let mut vibration_noise = noise.clone();
@@ -214,8 +214,8 @@ impl Simulator {
         self.profile.at(phase).unwrap_or(nothing)
     }
 
-    /// The highest peak of the vibration's spectrum at a time since the start: the tone, within 0.2 % of its frequency,
-    /// or somewhere in the noise up to twice that.
+    /// The highest peak of the vibration spectrum at a time since the start. While the tone sounds, within 0.2 % of its
+    /// frequency; otherwise uniformly distributed up to twice that frequency.
     pub fn measure_vibration(&mut self, tone: Tone, time_s: f64) -> Peak {
         let sounds = self.truth(time_s).friction_coefficient > tone.above_mu;
         let place: f64 = self.vibration_noise.random();
@@ -228,7 +228,7 @@ impl Simulator {
         }
     }
 
-    /// What is measured at a time since the start; the next call draws the next noise.
+    /// The measured conditions at a time since the start. Each call draws new noise.
     pub fn measure(&mut self, time_s: f64) -> OperatingPoint {
         let point = self.truth(time_s);
         let Noise { normal_load_n, disc_speed_rad_s, friction_coefficient } = self.profile.noise;
@@ -241,7 +241,7 @@ impl Simulator {
     }
 }
 
-/// A standard normal number (Box and Muller, 1958).
+/// A standard normal random number (Box and Muller, 1958).
 fn normal(noise: &mut ChaCha8Rng) -> f64 {
     let (u, v): (f64, f64) = (noise.random(), noise.random());
     (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
@@ -273,7 +273,7 @@ mod tests {
         let tone = Tone { above_mu: 0.5, frequency_hz: 1500.0 };
         let (mut heard, mut unheard) = (Simulator::new(Profile::paper(), 3), Simulator::new(Profile::paper(), 3));
         for k in 0..3000 {
-            // Between hundredths: at 19 s itself friction is the limit, give or take rounding.
+            // Sampled between hundredths of a second: at 19 s the friction coefficient equals the limit up to rounding.
             let time_s = 0.01 * f64::from(k) + 0.005;
             let peak = heard.measure_vibration(tone, time_s);
             // The ramp from 0 at 14 s to 1 at 24 s, and back from 27 s to 0.3 at 30 s.
