@@ -16,14 +16,14 @@ use thiserror::Error;
 
 use crate::input_file;
 
-/// Names nested deeper than this are refused.
+/// Deepest nesting of names that is accepted.
 const MAX_DEPTH: usize = 32;
-/// YAML nested deeper than this is refused before it is built: building it takes as many nested calls.
+/// Deepest nesting of YAML that is accepted; building the document recurses as deep.
 const MAX_NESTING: usize = 64;
 
 const PARAMETERS: &str = "ros__parameters";
 
-/// Why a parameter file was not read.
+/// Why a parameter file cannot be read.
 #[derive(Debug, Error)]
 pub enum ParamsFileError {
     #[error("parameter file {path}: {source}")]
@@ -34,10 +34,10 @@ pub enum ParamsFileError {
     Shape { path: PathBuf, at: String, problem: &'static str },
 }
 
-/// The parameters that a file has for a node, as text, in the order of the file.
+/// The parameters that a file contains for a node, as text, in file order.
 ///
 /// # Errors
-/// A file that cannot be read, is no YAML, or is not laid out as above.
+/// The file cannot be read, is not YAML, or does not have the layout above.
 pub fn read(path: &Path, namespace: &str, node: &str) -> Result<Vec<(String, String)>, ParamsFileError> {
     let failed = |source| ParamsFileError::Read { path: path.to_owned(), source };
     let text = input_file::read_text(path, input_file::PARAMETERS).map_err(failed)?;
@@ -57,8 +57,8 @@ fn shape(at: &[String], problem: &'static str) -> ParseError {
     ParseError::Shape { at: if at.is_empty() { "top level".to_owned() } else { at.join(" / ") }, problem }
 }
 
-/// Refuses what takes more memory or stack to build than the text is worth: deep nesting, and aliases, each of which stands
-/// for a copy of what it refers to. ROS itself reads no aliases.
+/// Refuses text that would need excessive memory or stack to build: deep nesting, and aliases, each of which represents
+/// a copy of its target. ROS does not read aliases either.
 fn check_events(text: &str) -> Result<(), ParseError> {
     let mut depth = 0_usize;
     for event in Parser::new_from_str(text) {
@@ -88,7 +88,7 @@ fn parse(text: &str, namespace: &str, node: &str) -> Result<Vec<(String, String)
     Ok(values)
 }
 
-/// Walks the names of nodes down to their parameters.
+/// Descends through node names to parameters.
 fn nodes(
     yaml: &Yaml,
     at: &mut Vec<String>,
@@ -118,7 +118,7 @@ fn nodes(
     Ok(())
 }
 
-/// Walks nested parameter names down to their values.
+/// Descends through nested parameter names to values.
 fn parameters(yaml: &Yaml, prefix: &str, at: &[String], values: &mut Vec<(String, String)>) -> Result<(), ParseError> {
     let mapping = yaml.as_mapping().ok_or_else(|| shape(at, "expected a mapping of parameters"))?;
     for (key, value) in mapping {
@@ -131,14 +131,14 @@ fn parameters(yaml: &Yaml, prefix: &str, at: &[String], values: &mut Vec<(String
             Yaml::Value(Scalar::FloatingPoint(number)) => values.push((name, number.into_inner().to_string())),
             Yaml::Value(Scalar::Boolean(truth)) => values.push((name, truth.to_string())),
             Yaml::Value(Scalar::String(text)) => values.push((name, text.to_string())),
-            // No parameter of this node, but maybe of another that the file is for, too.
+            // Not a parameter of this node, but perhaps of another node that uses the same file.
             _ => values.push((name, "a list, or nothing".to_owned())),
         }
     }
     Ok(())
 }
 
-/// Whether a pattern of node-name tokens matches: `*` is any one token, `**` any number of them.
+/// Whether a pattern of node-name tokens matches: `*` is one token, `**` any number of tokens.
 fn matches(pattern: &[&str], node: &[&str]) -> bool {
     match pattern.split_first() {
         None => node.is_empty(),
@@ -212,14 +212,14 @@ other:
         let nested = format!("{}1{}", "{a: ".repeat(100), "}".repeat(100));
         assert!(problem(&nested).ends_with("nested too deep"));
         assert!(problem(&format!("n: {{ros__parameters: {nested}}}").replace("n:", "squealcast:")).ends_with("deep"));
-        // As deep as a file can be: none of them may take the stack along.
+        // The deepest nesting that fits into a file must not overflow the stack.
         for (start, end) in [("[", ""), ("[", "]"), ("{a: ", ""), ("- ", ""), ("? ", "")] {
             let nested = format!("{}{}", start.repeat(200_000 / start.len()), end.repeat(200_000 / start.len()));
             assert!(parse(&nested, "/", "squealcast").is_err(), "{start}");
         }
     }
 
-    /// Every level doubles what the one before stands for: 2^40 values in some lines.
+    /// Every level doubles the number of values: 2^40 in a few lines.
     #[test]
     fn aliases_are_refused() {
         let mut text = "a0: &a0 [x, x]\n".to_owned();

@@ -1,10 +1,10 @@
-//! ROS 2: the node `/squealcast`, and its mirror, a rig that publishes conditions and hears predictions.
+//! ROS 2: the node `/squealcast`, and its counterpart, a rig that publishes operating points and receives predictions.
 //!
-//! A node that runs for long holds its [`Ros2`] in a child process, [`process::Ros2Process`]: a datagram can make RustDDS allocate
-//! without bound. What ends with its task (`simulate`, `replay`) holds it itself.
+//! A long-running node holds its [`Ros2`] in a child process, [`process::Ros2Process`], because a datagram can make
+//! RustDDS allocate without bound. Short-lived commands (`simulate`, `replay`) hold it themselves.
 //!
-//! Pure Rust DDS underneath (RustDDS): no ROS 2 installation is needed. Publishing works from any thread and never
-//! waits. A peer that was killed is only forgotten after its lease; who listens should look at sequence numbers.
+//! The DDS implementation is RustDDS, in pure Rust: no ROS 2 installation is needed. Publishing works from any thread
+//! and never blocks. A killed peer is only forgotten after its lease, so receivers should check sequence numbers.
 
 mod discovery;
 mod ears;
@@ -31,34 +31,34 @@ use super::ros_args::{RosArgs, USE_SIM_TIME};
 use crate::wire::schema::Topic;
 use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
-/// The name of the node, before remapping.
+/// Name of the node before remapping.
 pub const NODE_NAME: &str = "squealcast";
-/// The name of the mirror's node, before remapping.
+/// Name of the rig's node before remapping.
 pub const SOURCE_NODE_NAME: &str = "rig";
 
-/// How notes about ROS 2 begin.
+/// Prefix of notes about ROS 2 on standard error.
 const NOTE: &str = "ROS 2: ";
 
-/// The largest domain whose ports exist.
+/// The largest domain id whose ports are valid.
 const MAX_DOMAIN_ID: u16 = 232;
 
 /// How to join the ROS 2 network.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Ros2Options {
-    /// 0 to 232; peers of another domain do not exist.
+    /// Domain id, 0 to 232. Peers of other domains are invisible.
     pub domain_id: u16,
-    /// Announces itself on 127.0.0.1 only, and hears what comes in by the loopback interface only.
+    /// Announce on 127.0.0.1 only, and receive through the loopback interface only.
     pub loopback_only: bool,
     /// Names and remappings.
     pub args: RosArgs,
 }
 
 impl Ros2Options {
-    /// The given domain, or that of `ROS_DOMAIN_ID`, or 0; on loopback alone if that is asked for here or by
+    /// The given domain, else that of `ROS_DOMAIN_ID`, else 0. Restricted to loopback if requested here or by
     /// `ROS_AUTOMATIC_DISCOVERY_RANGE` or `ROS_LOCALHOST_ONLY`.
     ///
     /// # Errors
-    /// A domain that is no number or beyond 232; a variable whose value is none, or cannot be done.
+    /// A domain that is not a number or exceeds 232; a variable whose value is invalid or not supported.
     pub fn new(domain_id: Option<u16>, loopback_only: bool, args: RosArgs) -> Result<Self, Ros2Error> {
         let domain_id = match (domain_id, env::var("ROS_DOMAIN_ID")) {
             (Some(domain_id), _) => domain_id,
@@ -95,23 +95,23 @@ pub enum Ros2Error {
     Thread(#[from] std::io::Error),
     #[error("not published on {topic}: {reason}")]
     Publish { topic: &'static str, reason: String },
-    /// What the process of the ROS 2 side says, or why it cannot be started.
+    /// The error reported by the process of the ROS 2 side, or why that cannot be started.
     #[error("{0}")]
     Side(String),
 }
 
-/// Judges a parameter's value before it is taken; the text of a refusal is what the peer gets to read.
+/// Validates a parameter value before it is accepted; the error text is sent to the peer.
 pub type Validate = Box<dyn Fn(&str, f64) -> Result<(), String> + Send + Sync>;
-/// Gets a parameter's value after it was taken.
+/// Receives a parameter value after it was accepted.
 pub type Accepted = Box<dyn Fn(&str, f64) + Send + Sync>;
 
 /// The parameters of the node.
 pub struct Parameters {
-    /// Names and the values they start with (see [`RosArgs::parameters`]).
+    /// Names and initial values (see [`RosArgs::parameters`]).
     pub values: Vec<(String, f64)>,
-    /// Asked for every value, those to start with included.
+    /// Called for every value, including the initial ones.
     pub validate: Validate,
-    /// Gets every value that a peer has set, after it passed; runs on the node's thread.
+    /// Called on the node's thread for every value that a peer has set and `validate` accepted.
     pub accepted: Accepted,
 }
 
@@ -121,8 +121,8 @@ impl Parameters {
         Self { values: Vec::new(), validate: Box::new(|_, _| Ok(())), accepted: Box::new(|_, _| ()) }
     }
 
-    /// Node options with these parameters. Values reach `accepted` only once `started` is set: until then the node
-    /// sets the values it was given.
+    /// Node options with these parameters. `accepted` is only called once `started` is set: before that the node sets
+    /// the initial values.
     fn declare(self, started: Arc<AtomicBool>) -> NodeOptions {
         let Self { values, validate, accepted } = self;
         let options = NodeOptions::new()
@@ -147,11 +147,11 @@ impl Parameters {
     }
 }
 
-/// The node's side: hears operating points and the measured vibration, publishes everything else.
+/// The node's side: receives operating points and the measured vibration, and publishes all other topics.
 pub struct Ros2 {
-    // First: publishers go before the node.
+    // Declared first, because publishers must be dropped before the node.
     prediction: Publisher<Prediction>,
-    /// The publisher before it, while its readers find the present one.
+    /// The previous publisher, kept until its readers have found the present one.
     retired: Option<Publisher<Prediction>>,
     max_unanswered: i32,
     rig: Publisher<RigInfo>,
@@ -163,11 +163,11 @@ pub struct Ros2 {
 }
 
 impl Ros2 {
-    /// Joins the network and starts the node's thread; every operating point goes to `sink`, every measured vibration to
-    /// `vibration`, on that thread.
+    /// Joins the network and starts the node's thread. On that thread `sink` gets every operating point and `vibration`
+    /// every measured vibration.
     ///
     /// # Errors
-    /// Names that are none, a value that `validate` refuses, or whatever DDS refuses.
+    /// Invalid names, an initial value that `validate` refuses, or an error of DDS.
     pub fn start(
         options: &Ros2Options,
         parameters: Parameters,
@@ -177,7 +177,8 @@ impl Ros2 {
         Self::start_with(options, parameters, MAX_UNANSWERED, sink, vibration)
     }
 
-    /// As [`Self::start`]; publishing a prediction fails once a reader has left `max_unanswered` unacknowledged.
+    /// As [`Self::start`]. Publishing a prediction fails once a reader has left `max_unanswered` of them
+    /// unacknowledged.
     fn start_with(
         options: &Ros2Options,
         parameters: Parameters,
@@ -216,32 +217,33 @@ impl Ros2 {
         })
     }
 
-    /// Publishes a prediction, without waiting.
+    /// Publishes a prediction without blocking.
     ///
     /// # Errors
-    /// [`Ros2Error::Publish`], as for the others: more than a minute's worth waits for a reader that does not answer.
+    /// [`Ros2Error::Publish`], as for the other topics: a reader has left more than a minute's worth of messages
+    /// unacknowledged.
     pub fn publish_prediction(&self, prediction: &Prediction) -> Result<(), Ros2Error> {
         publish(&self.prediction, topic::PREDICTION, prediction)
     }
 
-    /// Puts another publisher of predictions in the place of the present one, which has no room left because a reader does not
-    /// acknowledge. The other readers take a moment to find it; the present one repairs until then, when
-    /// [`Self::retire`] drops it.
+    /// Replaces the publisher of predictions, whose history is full because a reader does not acknowledge. The other
+    /// readers take a moment to find the new publisher. Until [`Self::retire`] drops the old one, it continues to
+    /// retransmit lost samples.
     ///
     /// # Errors
-    /// Whatever DDS refuses.
+    /// An error of DDS.
     pub fn renew_prediction_publisher(&mut self) -> Result<(), Ros2Error> {
         let renewed = prediction_publisher(&mut self.link, self.max_unanswered)?;
         self.retired = Some(std::mem::replace(&mut self.prediction, renewed));
         Ok(())
     }
 
-    /// Drops the publisher of predictions before the present one, and what it kept for readers.
+    /// Drops the previous publisher of predictions with the samples it kept for its readers.
     pub fn retire(&mut self) {
         self.retired = None;
     }
 
-    /// Publishes what the node predicts for; kept for readers that come later.
+    /// Publishes the description of the rig, which is kept for late subscribers.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -249,7 +251,7 @@ impl Ros2 {
         publish(&self.rig, topic::RIG, rig)
     }
 
-    /// Publishes what else shaped predictions.
+    /// Publishes a session event.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -257,7 +259,7 @@ impl Ros2 {
         publish(&self.session_event, topic::SESSION_EVENT, event)
     }
 
-    /// Publishes how predictions change with conditions and contact.
+    /// Publishes sensitivities.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -265,12 +267,12 @@ impl Ros2 {
         publish(&self.sensitivity, topic::SENSITIVITY, sensitivity)
     }
 
-    /// How many readers the sensitivities have, those included that were killed less than their lease ago.
+    /// Number of readers of the sensitivities, including killed ones whose lease has not expired.
     pub fn sensitivity_readers(&self) -> usize {
         self.sensitivity.get_subscription_count(self.link.node())
     }
 
-    /// Publishes how the node does.
+    /// Publishes diagnostics.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -278,13 +280,13 @@ impl Ros2 {
         publish(&self.diagnostics, topic::DIAGNOSTICS, diagnostics)
     }
 
-    /// How many readers the predictions have, those included that were killed less than their lease ago. A [`Ros2Source`] has
-    /// two: a reliable one and a best-effort one.
+    /// Number of readers of the predictions, including killed ones whose lease has not expired. A [`Ros2Source`] counts
+    /// twice: it has a reliable and a best-effort reader.
     pub fn prediction_readers(&self) -> usize {
         self.prediction.get_subscription_count(self.link.node())
     }
 
-    /// How many readers a topic has that is published here, those included that were killed less than their lease ago.
+    /// Number of readers of a topic published here, including killed ones whose lease has not expired.
     pub fn readers(&self, topic: Topic) -> usize {
         let node = self.link.node();
         match topic {
@@ -298,18 +300,18 @@ impl Ros2 {
         }
     }
 
-    /// How many publishers of operating points are known, those included that were killed less than their lease ago.
-    /// What a peer sends before it is known here may be lost.
+    /// Number of known publishers of operating points, including killed ones whose lease has not expired. Messages sent
+    /// by a peer before it is known here may be lost.
     pub fn operating_point_writers(&self) -> usize {
         self.link.writers()
     }
 
-    /// What was counted of the operating points so far.
+    /// Counts of operating points so far.
     pub fn counts(&self) -> Counts {
         self.link.counts()
     }
 
-    /// A number that grows ten times a second while the thread that hears is well.
+    /// A counter that grows ten times a second while the receiving thread is running.
     pub fn beats(&self) -> u64 {
         self.beats.load(Ordering::Relaxed)
     }
@@ -319,11 +321,11 @@ impl Ros2 {
         self.link.node().fully_qualified_name()
     }
 
-    /// Leaves the network; dropping does the same.
+    /// Leaves the network, as dropping does.
     pub fn stop(self) {}
 }
 
-/// The rig's side: publishes operating points and its measured vibration, hears predictions.
+/// The rig's side: publishes operating points and measured vibration, receives predictions.
 pub struct Ros2Source {
     operating_point: Publisher<OperatingPoint>,
     vibration: Publisher<Vibration>,
@@ -331,10 +333,10 @@ pub struct Ros2Source {
 }
 
 impl Ros2Source {
-    /// Joins the network and starts the node's thread; every prediction goes to `sink`, on that thread.
+    /// Joins the network and starts the node's thread, on which `sink` gets every prediction.
     ///
     /// # Errors
-    /// Names that are none, or whatever DDS refuses.
+    /// Invalid names, or an error of DDS.
     pub fn start(
         options: &Ros2Options,
         sink: impl FnMut(Heard<Prediction>) + Send + 'static,
@@ -348,7 +350,7 @@ impl Ros2Source {
         Ok(Self { operating_point, vibration, link })
     }
 
-    /// Publishes an operating point, without waiting.
+    /// Publishes an operating point without blocking.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -356,7 +358,7 @@ impl Ros2Source {
         publish(&self.operating_point, topic::OPERATING_POINT, point)
     }
 
-    /// Publishes a measured vibration, without waiting.
+    /// Publishes a measured vibration without blocking.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -364,28 +366,28 @@ impl Ros2Source {
         publish(&self.vibration, topic::VIBRATION, vibration)
     }
 
-    /// How many readers the operating points have, those included that were killed less than their lease ago. A node has two:
-    /// a reliable one and a best-effort one.
+    /// Number of readers of the operating points, including killed ones whose lease has not expired. A node counts
+    /// twice: it has a reliable and a best-effort reader.
     pub fn readers(&self) -> usize {
         self.operating_point.get_subscription_count(self.link.node())
     }
 
-    /// How many readers the vibration has, those included that were killed less than their lease ago; a node has two.
+    /// Number of readers of the vibration, including killed ones whose lease has not expired. A node counts twice.
     pub fn vibration_readers(&self) -> usize {
         self.vibration.get_subscription_count(self.link.node())
     }
 
-    /// How many publishers of predictions are known, those included that were killed less than their lease ago.
+    /// Number of known publishers of predictions, including killed ones whose lease has not expired.
     pub fn prediction_writers(&self) -> usize {
         self.link.writers()
     }
 
-    /// What was counted of the predictions so far.
+    /// Counts of predictions so far.
     pub fn counts(&self) -> Counts {
         self.link.counts()
     }
 
-    /// Leaves the network; dropping does the same.
+    /// Leaves the network, as dropping does.
     pub fn stop(self) {}
 }
 
@@ -396,7 +398,7 @@ fn prediction_publisher(
     link.publisher(topic::PREDICTION, ours("Prediction"), Durability::Volatile, max_unanswered)
 }
 
-/// A type of `squealcast_msgs`.
+/// A message type of `squealcast_msgs`.
 fn ours(name: &str) -> MessageTypeName {
     MessageTypeName::new("squealcast_msgs", name)
 }
@@ -407,7 +409,7 @@ fn publish<M: Serialize + Clone>(publisher: &Publisher<M>, topic: &'static str, 
         .map_err(|error| Ros2Error::Publish { topic, reason: error.forget_data().to_string() })
 }
 
-/// Shows that the thread it runs on is not held up.
+/// Counts up while the thread it runs on is not blocked.
 async fn beat(beats: &AtomicU64) {
     loop {
         beats.fetch_add(1, Ordering::Relaxed);
@@ -415,7 +417,7 @@ async fn beat(beats: &AtomicU64) {
     }
 }
 
-/// Everything heard here came over ROS 2.
+/// A message received over ROS 2 now.
 fn heard<M>(message: M) -> Heard<M> {
     Heard::now(Bus::Ros2, message)
 }

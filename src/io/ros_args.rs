@@ -1,8 +1,8 @@
 //! ROS 2 command-line arguments: `--ros-args -r from:=to -p name:=value --params-file F ... --`.
 //!
-//! Written here because it is little, and the crate for it, `ros2args`, brings a regex engine along. The rules are those
-//! of rcl: an argument for one node carries its name before the first colon, later arguments win over earlier ones, and
-//! the first remapping rule that matches is the one that counts.
+//! Implemented here because it is little code, whereas the crate `ros2args` depends on a regex engine. The rules are
+//! those of rcl: an argument for one node begins with that node's name and a colon, later arguments override earlier
+//! ones, and the first matching remapping rule applies.
 
 use std::path::PathBuf;
 
@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use super::params_file::{self, ParamsFileError};
 
-/// What is wrong with ROS arguments.
+/// An invalid ROS argument.
 #[derive(Debug, Error)]
 pub enum RosArgsError {
     #[error("unknown ROS argument {0:?}")]
@@ -33,13 +33,13 @@ pub enum RosArgsError {
 /// A remapping rule.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Rule {
-    /// Only for the node of this name.
+    /// The node the rule is for; `None` for all nodes.
     node: Option<String>,
     from: String,
     to: String,
 }
 
-/// Where parameter values come from, in the order they were given.
+/// A source of parameter values; sources are kept in the order given.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 enum ParameterSource {
     Value { node: Option<String>, name: String, value: String },
@@ -54,11 +54,11 @@ pub struct RosArgs {
 }
 
 impl RosArgs {
-    /// Takes the ROS arguments out of a command line: those between each `--ros-args` and the next `--` or the end.
-    /// Returns them and the rest, which is for the program itself.
+    /// Separates the ROS arguments from a command line: those between each `--ros-args` and the next `--` or the end.
+    /// Returns them and the remaining arguments, which are for the program itself.
     ///
     /// # Errors
-    /// The first argument that is unknown or malformed.
+    /// The first unknown or malformed argument.
     pub fn split(args: impl IntoIterator<Item = String>) -> Result<(Self, Vec<String>), RosArgsError> {
         let mut ros = Self::default();
         let mut rest = Vec::new();
@@ -78,7 +78,7 @@ impl RosArgs {
             let mut value = || args.next().ok_or_else(|| RosArgsError::ValueMissing(arg.clone()));
             match arg.as_str() {
                 "--" => return Ok(()),
-                // Sections may follow each other without a `--`.
+                // Consecutive sections need no `--` between them.
                 "--ros-args" => {}
                 "-r" | "--remap" => self.rules.push(Rule::parse(&value()?)?),
                 "-p" | "--param" => self.sources.push(parse_parameter(&value()?)?),
@@ -94,7 +94,7 @@ impl RosArgs {
         Ok(())
     }
 
-    /// The same, but the node's name is `name` whatever the rules say.
+    /// The same arguments with the node renamed to `name`, overriding its `__node` rules.
     pub fn renamed(mut self, name: &str) -> Self {
         self.rules.retain(|rule| !matches!(rule.from.as_str(), "__node" | "__name"));
         self.rules.push(Rule { node: None, from: "__node".to_owned(), to: name.to_owned() });
@@ -106,7 +106,7 @@ impl RosArgs {
         self.special(default, &["__node", "__name"]).unwrap_or(default).to_owned()
     }
 
-    /// The namespace of the node of this name after `__ns` rules; always absolute, without a slash at its end.
+    /// The namespace of the node with this name after `__ns` rules; absolute, without a trailing slash.
     pub fn namespace(&self, node_name: &str, default: &str) -> String {
         let namespace = self.special(node_name, &["__ns"]).unwrap_or(default);
         format!("/{}", namespace.trim_matches('/'))
@@ -117,7 +117,8 @@ impl RosArgs {
         Some(&rule.to)
     }
 
-    /// The name of a topic after remapping, for a node of this namespace and name (its own remapping done). Names may be absolute, relative or private (`~/`); what comes back is absolute.
+    /// The absolute name of a topic after remapping, for a node with this namespace and name, to which its own
+    /// remapping rules have been applied. Topics may be absolute, relative or private (`~/topic`).
     pub fn topic(&self, topic: &str, namespace: &str, node: &str) -> String {
         let full = expand(topic, namespace, node);
         self.rules
@@ -127,12 +128,12 @@ impl RosArgs {
             .map_or(full, |rule| expand(&rule.to, namespace, node))
     }
 
-    /// Values for the declared parameters: their defaults, then whatever files and `-p` say for this node, in the order they
-    /// were given. What was not declared is ignored, as rclcpp does, for launch files give parameters to every node; it comes
-    /// back beside the values, as sentences to be said, so that a misspelt parameter does not go unnoticed.
+    /// Values for the declared parameters: their defaults, then files and `-p` for this node, in the order given.
+    /// Undeclared parameters are ignored as in rclcpp, because launch files give parameters to every node. They are
+    /// returned as sentences to report, so that a misspelt name does not go unnoticed.
     ///
     /// # Errors
-    /// A file that cannot be read, a declared parameter whose value is no number.
+    /// A file cannot be read, or the value of a declared parameter is not a number.
     pub fn parameters(
         &self,
         declared: &[(&str, f64)],
@@ -177,10 +178,10 @@ impl RosArgs {
 
 const LOG_SWITCHES: [&str; 3] = ["rosout-logs", "stdout-logs", "external-lib-logs"];
 
-/// The parameter every node has; ours takes no simulated time.
+/// A parameter that every ROS 2 node has; this node does not support simulated time.
 pub(super) const USE_SIM_TIME: &str = "use_sim_time";
 
-/// `LEVEL` or `LOGGER:=LEVEL`. It has no effect: this node says the same at every level.
+/// Checks `LEVEL` or `LOGGER:=LEVEL`. It has no effect: the node logs the same at every level.
 fn check_log_level(text: &str) -> Result<(), RosArgsError> {
     let level = text.split_once(":=").map_or(text, |(_, level)| level);
     if ["DEBUG", "INFO", "WARN", "ERROR", "FATAL"].iter().any(|known| level.eq_ignore_ascii_case(known)) {
@@ -215,7 +216,7 @@ fn parse_parameter(text: &str) -> Result<ParameterSource, RosArgsError> {
     Ok(ParameterSource::Value { node, name: name.to_owned(), value: value.to_owned() })
 }
 
-/// The node an argument is for, if it says one, and the rest: `node:rest`. The colon of `scheme://` is none.
+/// The node that an argument is for, if given, and the rest: `node:rest`. The colon of `scheme://` does not count.
 fn split_node(text: &str) -> (Option<String>, &str) {
     match text.split_once(':') {
         Some((node, rest)) if !rest.starts_with("//") && !node.is_empty() => (Some(node.to_owned()), rest),

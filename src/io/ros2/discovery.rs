@@ -1,6 +1,6 @@
-//! ROS 2's environment variables about who is discovered: `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`,
-//! `ROS_STATIC_PEERS`. The rules are those of rcl. RustDDS discovers by multicast and on this machine; what it cannot do is
-//! refused or said.
+//! ROS 2 environment variables for discovery: `ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`,
+//! `ROS_STATIC_PEERS`, with the rules of rcl. RustDDS discovers by multicast and on this machine. Settings it does not
+//! support are refused or reported.
 
 use super::Ros2Error;
 
@@ -8,20 +8,20 @@ const RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
 const LOCALHOST_ONLY: &str = "ROS_LOCALHOST_ONLY";
 const STATIC_PEERS: &str = "ROS_STATIC_PEERS";
 
-/// Who is discovered.
+/// Which participants are discovered.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Discovery {
-    /// Participants on this machine alone.
+    /// Participants on this machine only.
     pub loopback_only: bool,
-    /// What was asked for and is not done.
+    /// Requested settings that are not supported.
     pub warnings: Vec<String>,
 }
 
 impl Discovery {
-    /// As the variables say; an empty one says nothing.
+    /// The settings of the environment variables; an empty variable counts as unset.
     ///
     /// # Errors
-    /// A value that is none, and `OFF`, which RustDDS cannot do.
+    /// An invalid value, or `OFF`, which RustDDS does not support.
     pub(super) fn from_variables(variable: impl Fn(&str) -> Option<String>) -> Result<Self, Ros2Error> {
         let value =
             |name: &'static str| variable(name).map(|text| text.trim().to_owned()).filter(|text| !text.is_empty());
@@ -30,7 +30,7 @@ impl Discovery {
         };
         let mut discovery = Self::default();
         match value(LOCALHOST_ONLY) {
-            // It wins over the others, as in rcl.
+            // It overrides the others, as in rcl.
             Some(text) if text == "1" => {
                 discovery.loopback_only = true;
                 return Ok(discovery);

@@ -1,4 +1,5 @@
-//! Hearing every publisher of a topic: the reliable ones and, unlike a reliable subscription by itself, the best-effort ones.
+//! Receives from every publisher of a topic, reliable or best-effort. A reliable subscription alone would not match
+//! best-effort publishers.
 
 use std::collections::HashMap;
 
@@ -6,22 +7,23 @@ use ros2_client::{Gid, MessageInfo, Node, ReadError, Subscription};
 use rustdds::{DomainParticipant, QosPolicies};
 use serde::de::{Deserialize, DeserializeOwned, Deserializer};
 
-/// At most this many publishers are remembered; beyond that all are looked up again.
+/// Number of publishers that are remembered; beyond it all are looked up again.
 const MAX_PUBLISHERS: usize = 256;
 
 /// A reliable and a best-effort subscription to one topic.
 ///
-/// RustDDS keeps the samples of a topic in one cache: the best-effort subscription is handed those of reliable publishers too,
-/// at once and out of order where some were lost. They are dropped here, for the reliable one delivers them.
+/// RustDDS keeps the samples of a topic in one cache. The best-effort subscription therefore gets those of reliable
+/// publishers too, immediately and out of order after a loss. They are dropped here, because the reliable subscription
+/// delivers them.
 pub(super) struct Ears<M> {
     reliable: Subscription<M>,
     best_effort: Subscription<Tried<M>>,
-    /// What the reliable subscription asks of a publisher.
+    /// The quality of service that the reliable subscription requests.
     requested: QosPolicies,
     participant: DomainParticipant,
 }
 
-/// Which publishers the reliable subscription refuses, as far as they were looked up.
+/// Publishers looked up so far, and whether the reliable subscription rejects them.
 pub(super) type Refused = HashMap<Gid, bool>;
 
 impl<M: DeserializeOwned + 'static> Ears<M> {
@@ -33,10 +35,11 @@ impl<M: DeserializeOwned + 'static> Ears<M> {
         Self { reliable, best_effort, requested, participant }
     }
 
-    /// The next message, each once: in order and without gaps from a reliable publisher, as it comes from any other.
+    /// The next message; none is returned twice. Messages of a reliable publisher come in order and without gaps,
+    /// others as they arrive.
     ///
     /// # Errors
-    /// A sample that is no message, or a failure of DDS.
+    /// A sample that cannot be decoded, or an error of DDS.
     pub(super) async fn next(&self, refused: &mut Refused) -> Result<(M, MessageInfo), ReadError> {
         loop {
             tokio::select! {
@@ -52,7 +55,7 @@ impl<M: DeserializeOwned + 'static> Ears<M> {
         }
     }
 
-    /// How many publishers are known. The best-effort subscription refuses none of them.
+    /// Number of known publishers. The best-effort subscription matches all of them.
     pub(super) fn publishers(&self, node: &Node) -> usize {
         self.best_effort.get_publisher_count(node)
     }
@@ -61,7 +64,7 @@ impl<M: DeserializeOwned + 'static> Ears<M> {
         if let Some(&refused) = refused.get(&publisher) {
             return refused;
         }
-        // Samples are only taken from publishers that were discovered; one that is gone by now is not remembered.
+        // Samples only come from discovered publishers. A publisher that has disappeared since is not remembered.
         let writers = self.participant.discovered_writers();
         let Some(writer) = writers.iter().find(|writer| Gid::from(writer.publication_topic_data.key) == publisher)
         else {
@@ -76,7 +79,7 @@ impl<M: DeserializeOwned + 'static> Ears<M> {
     }
 }
 
-/// A message, or nothing where the sample is none: an error would not say whose sample it is.
+/// A message, or nothing if the sample cannot be decoded. An error would not tell which publisher the sample came from.
 pub(super) struct Tried<M>(Option<M>);
 
 impl<'de, M: Deserialize<'de>> Deserialize<'de> for Tried<M> {

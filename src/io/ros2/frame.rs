@@ -1,6 +1,6 @@
 //! The protocol between a node and its ROS 2 side: frames over a local stream socket.
 //!
-//! A frame is its length (`u32`, little endian) followed by the CDR bytes of a [`ToSide`] or a [`FromSide`].
+//! A frame is its length (`u32`, little-endian) followed by the CDR bytes of a [`ToSide`] or a [`FromSide`].
 
 use std::borrow::Cow;
 use std::io::{self, ErrorKind, Read};
@@ -14,9 +14,9 @@ use crate::io::clock::Reading;
 use crate::io::heard::Counts;
 use crate::wire::{self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration};
 
-/// The longest frame the node accepts from its ROS 2 side, bytes.
+/// Longest frame that the node accepts from its ROS 2 side, bytes.
 pub(super) const MAX_FROM_SIDE: usize = 1 << 16;
-/// The longest frame the ROS 2 side accepts from its node, bytes.
+/// Longest frame that the ROS 2 side accepts from its node, bytes.
 pub(super) const MAX_TO_SIDE: usize = 1 << 24;
 const LENGTH_BYTES: usize = 4;
 
@@ -97,7 +97,7 @@ pub(super) fn encode(frame: &impl Serialize) -> Result<Vec<u8>, FrameError> {
     Ok(bytes)
 }
 
-/// What reading a frame led to.
+/// Result of reading a frame.
 #[derive(Debug)]
 pub(super) enum Next<F> {
     Frame(F),
@@ -145,7 +145,7 @@ impl<R: Read> Frames<R> {
         Ok(self.take()?.map_or(Next::Nothing, Next::Frame))
     }
 
-    /// A whole frame among the bytes already read.
+    /// Takes a complete frame from the bytes already read.
     fn take<F: DeserializeOwned>(&mut self) -> Result<Option<F>, FrameError> {
         let waiting = &self.bytes[self.begin..];
         let Some((length, body)) = waiting.split_first_chunk::<LENGTH_BYTES>() else { return Ok(None) };
@@ -174,7 +174,7 @@ mod tests {
         }
     }
 
-    /// One byte at a time.
+    /// Delivers one byte at a time.
     struct Trickle<'a>(&'a [u8]);
 
     impl Read for Trickle<'_> {

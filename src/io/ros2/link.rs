@@ -1,4 +1,4 @@
-//! One ROS 2 node with its subscriptions, on a thread of its own.
+//! One ROS 2 node with its subscriptions, on its own thread.
 
 use std::net::Ipv4Addr;
 use std::pin::Pin;
@@ -21,18 +21,20 @@ use super::qos_conflicts::QosConflicts;
 use super::{Ros2Error, Ros2Options, heard};
 use crate::wire::topic;
 
-/// How many messages may wait for the thread that hears a subscription; RustDDS acknowledges what does not fit, and drops it.
-/// A reliable subscription hands over nothing until a lost sample was sent again, and everything at once then. Fast DDS sends
-/// it again with its next heartbeat, 3 s later by default: at 2 kHz 6000 messages wait for that.
+/// Samples that may wait for the thread that reads a subscription; RustDDS acknowledges samples beyond it and drops
+/// them. After a loss a reliable subscription delivers nothing until the sample is retransmitted, and then everything
+/// at once. Fast DDS retransmits with its next heartbeat, by default after 3 s: at 2 kHz, 6000 samples wait for that.
 const MAX_WAITING: i32 = 8192;
-/// How many messages may wait for the answer of a reader before publishing fails. A killed reader is only forgotten
-/// after its lease, under a minute as a rule; RustDDS's 8192 would be full after 16 s at 500 Hz, for all readers.
+/// Messages that a reader may leave unacknowledged before publishing fails. A killed reader is only forgotten after its
+/// lease, usually less than a minute. RustDDS's default of 8192 would be exhausted after 16 s at 500 Hz, for all
+/// readers.
 pub(super) const MAX_UNANSWERED: i32 = 1 << 15;
 
-/// What the thread of a node does for one subscription.
+/// The future that reads one subscription on the node's thread.
 pub(super) type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
 
-/// A node, and the thread that serves its parameters and hears its topic of messages `M`, and others aside.
+/// A node, and the thread that serves its parameters, reads its main topic with messages `M` and any other
+/// subscriptions.
 pub(super) struct Link<M> {
     options: Ros2Options,
     name: NodeName,
@@ -57,7 +59,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
             reason: error.to_string(),
         };
         let name = NodeName::new(&namespace, &base_name).map_err(bad_name)?;
-        // The names of its services begin with it, and their rules are stricter.
+        // The names of its services begin with this name and must satisfy stricter rules.
         Name::parse(&full_name).map_err(bad_name)?;
 
         let mut participant = DomainParticipantBuilder::new(options.domain_id);
@@ -82,7 +84,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         })
     }
 
-    /// A reliable publisher that never waits; publishing fails once a reader has left `max_unanswered` messages
+    /// A reliable publisher that never blocks. Publishing fails once a reader has left `max_unanswered` messages
     /// unacknowledged.
     pub(super) fn publisher<P: Serialize>(
         &mut self,
@@ -93,7 +95,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
     ) -> Result<Publisher<P>, Ros2Error> {
         let limits =
             ResourceLimits { max_samples: max_unanswered, max_instances: 1, max_samples_per_instance: max_unanswered };
-        // What is kept for readers that come later is the latest of it.
+        // Late subscribers get the latest message only.
         let depth = if durability == Durability::TransientLocal { 1 } else { topic::DEPTH };
         let qos = qos(durability, RELIABLE, depth).resource_limits(limits).build();
         let (topic, name) = self.topic(name, &kind, &qos)?;
@@ -101,7 +103,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         self.node.create_publisher(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
     }
 
-    /// Subscribes and starts the thread, which hears what is in `aside` too.
+    /// Subscribes and starts the thread, which also reads the subscriptions in `aside`.
     pub(super) fn listen(
         &mut self,
         topic: &'static str,
@@ -128,7 +130,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
                     if spinner.spin().await.is_err() {
                         counters.failure();
                     }
-                    // Parameters are gone, but messages go on.
+                    // The parameter service has ended, but messages are still received.
                     std::future::pending::<()>().await
                 };
                 tokio::select! {
@@ -143,8 +145,8 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         Ok(())
     }
 
-    /// Subscribes to another topic, of messages without numbers, for the thread of [`Link::listen`]. They are not in its
-    /// counts.
+    /// Adds a subscription to another topic, whose messages have no sequence numbers, to the thread of
+    /// [`Link::listen`]. Its messages are not counted.
     pub(super) fn aside<N: DeserializeOwned + Send + Sync + 'static>(
         &mut self,
         topic: &'static str,
@@ -169,13 +171,13 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         self.conflicts.subscribed(&best_effort, &name);
         let failed =
             |error: ros2_client::CreateError| Ros2Error::Topic { name: name.clone(), reason: error.to_string() };
-        // The reliable one first: a publisher that the other knows is known to it, too.
+        // The reliable one first: it then knows every publisher that the other one knows.
         let reliable = self.node.create_subscription(&reliable, None).map_err(failed)?;
         let best_effort = self.node.create_subscription(&best_effort, None).map_err(failed)?;
         Ok(Ears::new((reliable, requested), best_effort, self.context.domain_participant()))
     }
 
-    /// A topic, remapped, and its name.
+    /// The remapped topic, and its name.
     fn topic(
         &self,
         name: &'static str,
@@ -186,7 +188,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         let bad_name =
             |error: ros2_client::names::NameError| Ros2Error::Name { name: full.clone(), reason: error.to_string() };
         let name = Name::parse(&full).map_err(bad_name)?;
-        // Not by the node: it would not let us limit what waits for readers.
+        // Not created through the node, which offers no limit on unacknowledged samples.
         self.context
             .domain_participant()
             .create_topic(name.to_dds_name("rt", &self.name, ""), kind.dds_msg_type(), qos, TopicKind::NoKey)
@@ -213,7 +215,7 @@ impl<M> Drop for Link<M> {
     fn drop(&mut self) {
         if let Some((stop, thread)) = self.running.take() {
             let _ = stop.send(());
-            // A sink that panicked has said so on its own thread.
+            // A panic of the sink was reported on that thread.
             let _ = thread.join();
         }
     }
@@ -248,7 +250,7 @@ async fn hear<M: DeserializeOwned + 'static>(
     }
 }
 
-/// Reliable, and publishing never waits.
+/// Reliable, and publishing never blocks.
 const RELIABLE: Reliability = Reliability::Reliable { max_blocking_time: Duration::ZERO };
 
 fn qos(durability: Durability, reliability: Reliability, depth: i32) -> QosPolicyBuilder {

@@ -1,8 +1,8 @@
-//! Keeps the UDP sockets of this process on the loopback interface.
+//! Restricts the UDP sockets of this process to the loopback interface.
 //!
-//! RustDDS can be told to announce itself on 127.0.0.1 only, but it binds its sockets to 0.0.0.0, and whoever reaches the
-//! machine reaches them. Binding the sockets to the device `lo` (`SO_BINDTODEVICE`, Linux 5.7 or later without
-//! privileges) has the kernel drop whatever came in by another interface.
+//! RustDDS can announce itself on 127.0.0.1 only, but it binds its sockets to 0.0.0.0, where every machine on the
+//! network can reach them. With the sockets bound to the device `lo` (`SO_BINDTODEVICE`, Linux 5.7 or later without
+//! privileges), the kernel drops everything that arrives through other interfaces.
 
 use std::fs;
 use std::io;
@@ -10,16 +10,16 @@ use std::os::fd::{BorrowedFd, RawFd};
 
 use socket2::{SockRef, Type};
 
-/// Binds every UDP socket of this process to `lo`. What arrived between the socket's creation and now is still read.
+/// Binds every UDP socket of this process to `lo`. Datagrams that arrived before are still read.
 ///
 /// # Errors
 /// `/proc` is not mounted, or the kernel refuses.
 pub(super) fn keep_to_loopback() -> io::Result<()> {
-    // Collected first: the directory is itself an open file.
+    // Collected first, because the open directory is itself a descriptor.
     let names = fs::read_dir("/proc/self/fd")?.map(|entry| Ok(entry?.file_name())).collect::<io::Result<Vec<_>>>()?;
     for number in names.iter().filter_map(|name| name.to_str()?.parse::<RawFd>().ok()) {
-        // SAFETY: the descriptor is only asked what it is, and bound to a device if it is a UDP socket. One that was closed
-        // meanwhile gives EBADF; nothing is closed here.
+        // SAFETY: the descriptor is only queried, and bound to a device if it is a UDP socket. A descriptor closed in
+        // the meantime gives EBADF; none is closed here.
         let descriptor = unsafe { BorrowedFd::borrow_raw(number) };
         let socket = SockRef::from(&descriptor);
         let is_internet = || socket.local_addr().is_ok_and(|address| address.is_ipv4() || address.is_ipv6());

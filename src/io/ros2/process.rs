@@ -1,6 +1,6 @@
-//! The ROS 2 side of a node as a process of its own, seen from the node: started, watched, and started again.
+//! The ROS 2 side of a node as a child process, as the node sees it: started, watched and restarted.
 //!
-//! Nothing of the node waits for it: what is published goes into a bounded queue.
+//! The node never waits for it: messages to publish go into a bounded queue.
 
 use std::borrow::Cow;
 use std::io::{BufRead, BufReader, BufWriter, Read, Write};
@@ -22,57 +22,59 @@ use super::{NOTE, Ros2Error, Ros2Options};
 use crate::io::heard::{Bus, Counts, Heard};
 use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
-/// The command that is the ROS 2 side of a node.
+/// The command that runs the ROS 2 side of a node.
 pub const COMMAND: &str = "ros2-side";
-/// This program, even where its file was replaced meanwhile.
+/// This program, even if its file has been replaced since.
 const THIS_PROGRAM: &str = "/proc/self/exe";
-/// Messages that may wait for the ROS 2 side; what comes then is lost and counted.
+/// Capacity of the queue to the ROS 2 side; messages beyond it are lost and counted.
 const QUEUE: usize = 4096;
-/// The longest wait for anything from the ROS 2 side before the next look at the state of affairs.
+/// Read timeout of the socket, after which the supervisor checks the state of the process.
 const READ_TIMEOUT: Duration = Duration::from_millis(100);
-/// After this many timeouts in a row the ROS 2 side counts as hanging: 10 s while it joins the network, 5 s then. Counted
-/// in timeouts, not by a clock, so that a pause of the node itself is no fault of its ROS 2 side.
+/// Number of consecutive timeouts after which the ROS 2 side counts as hanging: 10 s while it joins the network, 5 s
+/// later. Timeouts are counted instead of time, so that a pause of the node itself is not taken for a fault of its ROS
+/// 2 side.
 const MAX_TIMEOUTS_JOINING: u32 = 100;
 const MAX_TIMEOUTS: u32 = 50;
-/// How long the ROS 2 side may take to leave the network.
+/// Time that the ROS 2 side may take to leave the network.
 const LEAVE_WITHIN: Duration = Duration::from_millis(500);
-/// Pause before the second start in a row; it doubles up to the longest. After a run of `STEADY` the next start is at once.
+/// Pause before the second consecutive start. It doubles up to `LONGEST_PAUSE`; after a run of `STEADY` the next start
+/// is immediate.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 const STEADY: Duration = Duration::from_secs(10);
-/// How long the first start may be tried again when the ROS 2 side falls before it has joined the network.
+/// Time within which the first start is repeated if the ROS 2 side fails before it has joined the network.
 const START_WITHIN: Duration = Duration::from_secs(10);
-/// How much of the end of its standard error is kept, bytes.
+/// Bytes kept of the end of its standard error.
 const MAX_LAST_WORDS: usize = 500;
 
-/// What the node does with what its ROS 2 side hears; called on a thread that may not wait.
+/// Callbacks for what the ROS 2 side receives. They run on a thread that must not block.
 pub struct Sinks {
     pub input: Box<dyn FnMut(Heard<OperatingPoint>) + Send>,
     pub vibration: Box<dyn FnMut(Heard<Vibration>) + Send>,
     /// A peer set a parameter.
     pub parameter: Box<dyn FnMut(&str, f64) + Send>,
-    /// The ROS 2 side fell, and why; another is being started.
+    /// The ROS 2 side failed, and why; it is being restarted.
     pub fell: Box<dyn FnMut(&str) + Send>,
 }
 
-/// How the ROS 2 side has fared.
+/// State of the ROS 2 side.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Health {
-    /// It is there and has joined the network.
+    /// Whether it is running and has joined the network.
     pub up: bool,
-    /// How often it fell, and why it did last.
+    /// Number of failures, and the latest reason.
     pub falls: u64,
     pub last_fall: String,
     /// Messages that DDS refused to publish, and the latest reason.
     pub refused: u64,
     pub last_refusal: String,
-    /// Its process; 0 before the first.
+    /// Its process id; 0 before the first start.
     pub process_id: u32,
 }
 
-/// The ROS 2 side of a node: hears operating points and the measured vibration, publishes everything else.
+/// The ROS 2 side of a node: receives operating points and the measured vibration, and publishes all other topics.
 pub struct Ros2Process {
-    /// `None` once it is to end.
+    /// `None` once it has to end.
     queue: Option<Sender<Vec<u8>>>,
     shared: Arc<Shared>,
     supervisor: Option<JoinHandle<()>>,
@@ -84,16 +86,16 @@ struct Shared {
     stopping: AtomicBool,
 }
 
-/// What is known of the ROS 2 side.
+/// What is known about the ROS 2 side.
 #[derive(Default)]
 struct Seen {
     health: Health,
     status: Status,
-    /// Of the processes before the present one.
+    /// Counts of the previous processes.
     counts_before: Counts,
     refused_before: u64,
     full_name: String,
-    /// Sent to every new one: readers that come later want it.
+    /// The rig message, sent to every new process for its late subscribers.
     rig: Option<Vec<u8>>,
 }
 
@@ -111,12 +113,12 @@ impl Ros2Process {
     /// Starts the ROS 2 side and waits until it has joined the network.
     ///
     /// # Errors
-    /// As [`super::Ros2::start`], or the process cannot be started.
+    /// As [`super::Ros2::start`]; the process cannot be started.
     pub fn start(options: &Ros2Options, parameters: Vec<(String, f64)>, sinks: Sinks) -> Result<Self, Ros2Error> {
         Self::start_program(THIS_PROGRAM.into(), options, parameters, sinks)
     }
 
-    /// As [`Self::start`]; `program` is the one that has the [`COMMAND`].
+    /// As [`Self::start`], with `program` as the executable that has the [`COMMAND`].
     ///
     /// # Errors
     /// As [`Self::start`].
@@ -133,7 +135,7 @@ impl Ros2Process {
         let mut supervisor = Supervisor { program, start, sinks, queued, shared: shared.clone(), joined: Some(joined) };
         let supervisor = thread::Builder::new().name("ros2 side".to_owned()).spawn(move || supervisor.run())?;
         let this = Self { queue: Some(queue), shared, supervisor: Some(supervisor) };
-        // The supervisor bounds the wait. It says nothing only if it panicked.
+        // The supervisor limits the waiting time. It only fails to answer if it panicked.
         waiting.recv().unwrap_or_else(|_| Err(Ros2Error::Side("its supervisor failed".to_owned())))?;
         Ok(this)
     }
@@ -149,15 +151,15 @@ impl Ros2Process {
         if sent { Ok(()) } else { Err(full()) }
     }
 
-    /// Publishes a prediction, without waiting.
+    /// Publishes a prediction without blocking.
     ///
     /// # Errors
-    /// [`Ros2Error::Publish`], as for the others: the queue is full. What DDS refuses later is in [`Self::health`].
+    /// [`Ros2Error::Publish`], as for the other topics: the queue is full. Errors of DDS appear in [`Self::health`].
     pub fn publish_prediction(&self, prediction: &Prediction) -> Result<(), Ros2Error> {
         self.send(topic::PREDICTION, &ToSide::Prediction(Cow::Borrowed(prediction)))
     }
 
-    /// Publishes what the node predicts for; kept for readers that come later.
+    /// Publishes the description of the rig, which is kept for late subscribers.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -168,7 +170,7 @@ impl Ros2Process {
         self.send_bytes(topic::RIG, bytes)
     }
 
-    /// Publishes what else shaped predictions.
+    /// Publishes a session event.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -176,7 +178,7 @@ impl Ros2Process {
         self.send(topic::SESSION_EVENT, &ToSide::SessionEvent(Cow::Borrowed(event)))
     }
 
-    /// Publishes how predictions change with conditions and contact.
+    /// Publishes sensitivities.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -184,7 +186,7 @@ impl Ros2Process {
         self.send(topic::SENSITIVITY, &ToSide::Sensitivity(Cow::Borrowed(sensitivity)))
     }
 
-    /// Publishes how the node does.
+    /// Publishes diagnostics.
     ///
     /// # Errors
     /// [`Ros2Error::Publish`].
@@ -192,28 +194,28 @@ impl Ros2Process {
         self.send(topic::DIAGNOSTICS, &ToSide::Diagnostics(Cow::Borrowed(diagnostics)))
     }
 
-    /// How many readers the predictions have, those included that were killed less than their lease ago.
+    /// Number of readers of the predictions, including killed ones whose lease has not expired.
     pub fn prediction_readers(&self) -> usize {
         self.shared.seen().status.prediction_readers as usize
     }
 
-    /// How many readers the sensitivities have, those included that were killed less than their lease ago.
+    /// Number of readers of the sensitivities, including killed ones whose lease has not expired.
     pub fn sensitivity_readers(&self) -> usize {
         self.shared.seen().status.sensitivity_readers as usize
     }
 
-    /// How many publishers of operating points are known, those included that were killed less than their lease ago.
+    /// Number of known publishers of operating points, including killed ones whose lease has not expired.
     pub fn operating_point_writers(&self) -> usize {
         self.shared.seen().status.operating_point_writers as usize
     }
 
-    /// What was counted of the operating points so far.
+    /// Counts of operating points so far, over all processes.
     pub fn counts(&self) -> Counts {
         let seen = self.shared.seen();
         seen.counts_before.plus(seen.status.counts)
     }
 
-    /// How the ROS 2 side has fared so far.
+    /// The current state of the ROS 2 side.
     pub fn health(&self) -> Health {
         let seen = self.shared.seen();
         Health { refused: seen.refused_before + seen.status.refused, ..seen.health.clone() }
@@ -224,7 +226,7 @@ impl Ros2Process {
         self.shared.seen().full_name.clone()
     }
 
-    /// Leaves the network; dropping does the same.
+    /// Leaves the network, as dropping does.
     pub fn stop(self) {}
 }
 
@@ -233,28 +235,28 @@ impl Drop for Ros2Process {
         self.shared.stopping.store(true, Ordering::Relaxed);
         self.queue = None;
         if let Some(supervisor) = self.supervisor.take() {
-            // A sink that panicked has said so on its own thread.
+            // A panic of a sink was reported on that thread.
             let _ = supervisor.join();
         }
     }
 }
 
-/// Starts the ROS 2 side again and again.
+/// Starts the ROS 2 side, and restarts it whenever it fails.
 struct Supervisor {
     program: PathBuf,
     start: Start,
     sinks: Sinks,
     queued: Receiver<Vec<u8>>,
     shared: Arc<Shared>,
-    /// Whoever waits for the first start.
+    /// Waiting for the result of the first start.
     joined: Option<Sender<Result<(), Ros2Error>>>,
 }
 
-/// Why a ROS 2 side is no more.
+/// Why a ROS 2 side has ended.
 enum End {
-    /// It was to end.
+    /// On request.
     Stopped,
-    /// It cannot join the network.
+    /// It cannot join the network, and why.
     Refused(String),
     Fell(String),
 }
@@ -271,7 +273,7 @@ impl Supervisor {
                 End::Fell(why) => (why, begun.elapsed() > START_WITHIN),
             };
             if is_final && let Some(joined) = self.joined.take() {
-                // The first start failed: that is for whoever started the node.
+                // The first start failed: report it to the caller.
                 let _ = joined.send(Err(Ros2Error::Side(why)));
                 return;
             }
@@ -291,7 +293,7 @@ impl Supervisor {
         }
     }
 
-    /// Takes note of a fall. What was counted stays.
+    /// Takes note of a failure and keeps the counts.
     fn fell(&mut self, why: String) {
         let mut seen = self.shared.seen();
         let status = std::mem::take(&mut seen.status);
@@ -313,7 +315,7 @@ impl Supervisor {
             .stdin(Stdio::from(OwnedFd::from(theirs)))
             .stdout(Stdio::null())
             .stderr(Stdio::piped())
-            // Signals of the terminal are for the node, which ends it when it is time.
+            // Terminal signals are for the node, which ends its ROS 2 side itself.
             .process_group(0)
             .spawn()?;
         self.shared.seen().health.process_id = process.id();
@@ -327,7 +329,7 @@ impl Supervisor {
         })
     }
 
-    /// Exchanges frames with a ROS 2 side; `None` where it closed its socket.
+    /// Exchanges frames with a ROS 2 side; `None` if it closed its socket.
     fn converse(&mut self, socket: &UnixStream) -> std::io::Result<Option<End>> {
         socket.set_read_timeout(Some(READ_TIMEOUT))?;
         let start = encode(&ToSide::Start(self.start.clone())).map_err(std::io::Error::other)?;
@@ -337,7 +339,7 @@ impl Supervisor {
         thread::scope(|scope| {
             scope.spawn(move || write(writing, first, &queued, &is_over));
             let end = self.listen(socket);
-            // Whatever the writer waits for, it waits no longer.
+            // Unblocks the writer, whatever it waits for.
             drop(over);
             let _ = socket.shutdown(Shutdown::Both);
             end
@@ -403,7 +405,7 @@ impl Supervisor {
     }
 }
 
-/// Writes `first`, then what is queued, until nobody can queue any more, the socket fails, or it `is_over`.
+/// Writes `first`, then the queued frames, until all senders are gone, the socket fails, or `is_over` is closed.
 fn write(socket: UnixStream, first: Vec<Vec<u8>>, queued: &Receiver<Vec<u8>>, is_over: &Receiver<()>) {
     let mut out = BufWriter::new(&socket);
     for bytes in first {
@@ -428,7 +430,7 @@ fn write(socket: UnixStream, first: Vec<Vec<u8>>, queued: &Receiver<Vec<u8>>, is
     let _ = socket.shutdown(Shutdown::Write);
 }
 
-/// Waits for the end of a process, which it may find by itself, or ends it.
+/// Waits for a process to end. With `gently` it gets [`LEAVE_WITHIN`] to do so itself before it is killed.
 fn end_process(process: &mut Child, gently: bool) -> std::io::Result<ExitStatus> {
     let until = Instant::now() + LEAVE_WITHIN;
     while gently && Instant::now() < until {
@@ -441,7 +443,8 @@ fn end_process(process: &mut Child, gently: bool) -> std::io::Result<ExitStatus>
     process.wait()
 }
 
-/// The last line that a process wrote to its standard error, Rust's hint about backtraces aside. Its notes are repeated here.
+/// The last line that a process wrote to its standard error, except Rust's hint about backtraces. Its notes are written
+/// to this process's standard error.
 fn last_words(stderr: ChildStderr) -> String {
     let (mut kept, mut line, mut stderr) = (Vec::new(), Vec::new(), BufReader::new(stderr));
     while let Ok(1..) = (&mut stderr).take(MAX_LAST_WORDS as u64).read_until(b'\n', &mut line) {

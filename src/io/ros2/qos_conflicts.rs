@@ -1,5 +1,5 @@
-//! Peers that DDS refuses to connect because they ask for, or offer, another quality of service. DDS says nothing about it to
-//! either program.
+//! Finds peers that DDS does not connect because their quality of service is incompatible. DDS reports this to neither
+//! program.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -10,12 +10,12 @@ use rustdds::{DomainParticipant, GUID, Topic};
 use super::super::heard::Counters;
 use super::NOTE;
 
-/// Time between two looks at who was discovered.
+/// Interval between checks of the discovered peers.
 const LOOK_EVERY: Duration = Duration::from_secs(5);
-/// At most this many are described; all are counted.
+/// Number of conflicts that are described; all are counted.
 const MAX_DESCRIBED: usize = 32;
 
-/// One topic of the node: its name, its name on DDS, and what the node offers or requests there.
+/// A topic of the node: its name, its DDS name, and the quality of service that the node offers or requests.
 #[derive(Clone)]
 struct Endpoint {
     name: String,
@@ -30,7 +30,7 @@ impl Endpoint {
     }
 }
 
-/// The topics of a node, to be compared with what peers ask and offer there.
+/// The topics of a node, compared with the quality of service of peers.
 #[derive(Clone)]
 pub(super) struct QosConflicts {
     participant: DomainParticipant,
@@ -43,23 +43,23 @@ impl QosConflicts {
         Self { participant, published: Vec::new(), subscribed: Vec::new() }
     }
 
-    /// The node publishes on a topic.
+    /// Adds a topic that the node publishes.
     pub(super) fn published(&mut self, topic: &Topic, name: &str) {
         self.published.push(Endpoint::new(topic, name));
     }
 
-    /// The node subscribes to a topic.
+    /// Adds a topic that the node subscribes to.
     pub(super) fn subscribed(&mut self, topic: &Topic, name: &str) {
         self.subscribed.push(Endpoint::new(topic, name));
     }
 
-    /// Looks now and then who cannot be connected, counts them and names each once.
+    /// Checks regularly which peers cannot be connected. Counts them and reports each once.
     pub(super) async fn watch(self, counters: &Counters) {
         let mut known = HashMap::new();
         let mut look = tokio::time::interval(LOOK_EVERY);
         loop {
             look.tick().await;
-            // With thousands of peers it takes milliseconds, in which inputs would wait.
+            // With thousands of peers this takes milliseconds, during which inputs would have to wait.
             let looking = self.clone();
             let Ok(found) = tokio::task::spawn_blocking(move || looking.find()).await else { continue };
             counters.set_incompatible(found.len() as u64);
@@ -70,7 +70,7 @@ impl QosConflicts {
         }
     }
 
-    /// The peers that are refused, and why.
+    /// The peers that cannot be connected, and why.
     fn find(&self) -> HashMap<GUID, String> {
         let mut found = HashMap::new();
         for writer in self.participant.discovered_writers() {

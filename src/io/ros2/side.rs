@@ -1,7 +1,7 @@
-//! The ROS 2 side of a node: the process that holds RustDDS, under a memory limit.
+//! The ROS 2 side of a node: the process that contains RustDDS, under a memory limit.
 //!
-//! RustDDS allocates what a datagram claims (a HEARTBEAT over 2^40 samples, a fragment of 4 GiB). Here that ends this
-//! process alone, and the node starts another.
+//! RustDDS allocates what a datagram claims (a HEARTBEAT over 2^40 samples, a fragment of 4 GiB). In this arrangement
+//! only this process dies of it, and the node starts another.
 
 use std::collections::VecDeque;
 use std::io::{self, Write};
@@ -23,37 +23,37 @@ use crate::io::heard::Heard;
 use crate::io::memory;
 use crate::wire::Prediction;
 
-/// The most private memory of this process, bytes (`RLIMIT_DATA`): an allocation beyond it aborts.
+/// Limit on the private memory of this process, bytes (`RLIMIT_DATA`). An allocation beyond it aborts the process.
 const MEMORY_LIMIT: u64 = 256 << 20;
-/// Resident memory above which this process ends in order to be started anew, bytes: RustDDS keeps some of the memory
-/// of every peer that died.
+/// Resident memory above which this process ends in order to be restarted, bytes. RustDDS keeps part of the memory of
+/// every peer that died.
 const RESIDENT_LIMIT: usize = 128 << 20;
-/// Messages that may wait for a node that is held up: 8 s of inputs at 1 kHz.
+/// Capacity of the queue to a node that is held up, in messages: 8 s of inputs at 1 kHz.
 const QUEUE: usize = 8192;
-/// The longest CDR form of an input or a vibration that is passed on to the node, bytes; longer ones count as malformed.
+/// Largest CDR form of an input or vibration that is passed to the node, bytes. Larger ones count as malformed.
 const MAX_INPUT: usize = 4096;
-/// Time between looks at the numbers of readers and writers.
+/// Interval between checks of the numbers of readers and writers.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
-/// Time between status frames while nothing changes.
+/// Interval between status frames while nothing changes.
 const STATUS_EVERY: Duration = Duration::from_millis(250);
-/// How many predictions a reader may leave unacknowledged before the publisher is renewed: 8 s at 1 kHz. With 64 modes they
-/// take 40 MB.
+/// Predictions that a reader may leave unacknowledged before the publisher is renewed: 8 s at 1 kHz. With 64 modes each
+/// they take 40 MB.
 const MAX_UNANSWERED: i32 = 1 << 13;
-/// How long predictions are held back after their publisher was renewed, so that its readers have found it.
+/// Time for which predictions are held back after the publisher was renewed, so that its readers can find it.
 const SETTLING: Duration = Duration::from_millis(100);
-/// How long the publisher before it goes on repairing.
+/// Time for which the previous publisher continues to retransmit lost samples.
 const RETIREMENT: Duration = Duration::from_secs(1);
-/// At most so many predictions are held back.
+/// Number of predictions that are held back at most.
 const MAX_HELD_BACK: usize = 8192;
-/// How many of them are published for each new one.
+/// Number of predictions held back that are published with each new one.
 const HELD_BACK_AT_ONCE: usize = 4;
-/// After this many looks without a sign of life of the thread that hears, this process gives up: 5 s.
+/// Number of checks without a beat of the receiving thread after which this process gives up: 5 s.
 const MAX_LOOKS_WITHOUT_BEAT: u32 = 250;
 
-/// Serves the node at the other end of standard input until it closes that socket. `validate` judges parameter values.
+/// Serves the node at the other end of standard input until it closes that socket. `validate` checks parameter values.
 ///
 /// # Errors
-/// Standard input is not the socket of a node, or the limits cannot be set.
+/// Standard input is not a socket of a node, or the limits cannot be set.
 pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Error> {
     let socket = UnixStream::from(io::stdin().as_fd().try_clone_to_owned()?);
     if socket.peer_addr().is_err() {
@@ -84,15 +84,15 @@ pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Er
         Err(error) => {
             node.send(&FromSide::Refused(error.to_string()));
             drop(node);
-            // A writer that failed has ended the process.
+            // If the writer fails, it ends the process.
             let _ = writer.join();
         }
     }
     Ok(())
 }
 
-/// Limits what this process can do to the machine, and ends it with its node or with the first panic: a thread of
-/// RustDDS that panicked would leave a process that is deaf and looks alive.
+/// Limits the resources of this process, and ends it with its node or at the first panic. If a RustDDS thread panicked
+/// alone, the process would stop receiving while appearing to work.
 fn contain() -> io::Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL))?;
     let limit = |most| Rlimit { current: Some(most), maximum: Some(most) };
@@ -127,12 +127,12 @@ fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNo
     )
 }
 
-/// The way to the node. It is never waited for: what does not fit into the queue is lost, and counted.
+/// The queue to the node. It never blocks: frames that do not fit are lost and counted.
 #[derive(Clone)]
 struct ToNode {
     queue: Sender<Vec<u8>>,
     lost: Arc<AtomicU64>,
-    /// Messages that are no frame, or too long a one.
+    /// Messages that cannot be encoded as a frame, or only as one that is too long.
     malformed: Arc<AtomicU64>,
 }
 
@@ -141,7 +141,7 @@ impl ToNode {
         self.send_up_to(usize::MAX, frame);
     }
 
-    /// Sends a frame whose length others decided.
+    /// Sends a frame whose length depends on peers.
     fn send_short(&self, frame: &impl Serialize) {
         self.send_up_to(MAX_INPUT, frame);
     }
@@ -157,7 +157,7 @@ impl ToNode {
     }
 }
 
-/// Writes what is queued until nobody can queue any more; ends the process where the node has gone.
+/// Writes the queued frames until all senders are gone. Ends the process if the node has gone.
 fn write(mut socket: &UnixStream, queued: &Receiver<Vec<u8>>) {
     for bytes in queued {
         if socket.write_all(&bytes).is_err() {
@@ -166,11 +166,11 @@ fn write(mut socket: &UnixStream, queued: &Receiver<Vec<u8>>) {
     }
 }
 
-/// A ROS 2 side that joined the network.
+/// A ROS 2 side that has joined the network.
 struct Side {
     ros2: Ros2,
     node: ToNode,
-    /// When the publisher of predictions was renewed, until the one before it is dropped.
+    /// When the publisher of predictions was renewed; `None` once the previous one is dropped.
     renewed: Option<Instant>,
     held_back: VecDeque<Prediction>,
     refused: u64,
@@ -178,7 +178,7 @@ struct Side {
 }
 
 impl Side {
-    /// Publishes what the node sends, and tells it how things are, until it closes the socket.
+    /// Publishes what the node sends and reports the status to it, until the node closes the socket.
     fn serve(mut self, frames: &mut Frames<UnixStream>) {
         let (mut looked, mut told) = (Instant::now(), None::<Instant>);
         let (mut last_status, mut last_beat, mut looks_without_beat) = (Status::default(), 0, 0);
@@ -228,8 +228,8 @@ impl Side {
         self.count_refusal(published);
     }
 
-    /// Publishes a prediction. Where a reader has not acknowledged for so long that there is no room for more, the publisher
-    /// is renewed, so that this reader holds up no other.
+    /// Publishes a prediction. If that fails because a reader has not acknowledged for too long, the publisher is
+    /// renewed, so that this reader delays no other.
     fn publish_prediction(&mut self, prediction: Prediction) -> Result<(), Ros2Error> {
         if !self.settling() && self.held_back.is_empty() {
             let published = self.ros2.publish_prediction(&prediction);
@@ -238,7 +238,8 @@ impl Side {
             }
             self.ros2.renew_prediction_publisher()?;
             self.renewed = Some(Instant::now());
-            // One alone: what the first heartbeat of a publisher announces, and has not come yet, some readers never ask for.
+            // Publish a single one: some readers never request samples that the first heartbeat of a publisher
+            // announces before they arrive.
             return self.ros2.publish_prediction(&prediction);
         }
         self.held_back.push_back(prediction);
@@ -255,7 +256,7 @@ impl Side {
         self.renewed.is_some_and(|renewed| renewed.elapsed() < SETTLING)
     }
 
-    /// Publishes some of what was held back, in order, and drops the publisher before the present one in its time.
+    /// Publishes some of the predictions held back, in order, and drops the previous publisher when its time is over.
     fn publish_held_back(&mut self) {
         if self.renewed.is_some_and(|renewed| renewed.elapsed() >= RETIREMENT) {
             self.renewed = None;
@@ -264,7 +265,7 @@ impl Side {
         if self.settling() {
             return;
         }
-        // Not all at once: readers keep no more than their depth of it.
+        // Not all at once: readers keep no more than their history depth.
         for _ in 0..HELD_BACK_AT_ONCE {
             let Some(prediction) = self.held_back.pop_front() else { return };
             let published = self.ros2.publish_prediction(&prediction);
@@ -294,7 +295,7 @@ impl Side {
     }
 }
 
-/// Ends this process; the node reads why and starts another.
+/// Ends this process with an error. The node reads the reason and starts another.
 fn give_up(why: &str) -> ! {
     note!("{why}");
     process::exit(1);
