@@ -1,8 +1,8 @@
-//! Shared memory: fixed-size forms over iceoryx2, with an event service of the same name beside each topic.
+//! Shared memory: fixed-size forms over iceoryx2. Each topic has an event service of the same name.
 //!
-//! The reading side is a thread that sleeps until the event wakes it, drains what came and hands it to a sink. The
-//! writing side is a pair of ports that any thread may use and that never waits: a reader that is too slow loses the
-//! oldest samples, which it sees as gaps in the sequence numbers.
+//! A reader is a thread that sleeps until an event wakes it, takes all samples and passes them to a sink. A writer is a
+//! pair of ports that any thread may use and that never blocks. A reader that is too slow loses the oldest samples,
+//! which it detects as gaps in the sequence numbers.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,24 +29,24 @@ use super::heard::{Bus, Counters, Counts, Gaps, Heard};
 use super::shm_place;
 use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
 
-/// The ports may be used from any thread; peers with single-threaded ports connect to them all the same.
+/// The ports may be used from any thread; peers with single-threaded ports can connect to them.
 type Ipc = ipc_threadsafe::Service;
 
-/// Hears operating points: the node's input.
+/// Receives operating points: the node's input.
 pub type ShmInput = ShmReader<OperatingPointForm>;
 /// Publishes predictions: the node's output.
 pub type ShmOutput = ShmWriter<PredictionForm>;
 /// Publishes sensitivities.
 pub type ShmSensitivity = ShmWriter<SensitivityForm>;
-/// Hears sensitivities.
+/// Receives sensitivities.
 pub type ShmSensitivitySink = ShmReader<SensitivityForm>;
-/// Publishes operating points: a rig, or its simulator.
+/// Publishes operating points: a rig or its simulator.
 pub type ShmSource = ShmWriter<OperatingPointForm>;
-/// Hears the measured vibration.
+/// Receives the measured vibration.
 pub type ShmVibrationInput = ShmReader<VibrationForm>;
 /// Publishes the measured vibration.
 pub type ShmVibrationSource = ShmWriter<VibrationForm>;
-/// Hears predictions.
+/// Receives predictions.
 pub type ShmSink = ShmReader<PredictionForm>;
 
 const MAX_PUBLISHERS: usize = 8;
@@ -54,20 +54,20 @@ const MAX_SUBSCRIBERS: usize = 32;
 const MAX_NODES: usize = 64;
 const HISTORY_SAMPLES: usize = 16;
 
-/// A reader looks for samples, and whether it should stop, at least this often; with events it wakes at once.
+/// Interval at which a reader without events checks for samples and for the request to stop.
 const TICK: Duration = Duration::from_millis(50);
-/// A reader removes what killed processes left behind this often.
+/// Interval at which a reader removes the remains of killed processes.
 const CLEANUP_PERIOD: Duration = Duration::from_secs(10);
-/// A service that somebody creates or removes this very moment is tried again.
+/// Number of attempts to open a service that another process is creating or removing.
 const OPEN_ATTEMPTS: usize = 50;
 const OPEN_RETRY: Duration = Duration::from_millis(10);
 
-/// Where the services are.
+/// Names of the services and their files.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ShmOptions {
-    /// Before every service name, so that `cell2/` gives `cell2/rig/operating_point`.
+    /// Prefix of all service names: `cell2/` gives `cell2/rig/operating_point`.
     pub service_prefix: String,
-    /// In the names of all files instead of `iox2_`: peers with another one do not exist. For tests.
+    /// Prefix of all file names instead of `iox2_`. Peers with another prefix are invisible. For tests.
     pub file_prefix: Option<String>,
 }
 
@@ -112,15 +112,15 @@ pub enum ShmError {
     Notify { service: String, source: NotifierNotifyError },
 }
 
-/// Publishes messages over shared memory, from any thread, without ever waiting. One that is dropped right after it
-/// was made takes along what its readers, who connect as they wake, have not taken yet.
+/// Publishes messages over shared memory from any thread without blocking. If it is dropped right after its creation,
+/// samples that its readers have not taken yet are lost, because readers only connect when they wake.
 #[derive(Debug)]
 pub struct ShmWriter<F: Form> {
     service: String,
     publisher: Publisher<Ipc, F, ()>,
     notifier: Notifier<Ipc>,
     topic: publish_subscribe::PortFactory<Ipc, F, ()>,
-    // Last: the ports go before their node.
+    // Declared last, because the ports must be dropped before their node.
     _node: Node<Ipc>,
 }
 
@@ -128,13 +128,14 @@ impl<F: Form> ShmWriter<F> {
     /// Opens or creates the services and the ports.
     ///
     /// # Errors
-    /// Whatever iceoryx2 refuses.
+    /// Errors of iceoryx2.
     pub fn new(options: &ShmOptions) -> Result<Self, ShmError> {
         let node = new_node(options)?;
         let Services { service, topic, event } = Services::<F>::open(&node, options)?;
         let publisher = topic
             .publisher_builder()
-            // Where somebody created the service without overflow, a full reader must not hold us up either.
+            // The service may have been created without overflow by another process: a full reader must not block us
+            // then either.
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|source| ShmError::Publisher { service: service.clone(), source })?;
@@ -145,10 +146,10 @@ impl<F: Form> ShmWriter<F> {
         Ok(Self { service, publisher, notifier, topic, _node: node })
     }
 
-    /// Publishes a message and wakes the readers; returns how many readers got it.
+    /// Publishes a message and wakes the readers. Returns how many readers got it.
     ///
     /// # Errors
-    /// A message that does not fit its form, or whatever iceoryx2 refuses; the next call may well succeed.
+    /// A message that does not fit its form, or an error of iceoryx2. A later call may succeed.
     pub fn publish(&self, message: &F::Message) -> Result<usize, ShmError> {
         let form = F::from_message(message)?;
         let readers = self
@@ -156,7 +157,7 @@ impl<F: Form> ShmWriter<F> {
             .send_copy(form)
             .map_err(|source| ShmError::Send { service: self.service.clone(), source })?;
         match self.notifier.notify() {
-            // A deadline is a setting of whoever created the service; the readers were woken.
+            // The creator of the service may have set a deadline; the readers were woken nevertheless.
             Ok(_) | Err(NotifierNotifyError::MissedDeadline | NotifierNotifyError::UnableToAcquireElapsedTime) => {
                 Ok(readers)
             }
@@ -166,7 +167,7 @@ impl<F: Form> ShmWriter<F> {
 }
 
 impl<F: Form> ShmWriter<F> {
-    /// How many readers there are, those included that were killed and not cleaned up after.
+    /// Number of readers, including killed ones whose remains have not been removed.
     pub fn readers(&self) -> usize {
         self.topic.dynamic_config().number_of_subscribers()
     }
@@ -176,13 +177,13 @@ impl<F: Form> ShmWriter<F> {
         &self.service
     }
 
-    /// How many writers there are besides this one, with the same exception.
+    /// Number of other writers, including killed ones whose remains have not been removed.
     pub fn other_writers(&self) -> usize {
         self.topic.dynamic_config().number_of_publishers().saturating_sub(1)
     }
 }
 
-/// Hears messages over shared memory on a thread of its own, until it is stopped or dropped.
+/// Receives messages over shared memory on its own thread, until it is stopped or dropped.
 #[derive(Debug)]
 pub struct ShmReader<F: Form> {
     stop: Arc<AtomicBool>,
@@ -192,11 +193,11 @@ pub struct ShmReader<F: Form> {
 }
 
 impl<F: Form> ShmReader<F> {
-    /// Opens or creates the services and starts the thread; every message goes to `sink`, on that thread. Of each
-    /// publisher that is already there the latest messages (16 with our own settings) come first.
+    /// Opens or creates the services and starts the thread, on which `sink` gets every message. The latest messages of
+    /// publishers that already exist come first (16 each with our own settings).
     ///
     /// # Errors
-    /// Whatever iceoryx2 refuses.
+    /// Errors of iceoryx2.
     pub fn spawn(
         options: &ShmOptions,
         mut sink: impl FnMut(Heard<F::Message>) + Send + 'static,
@@ -204,18 +205,18 @@ impl<F: Form> ShmReader<F> {
         Self::spawn_with_backlog(options, move |heard, _| sink(heard))
     }
 
-    /// As [`ShmReader::spawn`]; `sink` is also told whether more is waiting to be read: one that takes its time with the last
-    /// message should not with those before it, or the oldest of them are lost.
+    /// As [`ShmReader::spawn`]; `sink` is also told whether more samples are waiting. A sink that takes long for a
+    /// message should only do so when none is waiting, or the oldest samples are lost.
     ///
     /// # Errors
-    /// Whatever iceoryx2 refuses.
+    /// Errors of iceoryx2.
     pub fn spawn_with_backlog(
         options: &ShmOptions,
         sink: impl FnMut(Heard<F::Message>, bool) + Send + 'static,
     ) -> Result<Self, ShmError> {
         let node = new_node(options)?;
         let Services { service, topic, event } = Services::<F>::open(&node, options)?;
-        // The listener first: nothing can then come between that wakes nobody.
+        // The listener is created first, so that every later sample wakes the thread.
         let listener = event
             .listener_builder()
             .create()
@@ -243,12 +244,12 @@ impl<F: Form> ShmReader<F> {
         Ok(Self { stop, counters, thread: Some(thread), _form: std::marker::PhantomData })
     }
 
-    /// What was counted so far.
+    /// The counts so far.
     pub fn counts(&self) -> Counts {
         self.counters.counts()
     }
 
-    /// Stops the thread and waits for it, 50 ms at most plus the sink's time; dropping does the same.
+    /// Stops the thread and waits for it, at most 50 ms plus the time of the sink. Dropping does the same.
     pub fn stop(self) {}
 }
 
@@ -256,13 +257,13 @@ impl<F: Form> Drop for ShmReader<F> {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
-            // A sink that panicked has said so on its own thread.
+            // A panic of the sink was reported on that thread.
             let _ = thread.join();
         }
     }
 }
 
-/// The reading thread's own.
+/// State of the reading thread.
 struct Reading<F: Form, S> {
     subscriber: Subscriber<Ipc, F, ()>,
     stop: Arc<AtomicBool>,
@@ -315,7 +316,8 @@ impl<F: Form, S: FnMut(Heard<F::Message>, bool)> Reading<F, S> {
         }
     }
 
-    /// Hands over all samples there are. Each is copied out and given back at once: a reader may hold only a few.
+    /// Passes all available samples to the sink. Each is copied and released at once, because a reader may hold only a
+    /// few.
     fn drain(&mut self) {
         while !self.stop.load(Ordering::Acquire) {
             let (publisher, form) = match self.subscriber.receive() {
@@ -339,7 +341,7 @@ impl<F: Form, S: FnMut(Heard<F::Message>, bool)> Reading<F, S> {
     }
 }
 
-/// A topic and the event service beside it.
+/// A topic and its event service.
 struct Services<F: Form> {
     service: String,
     topic: publish_subscribe::PortFactory<Ipc, F, ()>,
@@ -359,7 +361,7 @@ impl<F: Form> Services<F> {
 }
 
 fn new_node(options: &ShmOptions) -> Result<Node<Ipc>, ShmError> {
-    // It would write to the terminal otherwise, which may be showing a table; every error reaches the caller.
+    // iceoryx2 would log to the terminal, which may show a table. All errors are returned to the caller.
     static QUIET: Once = Once::new();
     QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
 
@@ -374,7 +376,7 @@ fn new_node(options: &ShmOptions) -> Result<Node<Ipc>, ShmError> {
     Ok(node)
 }
 
-/// Opens the topic with whatever settings it has; creates it with ours where there is none.
+/// Opens the topic with the settings it has, or creates it with ours.
 fn open_topic<F: Form>(
     node: &Node<Ipc>,
     name: &ServiceName,
@@ -396,7 +398,7 @@ fn open_topic<F: Form>(
     }
 }
 
-/// Opens the event service with whatever settings it has; creates it with ours where there is none.
+/// Opens the event service with the settings it has, or creates it with ours.
 fn open_event(node: &Node<Ipc>, name: &ServiceName) -> Result<event::PortFactory<Ipc>, EventOpenOrCreateError> {
     match node.service_builder(name).event().open() {
         Ok(event) => Ok(event),
@@ -412,7 +414,7 @@ fn open_event(node: &Node<Ipc>, name: &ServiceName) -> Result<event::PortFactory
     }
 }
 
-/// Whether somebody is creating or removing the topic this very moment.
+/// Whether another process is creating or removing the topic at this moment.
 fn topic_in_flux(error: &PublishSubscribeOpenOrCreateError) -> bool {
     use PublishSubscribeCreateError as Create;
     use PublishSubscribeOpenError as Open;
@@ -433,7 +435,7 @@ fn topic_in_flux(error: &PublishSubscribeOpenOrCreateError) -> bool {
     }
 }
 
-/// Whether somebody is creating or removing the event service this very moment.
+/// Whether another process is creating or removing the event service at this moment.
 fn event_in_flux(error: &EventOpenOrCreateError) -> bool {
     use EventCreateError as Create;
     use EventOpenError as Open;

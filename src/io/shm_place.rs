@@ -1,8 +1,8 @@
-//! Where the files of shared memory are, and whether there is room for them.
+//! Chooses the folder for shared memory, and checks that there is enough space.
 //!
-//! iceoryx2 keeps its files in one folder for the whole machine (`/tmp/iceoryx2`), which belongs to whoever came first:
-//! nobody else can join. Where it cannot be used, and no configuration file of iceoryx2 names another one, every process of
-//! a user takes the same folder of that user's own.
+//! iceoryx2 keeps its files in one folder for the whole machine (`/tmp/iceoryx2`). It belongs to the user who created
+//! it, and other users cannot join. If it is not usable, and no iceoryx2 configuration file names another one, all
+//! processes of a user take a folder of that user.
 
 use std::ffi::OsStr;
 use std::fs::DirBuilder;
@@ -19,11 +19,11 @@ use super::shm::ShmError;
 
 /// Where the system keeps shared memory.
 const MEMORY: &str = "/dev/shm";
-/// At least so many bytes must be free there. A page that no memory is left for ends the process with a SIGBUS when it is
-/// first written to: nothing can be said then any more.
+/// Free space required there, bytes. If a page cannot be provided when it is first written to, the process dies of
+/// SIGBUS without a message.
 const LEAST_FREE: u64 = 32 << 20;
 
-/// The configuration of iceoryx2 that this process uses, with `file_prefix` in place of the usual one.
+/// The iceoryx2 configuration of this process, with `file_prefix` instead of the usual one.
 ///
 /// # Errors
 /// [`ShmError::FilePrefix`], [`ShmError::Place`], [`ShmError::NoRoom`].
@@ -61,7 +61,7 @@ fn file_name(name: &str) -> Result<FileName, ShmError> {
     FileName::new(name.as_bytes()).map_err(|_| ShmError::FilePrefix(name.to_owned()))
 }
 
-/// A path of iceoryx2 as one of the standard library.
+/// Converts an iceoryx2 path to a standard path.
 pub(super) fn path_of(path: &iceoryx2::prelude::Path) -> PathBuf {
     Path::new(OsStr::from_bytes(path.as_bytes())).components().collect()
 }
@@ -70,7 +70,7 @@ fn place(path: &Path, reason: impl ToString) -> ShmError {
     ShmError::Place { path: path.to_owned(), reason: reason.to_string() }
 }
 
-/// Whether `user` can keep files in the folder of the machine; why not.
+/// Whether `user` can keep files in the machine-wide folder; the error says why not.
 fn usable(root: &Path, user: u32) -> Result<(), String> {
     for folder in [root.to_owned(), root.join("nodes"), root.join("services")] {
         let metadata = match folder.symlink_metadata() {
@@ -81,7 +81,7 @@ fn usable(root: &Path, user: u32) -> Result<(), String> {
         if !metadata.is_dir() {
             return Err("is no folder".to_owned());
         }
-        // Whoever owns it can take files away and put others there.
+        // The owner of the folder can remove and replace files in it.
         if user != 0 && metadata.uid() != user && metadata.uid() != 0 {
             return Err(format!("belongs to user {}", metadata.uid()));
         }
@@ -92,7 +92,7 @@ fn usable(root: &Path, user: u32) -> Result<(), String> {
     Ok(())
 }
 
-/// Makes the folder of `user`; one of that name that others could write to is refused.
+/// Creates the folder of `user`. An existing one that others can write to is refused.
 fn make_own(folder: &Path, user: u32) -> Result<(), ShmError> {
     match DirBuilder::new().mode(0o700).create(folder) {
         Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(place(folder, error)),
@@ -105,9 +105,9 @@ fn make_own(folder: &Path, user: u32) -> Result<(), ShmError> {
     Ok(())
 }
 
-/// That a file system has room for what will be shared.
+/// Checks that a file system has space for the shared memory.
 fn check_room(folder: &Path, limit: u64) -> Result<(), ShmError> {
-    // Where there is none, iceoryx2 says so.
+    // Without the folder iceoryx2 reports the error.
     let Ok(status) = rustix::fs::statvfs(folder) else { return Ok(()) };
     let free = status.f_bavail.saturating_mul(status.f_frsize);
     if free < limit { Err(ShmError::NoRoom { path: folder.to_owned(), free, limit }) } else { Ok(()) }
