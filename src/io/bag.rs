@@ -4,28 +4,28 @@ use std::{collections::BTreeMap, fmt::Write as _, io::Write as _, path::Path};
 
 use super::whole_file::{WholeFileError, write_whole};
 
-/// The name of the file.
+/// Name of the file.
 pub const METADATA_FILE: &str = "metadata.yaml";
 
-/// What `metadata.yaml` says of a topic.
+/// Entry of a topic in `metadata.yaml`.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct TopicInfo {
     pub name: String,
     /// `package/msg/Type`.
     pub type_name: String,
     pub message_encoding: String,
-    /// Must be the text the channel carries, or `rosbags` finds no messages.
+    /// Must equal the text in the channel, or `rosbags` finds no messages.
     pub qos_profiles: String,
 }
 
-/// What `metadata.yaml` says of one MCAP file.
+/// Entry of an MCAP file in `metadata.yaml`.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct FileSummary {
-    /// Without directory.
+    /// File name without directory.
     pub name: String,
     /// First and last log time, ns; `None` without messages.
     pub span_ns: Option<(u64, u64)>,
-    /// Messages by topic.
+    /// Number of messages by topic.
     pub topics: BTreeMap<TopicInfo, u64>,
 }
 
@@ -40,7 +40,7 @@ impl FileSummary {
         self.span_ns = Some((first.min(log_time_ns), last.max(log_time_ns)));
     }
 
-    /// All messages.
+    /// Total number of messages.
     pub fn messages(&self) -> u64 {
         self.topics.values().sum()
     }
@@ -92,7 +92,7 @@ pub fn metadata_yaml(files: &[FileSummary]) -> String {
     yaml
 }
 
-/// Writes `metadata.yaml` into a directory; an older one stays until the new one is complete.
+/// Writes `metadata.yaml` into a directory. An existing file is kept until the new one is complete.
 ///
 /// # Errors
 ///
@@ -101,7 +101,7 @@ pub fn write_metadata(directory: &Path, files: &[FileSummary]) -> Result<(), Who
     write_whole(&directory.join(METADATA_FILE), |out| out.write_all(metadata_yaml(files).as_bytes()))
 }
 
-/// A YAML list under a key, `[]` when empty.
+/// A YAML list under a key; `[]` if empty.
 fn list<T>(yaml: &mut String, key: &str, items: impl ExactSizeIterator<Item = T>, item: impl Fn(&mut String, T)) {
     let _ = writeln!(yaml, "  {key}:{}", if items.len() == 0 { " []" } else { "" });
     for element in items {
@@ -109,7 +109,7 @@ fn list<T>(yaml: &mut String, key: &str, items: impl ExactSizeIterator<Item = T>
     }
 }
 
-/// A double-quoted YAML scalar: JSON strings are such.
+/// A double-quoted YAML scalar; JSON strings are valid ones.
 fn quoted(text: &str) -> String {
     serde_json::Value::from(text).to_string()
 }

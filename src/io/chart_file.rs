@@ -1,6 +1,7 @@
-//! Charts kept on disk, so that a rig is charted once: a file for each content of a rig, complete or on the way.
+//! Stores charts on disk, complete or unfinished, so that each rig is charted only once. There is one file for each
+//! content of a rig.
 //!
-//! The file is a line, the SHA-256 of what follows, the key, and the words of the chart, little-endian.
+//! The file consists of a magic line, the SHA-256 of what follows, the key, and the words of the chart, little-endian.
 
 use std::fs;
 use std::io::Write;
@@ -14,18 +15,18 @@ use crate::input_file;
 use crate::physics::Chart;
 use crate::physics::chart::{BUILDER, FORMAT};
 
-/// First line of a file.
+/// First line of the file.
 const MAGIC: &[u8] = b"squealcast chart\n";
 const HASH: usize = 32;
 
-/// Where the chart of one rig is kept.
+/// The file for the chart of one rig.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChartFile {
     path: PathBuf,
     key: [u8; HASH],
 }
 
-/// Why a file is of no use.
+/// Why a chart file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ChartFileError {
     #[error("{}: {source}", path.display())]
@@ -37,8 +38,9 @@ pub enum ChartFileError {
 }
 
 impl ChartFile {
-    /// The file of the rig with `content_hash`, read from `rig_file`: `<rig>.<hash>.chart` beside it, or in the cache folder where
-    /// the rig is embedded or its folder cannot be written to. `None` where there is no place for it.
+    /// The chart file of the rig with `content_hash`, read from `rig_file`. It is `<rig>.<hash>.chart` in the folder of
+    /// the rig file. For an embedded rig, or if that folder is not writable, it is in the cache folder. `None` without
+    /// a usable folder.
     pub fn locate(rig_name: &str, rig_file: Option<&Path>, content_hash: &str) -> Option<Self> {
         let key = key(content_hash, &BUILDER);
         let short = hex(&key[..8]);
@@ -52,12 +54,12 @@ impl ChartFile {
         beside.or_else(cached).map(|path| Self { path, key })
     }
 
-    /// Where it is.
+    /// Path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// What is kept; `None` where nothing is.
+    /// Loads the chart; `None` if there is no file.
     ///
     /// # Errors
     /// [`ChartFileError`].
@@ -81,16 +83,16 @@ impl ChartFile {
         Chart::from_words(&words)
     }
 
-    /// Keeps `chart`, in a folder made where it is missing.
+    /// Saves `chart`, creating the folder if necessary.
     ///
     /// # Errors
-    /// [`ChartFileError::Io`] of the folder, [`ChartFileError::Write`] of the file.
+    /// [`ChartFileError::Io`] for the folder, [`ChartFileError::Write`] for the file.
     pub fn save(&self, chart: &Chart) -> Result<(), ChartFileError> {
         let mut body = self.key.to_vec();
         body.extend(chart.words().into_iter().flat_map(u64::to_le_bytes));
         let folder = folder_of(&self.path);
         fs::create_dir_all(folder).map_err(|source| ChartFileError::Io { path: folder.to_owned(), source })?;
-        // A named pipe or the like has no business under this name.
+        // Replace a named pipe or similar.
         if fs::metadata(&self.path).is_ok_and(|there| !there.is_file()) {
             let _ = fs::remove_file(&self.path);
         }
@@ -103,7 +105,7 @@ impl ChartFile {
     }
 }
 
-/// What a chart is kept by: the content of the rig, and what made it.
+/// The key of a chart: a hash of the rig's content and of the sources of the builder.
 fn key(content_hash: &str, builder: &[&str]) -> [u8; HASH] {
     let hash = Sha256::new()
         .chain_update(content_hash)
@@ -136,7 +138,7 @@ mod tests {
         assert_ne!(key("content", &BUILDER), key("other", &BUILDER));
     }
 
-    /// What comes back says the same to the last bit; what was damaged or belongs to another rig is refused.
+    /// A loaded chart equals the saved one to the last bit. A damaged file or one of another rig is refused.
     #[test]
     fn keeps_a_chart() {
         let law = crate::physics::ContactLaw { exponent: 0.3, ..Default::default() };
@@ -180,7 +182,7 @@ mod tests {
         assert!(matches!(file.load(), Err(ChartFileError::Foreign { .. })));
         fs::write(file.path(), &bytes[..100]).unwrap();
         assert!(matches!(file.load(), Err(ChartFileError::Foreign { .. })));
-        // A named pipe that nobody writes to: the rig is charted anew, and the chart takes its place.
+        // A named pipe without a writer: loading fails, and saving replaces it by the chart.
         fs::remove_file(file.path()).unwrap();
         rustix::fs::mkfifoat(rustix::fs::CWD, file.path(), rustix::fs::Mode::RWXU).unwrap();
         assert!(file.load().unwrap_err().to_string().ends_with("is a named pipe, expected a regular file"));

@@ -1,4 +1,4 @@
-//! The only place that reads clocks. What a prediction depends on are the stamps of messages, never these.
+//! The only module that reads clocks. Predictions depend on the stamps of messages, never on these clocks.
 
 use std::sync::LazyLock;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -6,26 +6,26 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
-/// Both clocks at one moment of this process, from which logged times count.
+/// Both clocks at one moment early in this process; log times are counted from there.
 static START: LazyLock<Reading> = LazyLock::new(|| Reading { wall_ns: now_ns(), monotonic_ns: monotonic_ns() });
 
-/// Both clocks, read together.
+/// Both clocks, read at the same moment.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Reading {
-    /// Nanoseconds since the epoch; jumps when the clock is set.
+    /// Wall clock, ns since the epoch; jumps when the clock is set.
     pub wall_ns: i64,
-    /// Nanoseconds since the machine was started, the same in every process; never goes back. For durations.
+    /// Time since the machine was started, ns; the same in every process, never runs backward. For durations.
     pub monotonic_ns: u64,
 }
 
 impl Reading {
-    /// Now.
+    /// Reads both clocks.
     pub fn now() -> Self {
         Self { wall_ns: now_ns(), monotonic_ns: monotonic_ns() }
     }
 
-    /// The time to log something at: the wall clock at the start of this process plus the time that has passed since. Setting the
-    /// clock does not change it, so that a recording is replayed in the time it took; the wall clock then and now is
+    /// The log time: the wall clock at the start of this process plus the time elapsed since. It does not jump when the
+    /// wall clock is set, so that a replay takes as long as the recording did. The current wall clock is
     /// [`Reading::wall_ns`].
     pub fn log_ns(&self) -> u64 {
         let start = *START;
@@ -34,7 +34,7 @@ impl Reading {
     }
 }
 
-/// Wall time in nanoseconds since the epoch; negative before it, saturating in the year 2262.
+/// Wall clock in ns since the epoch; negative before it, saturates in the year 2262.
 pub fn now_ns() -> i64 {
     match SystemTime::now().duration_since(UNIX_EPOCH) {
         Ok(since) => i64::try_from(since.as_nanos()).unwrap_or(i64::MAX),
@@ -42,7 +42,7 @@ pub fn now_ns() -> i64 {
     }
 }
 
-/// Nanoseconds since the machine was started, the time it slept included; never goes back.
+/// Time since the machine was started, including suspension, ns; never runs backward.
 pub fn monotonic_ns() -> u64 {
     let time = clock_gettime(ClockId::Boottime);
     let [seconds, ns] = [time.tv_sec, time.tv_nsec].map(|part| u64::try_from(part).unwrap_or(0));
@@ -63,11 +63,11 @@ mod tests {
         }
     }
 
-    /// Log times are the wall clock at first, and pass as monotonic time does whatever the wall clock is set to.
+    /// Log times begin at the wall clock and advance with monotonic time, even if the wall clock is set.
     #[test]
     fn log_time_does_not_follow_a_clock_that_is_set() {
         let now = Reading::now();
-        // Both clocks are read within the time that passed since the start, and pass alike.
+        // Both clocks were read since the start of the process and advance alike.
         assert!(now.log_ns().abs_diff(now.wall_ns as u64) < 1_000_000_000, "{now:?}");
         let second = 1_000_000_000;
         for step_ns in [-3_600 * second, 3_600 * second] {
@@ -76,7 +76,7 @@ mod tests {
         }
     }
 
-    /// 2020-01-01 in nanoseconds: a clock before that is one read in the wrong unit.
+    /// 2020-01-01 in nanoseconds: an earlier time means that the unit is wrong.
     #[test]
     fn wall_time_is_in_nanoseconds_since_the_epoch() {
         assert!(now_ns() > 1_577_836_800_000_000_000);

@@ -1,4 +1,4 @@
-//! What the buses hand over, and what they count while they listen.
+//! Messages received over buses, and the counts of the receivers.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -8,51 +8,51 @@ use serde::{Deserialize, Serialize};
 
 use super::clock::Reading;
 
-/// The bus a message came over.
+/// The bus over which a message was received.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Bus {
     /// Shared memory (iceoryx2).
     Shm,
     /// ROS 2.
     Ros2,
-    /// No bus: the rig simulator of a demonstration, in this process.
+    /// No bus: the rig simulator of `demo`, in this process.
     Simulator,
 }
 
-/// A message that came over a bus.
+/// A message received over a bus.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heard<M> {
     pub bus: Bus,
-    /// When it was taken off the bus.
+    /// When it was taken from the bus.
     pub at: Reading,
     pub message: M,
 }
 
 impl<M> Heard<M> {
-    /// Heard now.
+    /// A message received now.
     pub fn now(bus: Bus, message: M) -> Self {
         Self { bus, at: Reading::now(), message }
     }
 }
 
-/// What one listener counted so far.
+/// Counts of one receiver so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
-    /// Messages handed over.
+    /// Messages received.
     pub heard: u64,
-    /// Messages that were lost on the way, by the gaps in their sequence numbers. A publisher that leaves numbers out on purpose
-    /// cannot be told from one whose messages were lost: it has to count by one.
+    /// Messages lost on the way, according to gaps in their sequence numbers. A publisher must count by one: numbers
+    /// that it skips on purpose cannot be distinguished from losses.
     pub missed: u64,
-    /// Samples that were no message.
+    /// Samples that could not be decoded.
     pub malformed: u64,
-    /// Times the bus itself failed to deliver or to wait.
+    /// Failures of the bus to deliver or to wait.
     pub failures: u64,
-    /// Peers that are known now but cannot be connected, because their quality of service is incompatible.
+    /// Known peers that cannot be connected because their quality of service is incompatible.
     pub incompatible: u64,
 }
 
 impl Counts {
-    /// These and `others`, of a listener that took the place of the first.
+    /// The sum of these counts and those of a receiver that replaced the first.
     pub(super) fn plus(self, others: Self) -> Self {
         Self {
             heard: self.heard + others.heard,
@@ -64,7 +64,7 @@ impl Counts {
     }
 }
 
-/// The counters behind [`Counts`], shared with the thread that listens.
+/// The counters behind [`Counts`], shared with the receiving thread.
 #[derive(Debug, Default)]
 pub(super) struct Counters {
     heard: AtomicU64,
@@ -103,10 +103,10 @@ impl Counters {
     }
 }
 
-/// At most this many publishers are told apart; beyond that the memory of all is dropped, and gaps with it.
+/// Number of publishers whose sequence numbers are tracked. Beyond it all are forgotten, and with them their gaps.
 const MAX_PUBLISHERS: usize = 256;
 
-/// The gaps in the sequence numbers of each publisher.
+/// Detects gaps in the sequence numbers of each publisher.
 #[derive(Debug)]
 pub(super) struct Gaps<K> {
     last: HashMap<K, u64>,
@@ -117,8 +117,8 @@ impl<K: Eq + Hash> Gaps<K> {
         Self { last: HashMap::new() }
     }
 
-    /// How many numbers are missing between `seq` and the one before it from the same publisher. The first of a
-    /// publisher misses none, nor does one that started over or sends a number again.
+    /// Number of sequence numbers missing between `seq` and the previous one of the same publisher. Zero for the first
+    /// message of a publisher, after a restart of its numbering, and for a repeated number.
     pub(super) fn note(&mut self, publisher: K, seq: u64) -> u64 {
         if self.last.len() >= MAX_PUBLISHERS && !self.last.contains_key(&publisher) {
             self.last.clear();

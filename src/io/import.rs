@@ -1,4 +1,4 @@
-//! Makes a recording of operating points from a tribometer's log.
+//! Converts a tribometer log to a recording of operating points.
 
 use std::{
     collections::BTreeMap,
@@ -18,19 +18,19 @@ use crate::hex::hex;
 use crate::input_file;
 use crate::wire::{Header, OperatingPoint, Time, schema::Topic};
 
-/// The name of the metadata record that says where the recording is from. Its keys: `source`, `source_sha256`,
-/// `squealcast_version`, `skipped_lines`, and per quantity the column it was read from.
+/// Name of the metadata record that describes the origin of the recording. Its keys: `source`, `source_sha256`,
+/// `squealcast_version`, `skipped_lines`, and for each quantity the column it was read from.
 pub const METADATA_NAME: &str = "squealcast_import";
 
-/// How a log is imported.
+/// Options of an import.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ImportOptions {
     pub log: LogOptions,
-    /// Replace a recording of that name.
+    /// Replace an existing recording.
     pub overwrite: bool,
 }
 
-/// Why nothing was imported.
+/// Why an import failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
     #[error("{}: {source}", .path.display())]
@@ -43,22 +43,23 @@ pub enum ImportError {
     Encode { path: PathBuf, reason: String },
 }
 
-/// What was imported.
+/// Result of an import.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Imported {
     pub path: PathBuf,
     pub messages: u64,
     /// First and last stamp, ns.
     pub span_ns: Option<(u64, u64)>,
-    /// The log, with what was found out about it.
+    /// The parsed log.
     pub log: TribometerLog,
 }
 
-/// Writes the recording `output` of `/rig/operating_point` from the log `input`; all of it or nothing.
+/// Writes the operating points (`/rig/operating_point`) of the log `input` to the recording `output`, completely or not
+/// at all.
 ///
 /// # Errors
 ///
-/// A log that cannot be read, whose lines make no sense, or an output that exists or cannot be written.
+/// The log cannot be read or is invalid, or the output exists or cannot be written.
 pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Imported, ImportError> {
     let (bytes, log) = read_log(input, &options.log)?;
     if output.exists() && !options.overwrite {
@@ -73,11 +74,11 @@ pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Im
     Ok(Imported { path: output.to_owned(), messages: summary.messages(), span_ns: summary.span_ns, log })
 }
 
-/// Reads the log `input`; its bytes, and what they hold.
+/// Reads the log `input`; returns its bytes and the parsed log.
 ///
 /// # Errors
 ///
-/// A file that cannot be read, or whose lines make no sense.
+/// The file cannot be read or is not a valid log.
 pub fn read_log(input: &Path, options: &LogOptions) -> Result<(Vec<u8>, TribometerLog), ImportError> {
     let bytes = input_file::read(input, input_file::LOG)
         .map_err(|source| ImportError::Read { path: input.to_owned(), source })?;
@@ -86,7 +87,7 @@ pub fn read_log(input: &Path, options: &LogOptions) -> Result<(Vec<u8>, Tribomet
     Ok((bytes, log))
 }
 
-/// The message of the sample with number `seq`.
+/// The message for sample number `seq`.
 pub fn operating_point(seq: u64, sample: &Sample) -> OperatingPoint {
     OperatingPoint {
         header: Header { stamp: Time::from_ns(sample.stamp_ns), frame_id: String::new() },

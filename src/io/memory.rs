@@ -1,21 +1,21 @@
-//! Memory of this process and of the machine, as Linux tells it.
+//! Memory of this process and of the machine, as reported by Linux.
 
-/// Bytes this process has in memory; `None` where the system does not say.
+/// Resident memory of this process, bytes; `None` if the system does not report it.
 pub fn resident_bytes() -> Option<usize> {
     kilobytes("/proc/self/status", "VmRSS:")
 }
 
-/// The most bytes this process has had in memory; `None` where the system does not say.
+/// Largest resident memory of this process so far, bytes; `None` if the system does not report it.
 pub fn peak_bytes() -> Option<usize> {
     kilobytes("/proc/self/status", "VmHWM:")
 }
 
-/// Bytes the machine can still give without swapping; `None` where the system does not say.
+/// Memory available on the machine without swapping, bytes; `None` if the system does not report it.
 pub fn available_bytes() -> Option<usize> {
     kilobytes("/proc/meminfo", "MemAvailable:")
 }
 
-/// The number after `key` in a file of lines, in bytes.
+/// The value after `key` in a file of lines, converted from kB to bytes.
 fn kilobytes(file: &str, key: &str) -> Option<usize> {
     let text = std::fs::read_to_string(file).ok()?;
     let value = text.lines().find_map(|line| line.strip_prefix(key))?;

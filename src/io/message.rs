@@ -1,11 +1,11 @@
-//! A recorded message of any of the node's topics.
+//! Recorded messages of all topics of the node.
 
 use crate::wire::{
     self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Time, Vibration,
     schema::Topic,
 };
 
-/// The content of a recorded message; which it is decides its topic.
+/// The content of a recorded message; its variant determines the topic.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Payload {
     OperatingPoint(OperatingPoint),
@@ -18,7 +18,7 @@ pub enum Payload {
 }
 
 impl Payload {
-    /// The topic it belongs on.
+    /// The topic of the message.
     pub fn topic(&self) -> Topic {
         match self {
             Self::OperatingPoint(_) => Topic::OperatingPoint,
@@ -31,7 +31,7 @@ impl Payload {
         }
     }
 
-    /// Its stamp, for change; a rig's description has none.
+    /// The stamp, for modification; `None` for the description of a rig, which has none.
     pub fn stamp_mut(&mut self) -> Option<&mut Time> {
         match self {
             Self::OperatingPoint(message) => Some(&mut message.header.stamp),
@@ -44,11 +44,11 @@ impl Payload {
         }
     }
 
-    /// Its CDR bytes, encapsulation header included.
+    /// The CDR encoding, including the encapsulation header.
     ///
     /// # Errors
     ///
-    /// What CDR cannot hold, such as a string longer than 4 GiB.
+    /// Content that CDR cannot represent, such as a string longer than 4 GiB.
     pub fn to_cdr(&self) -> Result<Vec<u8>, cdr_encoding::Error> {
         match self {
             Self::OperatingPoint(message) => wire::to_cdr(message),
@@ -61,11 +61,11 @@ impl Payload {
         }
     }
 
-    /// The message of a topic from its CDR bytes.
+    /// Decodes a message of a topic from CDR bytes.
     ///
     /// # Errors
     ///
-    /// Bytes that are no such message.
+    /// The bytes are not a message of that type.
     pub fn from_cdr(topic: Topic, cdr: &[u8]) -> Result<Self, cdr_encoding::Error> {
         Ok(match topic {
             Topic::OperatingPoint => Self::OperatingPoint(wire::from_cdr(cdr)?),
@@ -82,10 +82,10 @@ impl Payload {
 /// A message for the recorder.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Message {
-    /// When it was heard or made, ns since the epoch; the order of a recording. The recorder raises it by as little
-    /// as makes it later than the message before.
+    /// When it was received or made, ns since the epoch; determines the order of a recording. The recorder raises it by
+    /// the minimum that makes log times increase strictly.
     pub log_time_ns: u64,
-    /// When its sender sent it, ns since the epoch.
+    /// When it was sent, ns since the epoch.
     pub publish_time_ns: u64,
     pub payload: Payload,
 }

@@ -1,4 +1,5 @@
-//! Adapters between the node and the outside: buses, clocks and recordings. No physics and no session logic lives here.
+//! Adapters between the node and the outside: buses, clocks, files and recordings. They contain neither physics nor
+//! session logic.
 
 pub mod bag;
 pub mod chart_file;

@@ -1,15 +1,15 @@
-//! When each message of a replay is due: pure, no clock and no sleeping.
+//! Computes when each message of a replay is due. Pure: reads no clock and does not sleep.
 
-/// How a recording is played back, as `ros2 bag play` has it.
+/// How a recording is played back; the options of `ros2 bag play`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pacing {
     /// Playback speed: 2 plays twice as fast.
     pub rate: f64,
     /// Recorded time to skip at the start, s.
     pub start_offset_s: f64,
-    /// Recorded time to play, s; `None`: to the end.
+    /// Recorded time to play, s; `None` plays to the end.
     pub playback_duration_s: Option<f64>,
-    /// Begin again at the end, for ever.
+    /// Start again at the end, forever.
     pub repeat: bool,
 }
 
@@ -19,7 +19,7 @@ impl Default for Pacing {
     }
 }
 
-/// What is wrong with a [`Pacing`].
+/// An invalid value in a [`Pacing`].
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum PacingError {
     #[error("rate {0}: must be finite and greater than 0")]
@@ -30,7 +30,7 @@ pub enum PacingError {
     PlaybackDuration(f64),
 }
 
-/// The part of a recording that is played, and its pace.
+/// The part of a recording that is played, and its speed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pacer {
     pacing: Pacing,
@@ -41,20 +41,20 @@ pub struct Pacer {
 /// What to do with a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Due {
-    /// Before the part that is played.
+    /// It lies before the part that is played.
     Skip,
-    /// This long after playback began, ns.
+    /// Publish it this long after the start of playback, ns.
     After(u64),
-    /// Behind the part that is played: this round is over.
+    /// It lies after the part that is played: the round is over.
     End,
 }
 
 impl Pacer {
-    /// For a recording whose first message has the log time `first_log_time_ns`.
+    /// A pacer for a recording whose first message has the log time `first_log_time_ns`.
     ///
     /// # Errors
     ///
-    /// Every number of `pacing` that makes no sense.
+    /// An invalid value in `pacing`.
     pub fn new(pacing: Pacing, first_log_time_ns: u64) -> Result<Self, PacingError> {
         if !(pacing.rate.is_finite() && pacing.rate > 0.0) {
             return Err(PacingError::Rate(pacing.rate));
@@ -72,8 +72,8 @@ impl Pacer {
         Ok(Self { pacing, from_ns, until_ns })
     }
 
-    /// When the message logged at `log_time_ns` is due in a round that began `round_start_ns` after playback did.
-    /// Messages logged before the start offset are skipped; those at `from + duration` and later end the round.
+    /// When the message logged at `log_time_ns` is due, in a round that began `round_start_ns` after the start of
+    /// playback. Messages before the start offset are skipped; messages at `from + duration` or later end the round.
     pub fn due(&self, round_start_ns: u64, log_time_ns: u64) -> Due {
         if log_time_ns < self.from_ns {
             Due::Skip
@@ -84,17 +84,17 @@ impl Pacer {
         }
     }
 
-    /// Start of the round after one that began at `round_start_ns` and whose last message was logged at
-    /// `last_log_time_ns`; `None` when playback does not repeat. A repeated round follows `gap_ns` of recorded time
-    /// after the last message, so that its first does not fall together with it; never less than 1 ms of real time,
-    /// so that a recording of one message does not spin.
+    /// Start of the round after the one that began at `round_start_ns` and whose last message was logged at
+    /// `last_log_time_ns`; `None` if playback does not repeat. Rounds are separated by `gap_ns` of recorded time, so
+    /// that the last and the first message do not coincide. The separation is at least 1 ms of real time, so that a
+    /// recording with one message does not use the whole processor.
     pub fn next_round(&self, round_start_ns: u64, last_log_time_ns: u64, gap_ns: u64) -> Option<u64> {
         let played = last_log_time_ns.saturating_sub(self.from_ns).saturating_add(gap_ns);
         self.pacing.repeat.then(|| round_start_ns.saturating_add(self.scaled(played).max(1_000_000)))
     }
 
     fn scaled(&self, recorded_ns: u64) -> u64 {
-        // Rate 1 stays in integers: exact.
+        // Integer arithmetic at rate 1 is exact.
         if self.pacing.rate == 1.0 { recorded_ns } else { (recorded_ns as f64 / self.pacing.rate) as u64 }
     }
 }

@@ -1,13 +1,12 @@
-//! Walks the records of one MCAP file, however damaged, from start to end.
+//! Reads the records of one MCAP file from start to end, even if it is damaged.
 //!
-//! The readers of the `mcap` crate refuse a file without its summary, and trust lengths they find inside chunks and records
-//! (4 GiB are allocated for a name that claims to be as long). This
-//! one goes from record to record, believes no length beyond the bytes that are there, opens chunks itself (checking
-//! their CRC before any message is given out, and taking what it can from a chunk cut short), goes on behind a chunk
-//! that is damaged inside, and says what was damaged.
+//! The readers of the `mcap` crate refuse a file without a summary, and trust the lengths they find inside chunks and
+//! records: a name that claims 4 GiB makes them allocate 4 GiB. This reader goes from record to record and trusts no
+//! length beyond the bytes present. It opens chunks itself: it checks their CRC before it returns messages, and reads
+//! as much as possible of a truncated chunk. After a chunk with internal damage it continues, and it lists all damage.
 //!
-//! Its memory and time are bounded, whatever a file claims: one chunk is open at a time, its records are read one by one as
-//! they are asked for, and what exceeds a ceiling below is passed over and counts as damage.
+//! Memory and time are bounded, whatever a file claims. One chunk is open at a time, and its records are read one by
+//! one on demand. What exceeds one of the limits below is skipped and counts as damage.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -25,28 +24,29 @@ use mcap::{
 
 use crate::input_file;
 
-/// Largest chunk that is opened, in bytes of its records. Recorders close theirs at about 1 MB, after one large message at
-/// the latest.
+/// Largest chunk that is opened, in bytes of its records. Recorders close their chunks at about 1 MB, at the latest
+/// after one large message.
 const MAX_CHUNK_BYTES: u64 = 32 << 20;
-/// What all chunks of a file may unpack to: so many times the length of the file, and at least the second number of bytes.
+/// Limit on the unpacked size of all chunks of a file: this multiple of the file's length, and at least the second
+/// number, bytes.
 const MOST_TIMES_FILE: (u64, u64) = (1000, 64 << 20);
-/// Largest schema, and largest record of metadata.
+/// Largest schema or metadata record, bytes.
 const MAX_TEXT_BYTES: u64 = 1 << 20;
-/// Largest channel record.
+/// Largest channel record, bytes.
 const MAX_CHANNEL_BYTES: u64 = 64 << 10;
-/// What the schemas and channels of a file may take, in bytes of their records.
+/// Limit on all schemas and channels of a file, in bytes of their records.
 const MAX_KEPT_BYTES: usize = 16 << 20;
-/// A channel takes this many times its record, for the tree its metadata is kept in.
+/// Estimated memory of a channel as a multiple of its record, because its metadata is kept in a tree.
 const CHANNEL_OVERHEAD: usize = 8;
-/// So many unreadable records of one chunk are passed over before the rest of it is.
+/// Number of unreadable records after which the rest of a chunk is skipped.
 const MAX_UNREADABLE: usize = 20;
-/// So much damage of one file is listed, each in so many characters.
+/// Number of entries in the damage list of a file, and their length in characters.
 const MAX_DAMAGE: usize = 100;
 const MAX_DAMAGE_CHARS: usize = 300;
-/// The compressed form of a chunk may be larger than its records by this, its header included.
+/// Allowance of a chunk's compressed form over the size of its records, header included, bytes.
 const CHUNK_OVERHEAD: u64 = 1 << 20;
 
-/// A schema as its file has it.
+/// A schema as stored in the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Schema {
     pub name: String,
@@ -54,7 +54,7 @@ pub struct Schema {
     pub data: Vec<u8>,
 }
 
-/// A channel as its file has it.
+/// A channel as stored in the file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Channel {
     pub id: u16,
@@ -64,7 +64,7 @@ pub struct Channel {
     pub schema: Option<Arc<Schema>>,
 }
 
-/// A file within the file.
+/// A file attached to the recording.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Attachment {
     pub log_time_ns: u64,
@@ -74,18 +74,18 @@ pub struct Attachment {
     pub data: Vec<u8>,
 }
 
-/// A message not yet decoded.
+/// A message before decoding.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RawMessage {
     pub channel: Arc<Channel>,
     pub sequence: u32,
     pub log_time_ns: u64,
     pub publish_time_ns: u64,
-    /// Shares the memory of the chunk it came in.
+    /// Shares the memory of its chunk.
     pub data: Bytes,
 }
 
-/// What a file holds, in its order.
+/// An element of a file, in file order.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Item {
     Message(RawMessage),
@@ -93,29 +93,29 @@ pub enum Item {
     Metadata(Metadata),
 }
 
-/// Something wrong with a file.
+/// Damage of a file.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("byte {offset}: {what}")]
 pub struct Damage {
-    /// Of the record concerned.
+    /// Offset of the record concerned.
     pub offset: u64,
     pub what: String,
-    /// Whether messages or attachments may be lost; damage of indexes and of the summary loses none.
+    /// Whether messages or attachments may be lost. Damage of indexes or of the summary loses none.
     pub loses_data: bool,
 }
 
-/// Whether chunks are opened.
+/// How much of a file is read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Depth {
-    /// Everything is read.
+    /// Everything, including messages.
     Messages,
-    /// Chunks and messages are passed over unread: attachments, metadata, the channels that the summary lists, and where
-    /// the file ends.
+    /// Everything but chunks and messages: attachments, metadata, the channels listed in the summary, and the end of
+    /// the file.
     Structure,
 }
 
-/// Iterator over the [`Item`]s of a file. It ends at the end of the file or where nothing more can be read; then
-/// [`damage`](Self::damage) tells.
+/// Iterator over the [`Item`]s of a file. It ends at the end of the file or where nothing more can be read; the reason
+/// is in [`damage`](Self::damage).
 #[derive(Debug)]
 pub struct RecordWalker {
     input: BufReader<File>,
@@ -123,12 +123,12 @@ pub struct RecordWalker {
     offset: u64,
     depth: Depth,
     state: State,
-    /// Read, but not given out yet.
+    /// Read but not returned yet.
     next: Option<Item>,
     chunk: Option<OpenChunk>,
-    /// Bytes of records of all chunks opened so far.
+    /// Bytes of the records of all chunks opened so far.
     unpacked: u64,
-    /// Bytes of the records of all schemas and channels, overheads included.
+    /// Bytes of the records of all schemas and channels, including overheads.
     kept: usize,
     schemas: HashMap<u16, Arc<Schema>>,
     channels: HashMap<u16, Arc<Channel>>,
@@ -138,9 +138,9 @@ pub struct RecordWalker {
 /// A chunk whose records are being read.
 #[derive(Debug)]
 struct OpenChunk {
-    /// Where its record begins in the file.
+    /// Offset of its record in the file.
     start: u64,
-    /// The file ends within it.
+    /// Whether the file ends within the chunk.
     cut: bool,
     records: Bytes,
     unreadable: usize,
@@ -154,12 +154,12 @@ enum State {
 }
 
 impl RecordWalker {
-    /// At the start of a file. `None` when it is no MCAP file at all: its first bytes are others than the magic (a file
-    /// cut within the magic counts as a damaged MCAP file).
+    /// Opens a file at its start. `None` if it is not MCAP, that is, if its first bytes differ from the magic bytes. A
+    /// file truncated within the magic bytes counts as a damaged MCAP file.
     ///
     /// # Errors
     ///
-    /// What opening or reading the file yields.
+    /// Errors of opening or reading the file.
     pub fn open(path: &Path, depth: Depth) -> io::Result<Option<Self>> {
         let file = input_file::open(path, input_file::ANY_SIZE)?;
         let length = file.metadata()?.len();
@@ -187,22 +187,22 @@ impl RecordWalker {
         Ok(Some(walker))
     }
 
-    /// What was found wrong so far; complete once the iterator has ended.
+    /// Damage found so far; complete once the iterator has ended.
     pub fn damage(&self) -> &[Damage] {
         &self.damage
     }
 
-    /// How many bytes of messages were unpacked so far: what is given out shares their memory.
+    /// Bytes of records unpacked so far. The messages returned share their memory.
     pub fn unpacked_bytes(&self) -> u64 {
         self.unpacked
     }
 
-    /// The channels found so far; complete once the iterator has ended.
+    /// Channels found so far; complete once the iterator has ended.
     pub fn channels(&self) -> impl Iterator<Item = &Arc<Channel>> {
         self.channels.values()
     }
 
-    /// At most `length` bytes from here, fewer at the end of the file. Memory grows with what is there.
+    /// Reads at most `length` bytes, fewer at the end of the file. Memory is only allocated for bytes that exist.
     fn read(&mut self, length: u64) -> io::Result<Vec<u8>> {
         let mut bytes = Vec::with_capacity(length.min(self.length.saturating_sub(self.offset)) as usize);
         (&mut self.input).take(length).read_to_end(&mut bytes)?;
@@ -210,7 +210,8 @@ impl RecordWalker {
         Ok(bytes)
     }
 
-    /// Lists damage; of more than can be listed only whether it loses data, once.
+    /// Adds to the damage list. Once it is full, one last entry says that there is more; another one is added if data
+    /// are lost only after that.
     fn note(&mut self, offset: u64, mut what: String, loses_data: bool) {
         if self.damage.len() >= MAX_DAMAGE {
             let said = |damage: &Damage| damage.loses_data || !loses_data;
@@ -231,7 +232,7 @@ impl RecordWalker {
         self.state = State::Ended;
     }
 
-    /// Reads the next record of the file itself.
+    /// Reads the next record of the file.
     fn step(&mut self) -> io::Result<()> {
         let start = self.offset;
         let data = self.state == State::Data;
@@ -240,7 +241,7 @@ impl RecordWalker {
             Some(head) => head,
             None if head.is_empty() => {
                 let what = if data { "the file was not finished" } else { "the file ends without a footer" };
-                // Cut between two records: nothing of what is in the file is lost.
+                // The file was cut between two records: no data in the file are lost.
                 self.stop(start, what.to_owned(), false);
                 return Ok(());
             }
@@ -317,7 +318,7 @@ impl RecordWalker {
         Ok(())
     }
 
-    /// Opens a chunk; `cut`: the file ends within it.
+    /// Opens a chunk; `cut` says that the file ends within it.
     fn chunk(&mut self, start: u64, body: &Bytes, cut: bool) {
         let mut fields = Fields(body);
         let Some(header) = ChunkHeader::read(&mut fields) else {
@@ -338,7 +339,7 @@ impl RecordWalker {
         let (times, at_least) = MOST_TIMES_FILE;
         let budget = self.length.saturating_mul(times).max(at_least);
         let claimed = header.uncompressed_bytes;
-        // A chunk that claims too much by itself is refused below: what it claims may be damaged.
+        // A chunk that claims too much on its own is refused below, since its claim may be damaged.
         if !cut && claimed <= MAX_CHUNK_BYTES && self.unpacked.saturating_add(claimed) > budget {
             let what = format!(
                 "chunk of {claimed} bytes, with which a file of {} unpacks to more than the limit of {budget}; what \
@@ -363,7 +364,7 @@ impl RecordWalker {
         self.chunk = Some(OpenChunk { start, cut, records, unreadable: 0 });
     }
 
-    /// Reads on in an open chunk up to its next message, or to its end.
+    /// Reads an open chunk up to its next message or its end.
     fn step_in(&mut self, mut chunk: OpenChunk) {
         while self.next.is_none() && !chunk.records.is_empty() {
             let mut fields = Fields(&chunk.records);
@@ -392,7 +393,7 @@ impl RecordWalker {
         }
     }
 
-    /// Takes in a record other than a chunk or an attachment.
+    /// Processes a record other than a chunk or an attachment.
     fn record(&mut self, opcode: u8, body: &Bytes) -> Result<(), String> {
         if body.len() as u64 > largest(opcode) {
             let limit = largest(opcode);
@@ -457,7 +458,7 @@ impl RecordWalker {
         Ok(())
     }
 
-    /// Counts what a schema or channel takes.
+    /// Adds to the memory counted for schemas and channels; an error if it exceeds the limit.
     fn keep(&mut self, bytes: usize) -> Result<(), String> {
         if self.kept + bytes > MAX_KEPT_BYTES {
             return Err(format!("schemas and channels of more than the limit of {MAX_KEPT_BYTES} bytes"));
@@ -509,7 +510,7 @@ impl ChunkHeader {
     }
 }
 
-/// The largest record of a kind that is read.
+/// The largest record that is read, by kind, bytes.
 fn largest(opcode: u8) -> u64 {
     match opcode {
         op::CHUNK => MAX_CHUNK_BYTES + CHUNK_OVERHEAD,
@@ -520,7 +521,7 @@ fn largest(opcode: u8) -> u64 {
     }
 }
 
-/// The records of a chunk as far as they can be had, and what stopped that. At most `limit` bytes are unpacked.
+/// The readable records of a chunk, and the error at which reading stopped. At most `limit` bytes are unpacked.
 fn decompress(
     compression: &str,
     body: &Bytes,
@@ -554,21 +555,21 @@ fn decompress(
 
 fn zstd_decoder(compressed: &[u8]) -> io::Result<zstd::stream::read::Decoder<'static, &[u8]>> {
     let mut decoder = zstd::stream::read::Decoder::with_buffer(compressed)?;
-    // The window it keeps of what came before, whatever the frame asks for.
+    // Limit the decoder's window of previous data, whatever the frame requests.
     decoder.window_log_max(MAX_CHUNK_BYTES.ilog2())?;
     Ok(decoder)
 }
 
 fn read_until_error(mut input: impl Read, limit: u64) -> (Bytes, Option<io::Error>) {
-    // One allocation: a growing one would be copied, and be twice as large at the end.
+    // A single allocation: a growing buffer would be copied and end up twice as large.
     let mut bytes = Vec::with_capacity(limit as usize);
-    // `read_to_end` keeps what came before an error.
+    // `read_to_end` keeps what was read before an error.
     let error = input.by_ref().take(limit).read_to_end(&mut bytes).err();
     bytes.shrink_to_fit();
     (bytes.into(), error)
 }
 
-/// An attachment from its record.
+/// Parses an attachment record.
 fn attachment(body: Bytes) -> Result<Attachment, String> {
     let mut fields = Fields(&body);
     let mut read = || {
@@ -589,7 +590,7 @@ fn attachment(body: Bytes) -> Result<Attachment, String> {
     if written != 0 && written != crc {
         return Err(format!("attachment {:?} with CRC {crc:08x} where {written:08x} was written", attachment.name));
     }
-    // In place: it may be large.
+    // In place, since it may be large.
     let mut bytes = Vec::from(body);
     bytes.truncate(data.end);
     bytes.drain(..data.start);
@@ -597,7 +598,7 @@ fn attachment(body: Bytes) -> Result<Attachment, String> {
     Ok(attachment)
 }
 
-/// Bytes that are taken from the front; `None` where they do not suffice.
+/// Parses values from the front of a byte string; `None` if too few bytes are left.
 struct Fields<'a>(&'a [u8]);
 
 impl<'a> Fields<'a> {
@@ -628,7 +629,7 @@ impl<'a> Fields<'a> {
         self.array().map(u16::from_le_bytes)
     }
 
-    /// Its length in bytes, then keys and values by turns; every key once.
+    /// A map: its length in bytes, then keys and values in turn. Every key may occur once.
     fn map(&mut self) -> Option<BTreeMap<String, String>> {
         let length = usize::try_from(self.u32()?).ok()?;
         let mut fields = Fields(self.bytes(length)?);
@@ -642,21 +643,21 @@ impl<'a> Fields<'a> {
         Some(map)
     }
 
-    /// A schema and its number.
+    /// A schema and its id.
     fn schema(&mut self) -> Option<(u16, Schema)> {
         let (id, name, encoding) = (self.u16()?, self.string()?, self.string()?);
         let length = usize::try_from(self.u32()?).ok()?;
         Some((id, Schema { name, encoding, data: self.bytes(length)?.to_vec() }))
     }
 
-    /// The number of a channel's schema, and the channel without it.
+    /// The schema id of a channel, and the channel without its schema.
     fn channel(&mut self) -> Option<(u16, Channel)> {
         let (id, schema_id) = (self.u16()?, self.u16()?);
         let (topic, message_encoding, metadata) = (self.string()?, self.string()?, self.map()?);
         Some((schema_id, Channel { id, topic, message_encoding, metadata, schema: None }))
     }
 
-    /// The number of a message's channel, its sequence number, log time and publish time; what is left is its data.
+    /// The channel id of a message, its sequence number, log time and publish time. The remaining bytes are its data.
     fn message(&mut self) -> Option<(u16, u32, u64, u64)> {
         Some((self.u16()?, self.u32()?, self.u64()?, self.u64()?))
     }

@@ -1,6 +1,7 @@
 //! Repairs interrupted recordings.
 //!
-//! What can be read is written into a finished file, which takes the place of the interrupted one only when it is on the disk. An original with anything in it that could not be read is kept as `*.mcap.damaged`.
+//! Everything readable is written to a new file, which replaces the interrupted one once it is on the disk. An original
+//! that contains unreadable data is kept as `*.mcap.damaged`.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -19,7 +20,7 @@ use super::{
     whole_file::{folder_of, sync_folder},
 };
 
-/// The suffix of a file that is being recorded.
+/// Suffix of a file being recorded.
 pub const ACTIVE: &str = ".active";
 const DAMAGED: &str = ".damaged";
 
@@ -34,10 +35,10 @@ pub enum RecoverError {
     TargetExists { interrupted: PathBuf, finished: PathBuf },
 }
 
-/// What became of one file.
+/// Result of repairing one file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Recovery {
-    /// As it was named before.
+    /// Its name before the repair.
     pub original: PathBuf,
     pub outcome: Outcome,
 }
@@ -45,19 +46,19 @@ pub struct Recovery {
 /// See [`Recovery`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// It was finished and undamaged; an interrupted renaming was done.
+    /// It was finished and undamaged. An interrupted renaming was completed.
     Complete { path: PathBuf, messages: u64 },
-    /// Everything readable is in a finished file now.
+    /// Everything readable is now in a finished file.
     Restored(Restored),
-    /// It held nothing at all, not even the start of a recording, and was removed.
+    /// It contained nothing, not even the start of a recording, and was removed.
     Empty,
-    /// It was named as a recording in progress, but is none: it has another name now and is not looked at again.
+    /// It was named as a recording in progress but is not one. It was renamed and is ignored from now on.
     SetAside { path: PathBuf },
-    /// A running process writes it.
+    /// A running process is writing it.
     InUse,
 }
 
-/// What was restored, and what was not.
+/// What was restored and what was lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Restored {
     /// The finished file.
@@ -66,34 +67,34 @@ pub struct Restored {
     pub attachments: u64,
     /// First and last log time, ns.
     pub span_ns: Option<(u64, u64)>,
-    /// What was wrong with the original.
+    /// Damage of the original.
     pub damage: Vec<Damage>,
-    /// The original, when it held something that could not be read.
+    /// The original, kept if it contained unreadable data.
     pub kept_original: Option<PathBuf>,
 }
 
 impl Restored {
-    /// Whether the original held data that could not be read.
+    /// Whether the original contained unreadable data.
     pub fn loses_data(&self) -> bool {
         self.damage.iter().any(|damage| damage.loses_data)
     }
 }
 
-/// What became of several files. One that cannot be repaired does not keep the others from it.
+/// Results of repairing several files. A file that cannot be repaired does not prevent the repair of others.
 #[derive(Debug, Default)]
 pub struct RecoveryReport {
     pub recoveries: Vec<Recovery>,
-    /// Of the files that could not be repaired; they are as they were.
+    /// Errors of the files that could not be repaired; these files are unchanged.
     pub errors: Vec<RecoverError>,
 }
 
 impl RecoveryReport {
-    /// Messages in the files that were restored.
+    /// Number of messages in the restored files.
     pub fn messages_restored(&self) -> u64 {
         self.restored().map(|restored| restored.messages).sum()
     }
 
-    /// Whether a restored file's original held data that could not be read.
+    /// Whether any original contained unreadable data.
     pub fn loses_data(&self) -> bool {
         self.restored().any(Restored::loses_data)
     }
@@ -106,12 +107,12 @@ impl RecoveryReport {
     }
 }
 
-/// Repairs a file; of a directory every `*.mcap` and `*.mcap.active` file in it and in the directories directly below.
-/// `metadata.yaml` is written again where files of its directory changed.
+/// Repairs a file, or every `*.mcap` and `*.mcap.active` file in a directory and in its immediate subdirectories.
+/// `metadata.yaml` is rewritten where files of its directory changed.
 ///
 /// # Errors
 ///
-/// A path that cannot be read or holds no recording; what is wrong with single files is in the report.
+/// The path cannot be read or contains no recording. Errors of single files are in the report.
 pub fn recover(path: &Path) -> Result<RecoveryReport, RecoverError> {
     let is_directory = std::fs::metadata(path).map_err(|source| read_error(path, source))?.is_dir();
     if !is_directory {
@@ -124,12 +125,12 @@ pub fn recover(path: &Path) -> Result<RecoveryReport, RecoverError> {
     Ok(recover_files(&files))
 }
 
-/// Repairs what interrupted processes left (`*.mcap.active`) in a record directory and those directly below it.
-/// Finished files are not looked at.
+/// Repairs the remains of interrupted processes (`*.mcap.active`) in a record directory and its immediate
+/// subdirectories. Finished files are not examined.
 ///
 /// # Errors
 ///
-/// A directory that cannot be read.
+/// The directory cannot be read.
 pub fn recover_leftovers(directory: &Path) -> Result<RecoveryReport, RecoverError> {
     let mut leftovers = files_below(directory).map_err(|source| read_error(directory, source))?;
     leftovers.retain(|path| is_active(path));
@@ -164,8 +165,8 @@ fn recover_files(files: &[PathBuf]) -> RecoveryReport {
     report
 }
 
-/// A lone file somewhere is no reason to litter its directory: a recording's directory is one that has a
-/// `metadata.yaml`, or has its files' name.
+/// Whether `metadata.yaml` may be written into a directory: it already exists, or the directory has the name of its
+/// files. The directory of a single file elsewhere stays as it is.
 fn is_bag(directory: &Path, file: &Path) -> bool {
     let named_alike = || {
         let directory = directory.file_name()?.to_str()?;
@@ -191,7 +192,7 @@ fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
         return Ok(recovery(Outcome::Empty));
     }
 
-    // A first pass over everything: a sound file is left as it is.
+    // The first pass reads everything: an undamaged file is left as it is.
     let mut walker = match open_walker(path, Depth::Messages) {
         Err(RecordingError::NotMcap { .. }) if is_active(path) => {
             let kept = free_name(&with_suffix(&target, DAMAGED));
@@ -238,7 +239,7 @@ fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
     Ok(recovery(Outcome::Restored(restored)))
 }
 
-/// Copies what can be read; the number of attachments.
+/// Copies everything readable; returns the number of attachments.
 fn copy_items(walker: &mut RecordWalker, copy: &mut RecordingFile) -> Result<u64, WriteError> {
     let mut channels = HashMap::new();
     let mut attachments = 0;
@@ -323,7 +324,7 @@ fn finished_name(path: &Path) -> PathBuf {
     if is_active(path) { path.with_extension("") } else { path.to_owned() }
 }
 
-/// `path`, or with `.2`, `.3` ... behind it where that is taken.
+/// `path`, or `path` with the suffix `.2`, `.3` ... if it is taken.
 fn free_name(path: &Path) -> PathBuf {
     if !path.exists() {
         return path.to_owned();
@@ -338,7 +339,8 @@ fn rename(from: &Path, to: &Path) -> Result<(), WriteError> {
     std::fs::rename(from, to).and_then(|()| sync_folder(folder_of(to))).map_err(|source| WriteError::io(to, source))
 }
 
-/// Gives a file a second name, so that replacing the first leaves it; where the file system has no second names, another one.
+/// Adds a second name to a file, so that it survives the replacement of the first. If the file system has no hard
+/// links, the file is renamed.
 fn keep_as(path: &Path, kept: &Path) -> Result<(), WriteError> {
     match std::fs::hard_link(path, kept) {
         Ok(()) => Ok(()),
@@ -346,7 +348,7 @@ fn keep_as(path: &Path, kept: &Path) -> Result<(), WriteError> {
     }
 }
 
-/// Removes a file whose content is elsewhere; that it has gone already is as good.
+/// Removes a file whose content has been copied; it may already be gone.
 fn remove(path: &Path) -> Result<(), RecordingError> {
     match std::fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => Err(read_error(path, error)),

@@ -1,7 +1,7 @@
-//! Reads a tribometer's log: delimited text with named columns, units in their names or in the line below.
+//! Reads a tribometer log: delimited text with named columns, with units in their names or in the next line.
 //!
-//! Pure: text in, samples out. What programs write differs, so the separator (`;`, tab, `,`), the decimal sign, lines
-//! before the header, a byte order mark and Latin-1 are recognised; what remains ambiguous is an error, not a guess.
+//! Pure: text in, samples out. Formats differ between programs, so the separator (`;`, tab, `,`), the decimal sign,
+//! lines before the header, a byte order mark and Latin-1 are detected. An ambiguity is an error; nothing is guessed.
 
 mod field;
 mod times;
@@ -11,10 +11,10 @@ use std::borrow::Cow;
 pub use field::Field;
 use times::{date_ns, decimal_ns, is_stamp};
 
-/// Longest line that is read, in bytes.
+/// Longest line accepted, bytes.
 const LONGEST_LINE: usize = 64 << 10;
 
-/// What is wrong with a log. Lines count from 1.
+/// Why a log is invalid. Lines are counted from 1.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum LogError {
     #[error("no line names the columns needed: {missing} not found; line {line} comes closest: {header:?}{hint}")]
@@ -44,26 +44,26 @@ pub enum LogError {
     NoSamples { line: usize },
 }
 
-/// How a log is read.
+/// Options for reading a log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogOptions {
-    /// Columns by their name in the log, instead of by what they are usually called. Their unit is that in the name, or
-    /// else that of the field's name.
+    /// Columns chosen by their name in the log instead of by the usual names. The unit is the one in the column name,
+    /// else the one in the field's name.
     pub columns: Vec<(Field, String)>,
-    /// `,` or `.`, instead of finding out.
+    /// `,` or `.`; `None` detects it.
     pub decimal: Option<char>,
-    /// What relative times count from, ns since the epoch. Times of a billion seconds and more count from the epoch.
+    /// Origin of relative times, ns since the epoch. Times of a billion seconds or more count from the epoch itself.
     pub start_ns: i64,
-    /// Closed ranges in the kept units.
+    /// Accepted ranges, ends included, in the units of the field names.
     pub normal_load_n: [f64; 2],
     pub disc_speed_rad_s: [f64; 2],
     pub friction_coefficient: [f64; 2],
-    /// Leave lines out that have something wrong with them, instead of refusing the log.
+    /// Skip invalid lines instead of refusing the log.
     pub skip_bad_lines: bool,
 }
 
 impl Default for LogOptions {
-    /// Relative times count from 2000-01-01, so that an import always gives the same recording.
+    /// The default origin of relative times is 2000-01-01, so that an import always gives the same recording.
     fn default() -> Self {
         Self {
             columns: Vec::new(),
@@ -77,7 +77,7 @@ impl Default for LogOptions {
     }
 }
 
-/// A line of the log.
+/// The operating point in one line of the log.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sample {
     /// ns since the epoch.
@@ -87,33 +87,33 @@ pub struct Sample {
     pub friction_coefficient: f64,
 }
 
-/// A column that was read.
+/// A column that is used.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Column {
     pub field: Field,
     /// Its name in the log.
     pub header: String,
-    /// Empty where it has none (dates, friction coefficients).
+    /// Empty if it has none (dates, friction coefficients).
     pub unit: String,
     index: usize,
     factor: f64,
 }
 
-/// What a log holds.
+/// The content of a log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TribometerLog {
     pub samples: Vec<Sample>,
     pub columns: Vec<Column>,
-    /// The names of the columns that were not read, those without a name left out.
+    /// Names of the columns that are not used, without empty names.
     pub left_out: Vec<String>,
     pub separator: char,
     pub decimal: char,
-    /// Lines left out, and what was wrong with the first.
+    /// Number of lines skipped, and the error of the first.
     pub skipped: usize,
     pub first_skipped: Option<LogError>,
 }
 
-/// Text of a log file: UTF-8 or UTF-16 by its byte order mark, else UTF-8, else Latin-1.
+/// Decodes the text of a log: UTF-8 or UTF-16 according to its byte order mark, else UTF-8, else Latin-1.
 pub fn decode_text(bytes: &[u8]) -> Cow<'_, str> {
     let utf16 = |bytes: &[u8], unit: fn([u8; 2]) -> u16| {
         let units = bytes.chunks_exact(2).map(|pair| unit([pair[0], pair[1]]));
@@ -136,11 +136,12 @@ pub fn decode_text(bytes: &[u8]) -> Cow<'_, str> {
 ///
 /// # Errors
 ///
-/// See [`LogError`]; with [`LogOptions::skip_bad_lines`] only those of the log as a whole.
+/// See [`LogError`]; with [`LogOptions::skip_bad_lines`] only errors that concern the whole log.
 pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError> {
     check_lines(text)?;
     let header = find_header(text, options)?;
-    // Rows are read once for each question, one at a time: all of them would take many times the memory of the text.
+    // The rows are parsed again for each question, one at a time: keeping all would take many times the memory of the
+    // text.
     let rows = |skipped: usize| Rows::below(text, &header).skip(skipped);
     let first = rows(0).next().transpose()?;
     let (mut columns, unit_rows) = match first {
@@ -198,14 +199,14 @@ pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError
 struct Header {
     line: usize,
     separator: u8,
-    /// All names of the line.
+    /// All names in the line.
     cells: Vec<String>,
     columns: Vec<Column>,
-    /// Byte where the lines below begin.
+    /// Offset at which the lines below begin, bytes.
     end: usize,
 }
 
-/// The first line that names all columns needed.
+/// The first line that contains the names of all required columns.
 fn find_header(text: &str, options: &LogOptions) -> Result<Header, LogError> {
     const SEARCHED_LINES: usize = 500;
     let mut closest: Option<(usize, LogError)> = None;
@@ -238,7 +239,7 @@ fn split_line(line: &str, separator: u8) -> Option<Vec<String>> {
     Some(reader.records().next()?.ok()?.iter().map(str::to_owned).collect())
 }
 
-/// The columns of a header line, or how many were found and what is wrong.
+/// The columns of a header line, or the number found and what is missing.
 fn header_columns(cells: &[String], line: usize, options: &LogOptions) -> Result<Vec<Column>, (usize, LogError)> {
     let mut columns: Vec<Column> = Vec::new();
     let mut trouble = None;
@@ -303,8 +304,8 @@ fn header_columns(cells: &[String], line: usize, options: &LogOptions) -> Result
     Ok(columns)
 }
 
-/// How to read a missing field from one of the columns not read: by its unit it may be the one, but that is for the user to
-/// know (a force may be normal or tangential).
+/// How to choose an unused column for a missing field whose unit it has. The choice is left to the user, since a force
+/// may be normal or tangential.
 fn hint(field: Field, free: &[&String]) -> Option<String> {
     let fits = |cell: &&&String| split_unit(cell).1.is_some_and(|unit| !unit.is_empty() && field.unit(&unit).is_some());
     let column = free.iter().find(fits)?;
@@ -327,7 +328,7 @@ fn split_unit(cell: &str) -> (&str, Option<String>) {
     (cell, None)
 }
 
-/// The unit of a column when its name says it holds `field`; an empty unit when the name has none.
+/// The unit of a column whose name says that it contains `field`; empty if the name has no unit.
 fn recognise(cell: &str, field: Field) -> Option<String> {
     let (name, unit) = split_unit(cell);
     let name = name.to_lowercase().replace('µ', "μ");
@@ -368,12 +369,12 @@ impl Row {
     }
 }
 
-/// The rows below the header; those without any content are passed over.
+/// The rows below the header, without empty ones.
 struct Rows<'t> {
     text: &'t str,
     records: csv::StringRecordsIntoIter<&'t [u8]>,
-    /// The reader's own line numbers are those of the line breaks before a record: behind by the empty lines and by one
-    /// where lines end in CR LF.
+    /// Line number corrected for empty lines and CR LF: the CSV reader counts line breaks before a record and misses
+    /// those.
     line: usize,
     counted: usize,
 }
@@ -413,7 +414,7 @@ impl Iterator for Rows<'_> {
     }
 }
 
-/// That no line is longer than one of measurements can be.
+/// Checks that no line is longer than [`LONGEST_LINE`].
 fn check_lines(text: &str) -> Result<(), LogError> {
     match text.lines().position(|line| line.len() > LONGEST_LINE) {
         Some(at) => Err(LogError::Text { line: at + 1, reason: format!("longer than {LONGEST_LINE} bytes") }),
@@ -421,7 +422,7 @@ fn check_lines(text: &str) -> Result<(), LogError> {
     }
 }
 
-/// Whether the line below the header holds units: none of its cells has a digit at its start, and some are units.
+/// Whether the line below the header contains units: no cell begins with a digit, and some cells are units.
 fn is_unit_row(row: &Row, columns: &[Column]) -> bool {
     let cells = || columns.iter().filter_map(|column| Some((column, row.cells.get(column.index)?)));
     let bare = |cell: &str| cell.trim_matches(['[', ']', '(', ')']).trim().to_owned();
@@ -440,13 +441,13 @@ fn with_units(row: &Row, mut columns: Vec<Column>) -> Result<Vec<Column>, LogErr
     Ok(columns)
 }
 
-/// Whether times are dates: their first holds a `:` or a `-` behind its start.
+/// Whether times are dates: the first one contains a `:`, or a `-` that is neither a sign nor part of an exponent.
 fn is_iso(first: &Row, columns: &[Column]) -> bool {
     let first = first.time_text(columns);
     first.contains(':') || first.char_indices().any(|(at, c)| c == '-' && at >= 4 && !first.contains(['e', 'E']))
 }
 
-/// The factor of a column's unit, or that it has none it should have.
+/// Sets the factor of a column's unit; an error if a required unit is missing.
 fn resolve_unit(column: &mut Column, line: usize, iso: bool, options: &LogOptions) -> Result<(), LogError> {
     let field = column.field;
     if field == Field::Time && iso {
@@ -455,7 +456,7 @@ fn resolve_unit(column: &mut Column, line: usize, iso: bool, options: &LogOption
     }
     let mapped = options.columns.iter().any(|(mapped, _)| *mapped == field);
     if column.unit.is_empty() && mapped {
-        // Named by the field, and the field's name has the unit.
+        // Chosen by the field's name, which contains the unit.
         column.unit = field.units().first().map(|(unit, _)| (*unit).to_owned()).unwrap_or_default();
     }
     match field.unit(&column.unit) {
@@ -479,8 +480,8 @@ fn resolve_unit(column: &mut Column, line: usize, iso: bool, options: &LogOption
     }
 }
 
-/// Comma or point. A cell with both settles it (the last one is the decimal sign); so do cells with only one of them,
-/// unless there are cells of both kinds.
+/// Detects the decimal sign. A cell that contains both comma and point decides: the last one is the decimal sign.
+/// Otherwise cells with only one of them decide, unless both kinds occur.
 fn decimal_sign(
     rows: impl Iterator<Item = Result<Row, LogError>>,
     columns: &[Column],
@@ -545,8 +546,8 @@ fn sample(
             Field::NormalLoadN => (&mut sample.normal_load_n, Some(options.normal_load_n)),
             Field::DiscSpeedRadS => (&mut sample.disc_speed_rad_s, Some(options.disc_speed_rad_s)),
             Field::FrictionCoefficient => (&mut sample.friction_coefficient, None),
-            // Columns come in the order of `Field::ALL`: the load is there. Without load there is no contact and the
-            // coefficient has no meaning.
+            // Columns are in the order of `Field::ALL`, so the load is already known. Without load there is no contact
+            // and the friction coefficient is meaningless.
             Field::FrictionForceN | Field::Time => {
                 let friction = if sample.normal_load_n == 0.0 { 0.0 } else { value / sample.normal_load_n };
                 check(row, column, friction, options.friction_coefficient)?;
@@ -568,7 +569,7 @@ fn check(row: &Row, column: &Column, value: f64, [min, max]: [f64; 2]) -> Result
     }
 }
 
-/// A number with a decimal point and without signs between thousands; `None` when it is none.
+/// A number with a decimal point and without thousands separators; `None` if the cell is not a number.
 fn plain_number(cell: &str, decimal: char) -> Option<String> {
     let thousands = if decimal == ',' { '.' } else { ',' };
     let cell = cell.trim();
@@ -591,7 +592,7 @@ fn plain_number(cell: &str, decimal: char) -> Option<String> {
         text.push('.');
         text.push_str(fraction);
     }
-    // Digits only: `f64` would also take "inf" and "nan".
+    // Must begin with a digit: `f64` would also accept "inf" and "nan".
     let body = text.trim_start_matches(['+', '-']);
     (body.starts_with(|c: char| c.is_ascii_digit() || c == '.') && text.parse::<f64>().is_ok()).then_some(text)
 }

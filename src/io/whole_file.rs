@@ -1,8 +1,8 @@
-//! Files that appear under their name complete or not at all, whatever ends the process or the machine.
+//! Files that appear under their name either complete or not at all, even if the process or the machine stops.
 //!
-//! A file is written under a random name next to its own, put on the disk, and renamed; then its folder is put on the disk, so
-//! that the new name survives a power failure. This is the only place that does so; recordings in progress, which are useful
-//! before they are complete, are [`super::recording_file`]'s.
+//! A file is written under a random name in the same folder, synced to the disk and renamed. Then its folder is synced,
+//! so that the new name survives a power failure. No other module does this. Recordings in progress, which are useful
+//! before they are complete, are handled by [`super::recording_file`].
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, OpenOptions, Permissions};
@@ -27,49 +27,48 @@ pub enum WholeFileError {
     NotAFile { path: PathBuf },
 }
 
-/// Temporary files of this process.
+/// Temporary files of this process that are not finished.
 static BEGUN: Mutex<Vec<PathBuf>> = Mutex::new(vec![]);
-/// Held while files that belong together get their names.
+/// Held while files that belong together are renamed.
 static NAMING: Mutex<()> = Mutex::new(());
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // A list of paths is never half changed.
+    // A list of paths is always consistent.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Removes the files that are not complete yet, for a process that is about to end. From here on no file is begun, and none gets
-/// its name.
+/// Removes all unfinished files of a process that is about to end. From now on no file can be begun or renamed.
 pub fn remove_begun() {
     let (naming, mut begun) = (lock(&NAMING), lock(&BEGUN));
-    // One that cannot be removed must not keep the others.
+    // A file that cannot be removed must not prevent the removal of others.
     begun.drain(..).for_each(|path| drop(fs::remove_file(path)));
     std::mem::forget((naming, begun));
 }
 
-/// What follows the name of a temporary file; before it are a dot, the final name, a dot and [`RANDOM`] random letters.
+/// Suffix of a temporary file. Its name is a dot, the final name, a dot, [`RANDOM`] random letters and this suffix.
 const SUFFIX: &str = ".part";
 const RANDOM: usize = 6;
-/// A temporary file that nobody holds and that is older than this was left by a process that was killed.
+/// Age above which an unlocked temporary file counts as left behind by a killed process.
 const LEFTOVER_AGE: Duration = Duration::from_secs(60);
 
-/// A file that is being written under a temporary name, locked (`flock`). It is removed when dropped.
+/// A file being written under a temporary name, locked (`flock`). It is removed when dropped.
 #[derive(Debug)]
 pub struct WholeFile {
     file: File,
-    /// `None` once it has its name.
+    /// `None` once the file has its final name.
     temporary: Option<TempPath>,
     path: PathBuf,
 }
 
 impl WholeFile {
-    /// Begins a file that is named `path` when it is finished. The temporary file is new (never a link or a file that somebody put
-    /// there before); what killed processes left of earlier attempts is removed.
+    /// Begins a file that is named `path` when finished. The temporary file is always new, never an existing link or
+    /// file. Temporary files left by killed processes are removed.
     ///
     /// # Errors
     /// [`WholeFileError`].
     pub fn create(path: &Path) -> Result<Self, WholeFileError> {
         let name = path.file_name().ok_or_else(|| WholeFileError::NoName { path: path.to_owned() })?;
-        // What a link leads to counts: `/dev/stdout` is one.
+        // The target of a link decides: `/dev/stdout` is a link.
         if fs::metadata(path).is_ok_and(|there| !there.is_file()) {
             return Err(WholeFileError::NotAFile { path: path.to_owned() });
         }
@@ -87,20 +86,20 @@ impl WholeFile {
             .tempfile_in(folder);
         let (file, temporary) = created.map_err(|source| write_error(path, source))?.into_parts();
         begun.push(temporary.to_path_buf());
-        // File systems without locks exist; there the age alone tells leftovers.
+        // Some file systems have no locks; there only the age identifies remains.
         let _ = file.try_lock();
         Ok(Self { file, temporary: Some(temporary), path: path.to_owned() })
     }
 
-    /// What to write to.
+    /// The open temporary file.
     pub fn as_file(&self) -> &File {
         &self.file
     }
 
-    /// Puts what was written on the disk, replaces what has the final name now, and makes the name last.
+    /// Syncs the file to the disk, replaces any file with the final name, and syncs the folder.
     ///
     /// # Errors
-    /// [`WholeFileError`]; what had the name before is untouched.
+    /// [`WholeFileError`]; an existing file of that name is then unchanged.
     pub fn finish(self) -> Result<(), WholeFileError> {
         let path = self.path.clone();
         self.sync()?;
@@ -110,8 +109,8 @@ impl WholeFile {
         sync_folder(folder_of(&path)).map_err(|source| write_error(&path, source))
     }
 
-    /// As [`finish`](Self::finish) of a file that goes on growing under its final name, which must be free. Nothing is put on the
-    /// disk yet.
+    /// As [`finish`](Self::finish), for a file that continues to grow under its final name, which must be free. Nothing
+    /// is synced yet.
     ///
     /// # Errors
     /// [`WholeFileError`].
@@ -132,7 +131,7 @@ impl WholeFile {
         named.unwrap_or(Ok(())).map_err(|error| write_error(&self.path, error.error))
     }
 
-    /// The temporary name, no longer among those that [`remove_begun`] removes.
+    /// The temporary name, removed from the list of [`remove_begun`].
     fn take_temporary(&mut self) -> Option<TempPath> {
         let temporary = self.temporary.take()?;
         lock(&BEGUN).retain(|begun| *begun != *temporary);
@@ -146,7 +145,7 @@ impl Drop for WholeFile {
     }
 }
 
-/// Removes temporary files of `start` in `folder` that were left by killed processes.
+/// Removes temporary files in `folder` whose names begin with `start` and which killed processes left behind.
 fn remove_leftovers(folder: &Path, start: &OsStr) {
     let ours = |name: &OsStr| {
         let random =
@@ -165,10 +164,10 @@ fn remove_leftovers(folder: &Path, start: &OsStr) {
     }
 }
 
-/// Writes a file, whole or not at all.
+/// Writes a file either completely or not at all.
 ///
 /// # Errors
-/// [`WholeFileError`]; what `path` named before is untouched then.
+/// [`WholeFileError`]; an existing file at `path` is then unchanged.
 pub fn write_whole(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
@@ -176,17 +175,17 @@ pub fn write_whole(
     let whole = WholeFile::create(path)?;
     let mut writer = BufWriter::with_capacity(1 << 20, whole.as_file());
     let written = write(&mut writer).and_then(|()| writer.flush());
-    // What is still in the buffer of one that failed is not written.
+    // After an error the buffered rest must not be written.
     drop(writer.into_parts());
     written.map_err(|source| write_error(path, source))?;
     whole.finish()
 }
 
-/// Writes files that belong together, the last of which names the others: it appears when they are there, and none of them is
-/// left behind without it.
+/// Writes files that belong together. The last one names the others: it appears after them, and none of them remains
+/// without it.
 ///
 /// # Errors
-/// [`WholeFileError`] of the first that could not be written.
+/// [`WholeFileError`] of the first file that cannot be written.
 pub fn write_together<'a>(files: impl IntoIterator<Item = (PathBuf, &'a [u8])>) -> Result<(), WholeFileError> {
     let mut written = vec![];
     for (path, bytes) in files {
@@ -201,11 +200,11 @@ pub fn write_together<'a>(files: impl IntoIterator<Item = (PathBuf, &'a [u8])>) 
     let named = written.into_iter().enumerate().try_for_each(|(k, whole)| {
         let path = whole.path.clone();
         let at = |source| write_error(&path, source);
-        // The others' names are on the disk before the last one's.
+        // The names of the other files must be on the disk before that of the last.
         if k == last {
             sync_folder(folder_of(&path)).map_err(at)?;
         }
-        // One that is there already may belong to other files too.
+        // A file that already existed may belong to other files too, so it is not removed on failure.
         new.extend((!path.exists()).then(|| path.clone()));
         whole.rename()?;
         if k == last { sync_folder(folder_of(&path)).map_err(at) } else { Ok(()) }
@@ -217,15 +216,15 @@ pub fn write_together<'a>(files: impl IntoIterator<Item = (PathBuf, &'a [u8])>) 
     named
 }
 
-/// Makes new names in a folder survive a power failure.
+/// Syncs a folder, so that new names in it survive a power failure.
 ///
 /// # Errors
-/// What `fsync` yields, except where the file system has none for folders.
+/// Errors of `fsync`, unless the file system does not support it for folders.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
     sync_open_folder(&File::open(folder)?)
 }
 
-/// As [`sync_folder`], of one that is open, wherever it was moved.
+/// As [`sync_folder`] for an open folder, even if it was moved.
 ///
 /// # Errors
 /// As [`sync_folder`].
@@ -236,7 +235,7 @@ pub fn sync_open_folder(folder: &File) -> io::Result<()> {
     }
 }
 
-/// The folder a file is in.
+/// The folder that contains a file.
 pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
@@ -284,7 +283,7 @@ mod tests {
         assert_eq!(mode, fs::metadata(plain).unwrap().permissions().mode() & 0o777, "as any new file");
     }
 
-    /// Another user of a shared folder can put a link under any name that is known beforehand.
+    /// In a shared folder, another user can place a link under any predictable name.
     #[test]
     fn links_that_were_planted_are_not_followed() {
         let folder = tempfile::tempdir().unwrap();
@@ -296,7 +295,7 @@ mod tests {
         write_whole(&path, |out| out.write_all(b"new")).unwrap();
         assert_eq!(fs::read(&victim).unwrap(), b"precious");
         assert!(fs::symlink_metadata(&path).unwrap().is_file(), "the link itself was replaced");
-        // Two files never have the same temporary name.
+        // Temporary names are unique.
         let [first, second] = [(); 2].map(|()| WholeFile::create(&path).unwrap());
         assert_ne!(first.temporary.as_deref(), second.temporary.as_deref());
     }
@@ -341,10 +340,10 @@ mod tests {
     #[test]
     fn files_that_belong_together_appear_together() {
         let folder = tempfile::tempdir().unwrap();
-        // The file that names the others cannot be written: its folder is not there.
+        // The file that names the others cannot be written, because its folder does not exist.
         write_together(bytes_of(folder.path(), &[("a.npz", b"x"), ("none/rig.toml", b"x")])).unwrap_err();
         assert_eq!(names(folder.path()), [] as [String; 0]);
-        // It cannot be named: a folder has taken its name meanwhile.
+        // It cannot be renamed, because a folder has taken its name.
         let taken = folder.path().join("rig.toml");
         let whole = WholeFile::create(&taken).unwrap();
         fs::create_dir(&taken).unwrap();

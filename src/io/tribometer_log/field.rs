@@ -1,8 +1,8 @@
-//! The quantities of a log: what their columns are called, and in which units they may be.
+//! The quantities of a log: their column names and units.
 
 use std::{f64::consts::TAU, fmt};
 
-/// A quantity a column can hold, in the unit it is kept in.
+/// A quantity in a column; the name contains the unit in which it is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Field {
     /// Time of measurement.
@@ -10,16 +10,16 @@ pub enum Field {
     NormalLoadN,
     DiscSpeedRadS,
     FrictionCoefficient,
-    /// Instead of the friction coefficient: divided by the normal load.
+    /// Alternative to the friction coefficient, which is then this force over the normal load.
     FrictionForceN,
 }
 
 impl Field {
-    /// All of them.
+    /// All quantities.
     pub const ALL: [Self; 5] =
         [Self::Time, Self::NormalLoadN, Self::DiscSpeedRadS, Self::FrictionCoefficient, Self::FrictionForceN];
 
-    /// As options and messages name it.
+    /// Name in options and messages.
     pub fn name(self) -> &'static str {
         match self {
             Self::Time => "time_s",
@@ -35,7 +35,7 @@ impl Field {
         Self::ALL.into_iter().find(|field| field.name() == name)
     }
 
-    /// What its columns are called, words joined by `_`.
+    /// Usual column names, words joined by `_`.
     pub(super) fn synonyms(self) -> &'static [&'static str] {
         match self {
             Self::Time => &[
@@ -95,7 +95,7 @@ impl Field {
         }
     }
 
-    /// Units and how many of the kept unit one of them is; of time: how many ns.
+    /// Accepted units with their value in the stored unit; of time in ns.
     pub(super) fn units(self) -> &'static [(&'static str, f64)] {
         const FORCES: &[(&str, f64)] = &[("N", 1.0), ("daN", 10.0), ("kN", 1e3)];
         match self {

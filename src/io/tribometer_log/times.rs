@@ -1,8 +1,9 @@
-//! Times of a log in ns since the epoch.
+//! Converts times of a log to ns since the epoch.
 
 use jiff::civil::DateTime;
 
-/// A decimal number of units of `unit_ns`, in ns; exact, where `f64` would lose the ns of times since the epoch.
+/// A decimal number of units of `unit_ns`, in ns. Exact, whereas `f64` would lose the nanoseconds of times since the
+/// epoch.
 pub fn decimal_ns(text: &str, unit_ns: i64) -> Option<i64> {
     if text.contains(['e', 'E']) {
         let ns = (text.parse::<f64>().ok()? * unit_ns as f64).round();
@@ -22,13 +23,13 @@ pub fn decimal_ns(text: &str, unit_ns: i64) -> Option<i64> {
     i64::try_from(if negative { -ns } else { ns }).ok()
 }
 
-/// Whether `builtin_interfaces/Time`, whose seconds are an `int32`, holds a time; before 1970 is a mistake.
+/// Whether `builtin_interfaces/Time` can represent a time, with its `int32` seconds. Times before 1970 are mistakes.
 pub fn is_stamp(ns: &i64) -> bool {
     (0..(1 << 31) * 1_000_000_000).contains(ns)
 }
 
-/// A date with a time in ns since the epoch: ISO 8601, or day, month and year with points between; UTC without an offset.
-/// Days and months with slashes between are refused, for their order differs between countries.
+/// A date and time in ns since the epoch: ISO 8601, or day, month and year separated by points; UTC if no offset is
+/// given. Dates with slashes are refused, since the order of day and month differs between countries.
 pub fn date_ns(cell: &str) -> Option<i64> {
     let text = cell.trim().replacen(',', ".", 1);
     let with_points = || {
