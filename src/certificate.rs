@@ -14,7 +14,7 @@ use crate::rig::Rig;
 
 /// Default upper end of the band, if neither rig nor full model gives one, Hz.
 pub const DEFAULT_BAND_HZ: f64 = 5000.0;
-/// Roots that decay faster than this are not compared, 1/s.
+/// Roots that decay faster than this are neither compared nor held to the tolerance of a basis, 1/s.
 pub const DECAY_PER_S: f64 = 20.0;
 
 /// Certificate of a rig: its errors against the full model at held-out points. The table `[reduction]` of a rig file.

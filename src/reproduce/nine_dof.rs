@@ -7,8 +7,7 @@ use crate::plot::{self, Point, Unit};
 use crate::rig::Rig;
 use crate::session::map_options;
 
-/// Table 1 of the paper, rad/s: full model, reduced model 1, reduced model 2. As printed, so mode 2 comes before mode
-/// 3.
+/// Table 1 of the paper, rad/s: full model, reduced model 1, reduced model 2. In printed order: mode 2 before mode 3.
 const TABLE_1: [&[f64]; 3] = [
     &[1.0, 1.0720, 1.0720, 1.3809, 1.5698, 1.7718, 1.999, 2.2313, 5.4970],
     &[1.0, 1.0797, 1.0795, 1.4529, 2.1606],

@@ -56,7 +56,7 @@ const DOTS: usize = 10;
 /// Largest friction coefficient, as in the paper.
 const MU_MAX: f64 = 1.0;
 
-/// The largest number of [`MODES`] of pad and disc, at the contact interface.
+/// Modes of pad and disc at the contact interface, as many of each as the largest entry of [`MODES`].
 pub struct PartModes {
     omega_squared: Vec<Vec<f64>>,
     /// Rigs with all of these modes, without and with residual flexibility.

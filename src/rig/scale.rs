@@ -16,7 +16,7 @@ pub const NAMES: [&str; 3] = ["disc_speed_rad_s", "friction_coefficient", "norma
 
 /// Longest accepted text, bytes.
 const LONGEST: usize = 1000;
-/// Deepest accepted nesting of parentheses and signs.
+/// Deepest accepted nesting of parentheses.
 const DEEPEST: usize = 32;
 
 /// A binary operator. Declared as not commutative, so that operators of equal precedence are applied from left to
