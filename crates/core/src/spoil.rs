@@ -1,23 +1,24 @@
-//! What a test spoils in what its own thread computes next, so that the check behind it is seen to hold.
+//! Falsifies a result inside a solver, in tests only and on the calling thread only, to show that the check behind it
+//! notices.
 
 use std::cell::Cell;
 
-/// What is spoilt.
+/// The result to falsify.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Spoil {
-    /// An eigenvalue of the unsymmetric dense problem is moved by a millionth of the matrix.
+    /// Moves an eigenvalue of the unsymmetric dense problem by 1e-6 of the matrix norm.
     Value,
-    /// A right vector of the dense problem is turned.
+    /// Perturbs a right vector of the unsymmetric dense problem.
     Vector,
-    /// A converged mode of the Lanczos iteration is lost.
+    /// Drops a converged mode of the Lanczos iteration.
     Mode,
-    /// A root that two discs cover is lost from one of them.
+    /// Drops a root that lies in the discs of two shifts from one of them.
     Root,
-    /// Only one shift may be taken.
+    /// Allows only one shift.
     Shifts,
-    /// Ends of windows of a full model may take one round.
+    /// Allows the search for window ends of a full model only one round.
     Rounds,
-    /// No projection of a full model is good enough.
+    /// Lets no projection of a full model pass its accuracy check.
     Held,
 }
 
@@ -25,12 +26,12 @@ thread_local! {
     static NOW: Cell<Option<Spoil>> = const { Cell::new(None) };
 }
 
-/// Whether this is spoilt now.
+/// Whether `what` is to be falsified now.
 pub fn spoilt(what: Spoil) -> bool {
     NOW.get() == Some(what)
 }
 
-/// Runs `action` with something spoilt.
+/// Runs `action` with `what` falsified.
 pub fn with<T>(what: Spoil, action: impl FnOnce() -> T) -> T {
     NOW.set(Some(what));
     let result = action();

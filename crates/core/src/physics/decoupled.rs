@@ -1,7 +1,8 @@
-//! Coordinates that nothing couples to the others: modes that no contact row touches, damped by themselves.
+//! Uncoupled coordinates: modes with a zero contact row and modal damping only.
 //!
-//! Their rows and columns of `K` and `C` are zero off the diagonal in every term, so that `λ² + c λ + k = 0` gives their
-//! roots and a unit vector their shape, exactly and under all conditions. The eigenvalue problem is that of the rest.
+//! Their rows and columns of `K` and `C` have only diagonal entries, in every term. Their roots therefore follow from
+//! `λ² + c λ + k = 0` and their shapes are unit vectors, exactly and at every operating point. The eigenvalue problem
+//! contains only the coupled coordinates.
 
 use faer::{Mat, c64};
 
@@ -10,29 +11,29 @@ use super::operating_point::OperatingPoint;
 use super::solver::ROUNDING;
 use super::spectrum::{Root, RootError, SolveError, Spectrum, Vectors, order, square_root};
 
-/// A model taken apart.
+/// A model divided into coupled and uncoupled coordinates.
 #[derive(Clone, Debug)]
 pub struct Parts {
-    /// The model of the coordinates that are coupled.
+    /// The model of the coupled coordinates.
     pub coupled: Model,
-    /// Their places among all.
+    /// Indices of the coupled coordinates in the whole model.
     places: Vec<usize>,
-    /// The other coordinates.
+    /// Indices of the uncoupled coordinates.
     alone: Vec<usize>,
 }
 
 impl Model {
-    /// What is coupled and what is not; `None` where everything is. A model without any coupling is left whole.
+    /// The division of the model; `None` if all coordinates are coupled, and also if none are.
     pub(super) fn parts(&self) -> Option<&Parts> {
         self.parts.get_or_init(|| Parts::of(self).map(Box::new)).as_deref()
     }
 
-    /// How many coordinates nothing couples to the others: modes that a solve does without.
+    /// Number of uncoupled coordinates: modes that the eigenvalue problem does not contain.
     pub fn decoupled_count(&self) -> usize {
         self.parts().map_or(0, |parts| parts.alone.len())
     }
 
-    /// Diagonal entries `k` of `K` and `C`, or of their derivatives, by the `coefficient` of each term.
+    /// Diagonal entries `k` of `K` and `C`, or of their derivatives, with the `coefficient` of each term.
     fn diagonal(
         &self,
         k: usize,
@@ -48,14 +49,14 @@ impl Model {
     }
 }
 
-/// Where the vectors of a root are.
+/// The source of the vectors of a root.
 enum Column {
     Coupled(usize),
-    /// The unit vector of a coordinate, and the left one's length.
+    /// Index of an uncoupled coordinate, whose unit vector is the shape, and the scale of the left vector.
     Alone(usize, c64),
 }
 
-/// A root to be put in order.
+/// A root before sorting.
 struct Entry {
     root: Root,
     column: Column,
@@ -94,7 +95,7 @@ impl Parts {
         Some(Self { coupled, places, alone })
     }
 
-    /// The spectrum of `model` from that of its coupled part.
+    /// Completes the spectrum of the coupled coordinates with the roots of the uncoupled ones.
     pub(super) fn complete(&self, model: &Model, spectrum: Spectrum, vectors: Vectors) -> Result<Spectrum, SolveError> {
         let of_coupled = |(j, root): (usize, &Root)| {
             let sensitivity = spectrum.friction_sensitivity.get(j).copied().unwrap_or_default();
@@ -130,7 +131,7 @@ impl Parts {
     }
 }
 
-/// The roots of coordinate `k` by itself.
+/// Appends the roots of uncoupled coordinate `k` to `out`.
 fn alone(model: &Model, k: usize, of: &Spectrum, vectors: Vectors, out: &mut Vec<Entry>) -> Result<(), SolveError> {
     let p = &of.point;
     let [stiffness, damping] = model.diagonal(k, p, |law| model.coefficient(law, p))?;
@@ -141,7 +142,8 @@ fn alone(model: &Model, k: usize, of: &Spectrum, vectors: Vectors, out: &mut Vec
         (None, None) => f64::NAN,
     };
     let mut push = |lambda: c64, square: c64| {
-        // What `λ² + c λ + k` and its slope are there; each coefficient is rounded, and what is added up too.
+        // Value of `λ² + c λ + k` and its derivative at the computed root, with the rounding of its coefficients and
+        // of its terms.
         let off = square + damping * lambda + stiffness;
         let weight = if of.undamped { c64::ONE } else { 2.0 * lambda + damping };
         let size = square.norm() + damping.abs() * lambda.norm() + stiffness.abs();
@@ -149,7 +151,7 @@ fn alone(model: &Model, k: usize, of: &Spectrum, vectors: Vectors, out: &mut Vec
         let error = match (vectors, of.undamped) {
             (Vectors::None | Vectors::Right, _) => RootError::UNKNOWN,
             (Vectors::Both, true) => RootError::from_square(lambda, rounding, true),
-            // The nearer root of δ² + w δ + η = 0.
+            // The root nearer to zero of `δ² + w δ + η = 0`.
             (Vectors::Both, false) => {
                 RootError::from_lambda(lambda, rounding.sqrt().min(2.0 * rounding / weight.norm()))
             }
@@ -159,7 +161,7 @@ fn alone(model: &Model, k: usize, of: &Spectrum, vectors: Vectors, out: &mut Vec
             _ if off == c64::ZERO => 0.0,
             _ => off.norm() / size,
         };
-        // Where two roots of one coordinate meet, neither has a slope: then nothing is said to move it.
+        // At a double root neither has a derivative; the sensitivity is set to zero.
         let left = if weight == c64::ZERO { c64::ZERO } else { weight.inv().conj() };
         let change = lambda * damping_slope + stiffness_slope;
         let sensitivity = -left.conj() * change * if of.undamped { c64::ONE } else { 2.0 * lambda };
@@ -175,7 +177,7 @@ fn alone(model: &Model, k: usize, of: &Spectrum, vectors: Vectors, out: &mut Vec
         let lambda = c64::new(half, (-discriminant).sqrt());
         push(lambda, lambda * lambda);
     } else {
-        // The larger one first: nothing cancels in it, and their product is known.
+        // The root of larger magnitude first, without cancellation; the other follows from their product.
         let larger = half + discriminant.sqrt().copysign(half);
         let smaller = if larger == 0.0 { 0.0 } else { stiffness / larger };
         for lambda in [larger, smaller] {
@@ -194,7 +196,8 @@ mod tests {
     use super::super::test_models::REFERENCE;
     use super::*;
 
-    /// Ten modes on three contact pairs; those in `untouched` have rows of zeros. One of them is free, one over-damped.
+    /// Ten modes on three contact pairs. Those in `untouched` have zero contact rows. Mode 8 is free, mode 9
+    /// overdamped.
     fn rig(untouched: &[usize], damping_ratio: f64) -> Model {
         let mut uniform = Uniform::new(4);
         let omega: Vec<f64> = (0..10).map(|k| if k == 8 { 0.0 } else { 1.0 + 0.4 * f64::from(k) }).collect();
@@ -220,7 +223,7 @@ mod tests {
         model.and_then(|model| model.with_contact(&pairs)).expect("the rig is well formed")
     }
 
-    /// Roots, shapes, sensitivities and windows are those of the whole problem.
+    /// Roots, shapes and sensitivities agree with those of the undivided problem, and the map is complete.
     #[test]
     fn the_rest_is_the_whole() {
         for damping_ratio in [0.0, 1e-2] {
@@ -234,7 +237,7 @@ mod tests {
                 let parted = solver.solve(&model, &p, Vectors::Both).expect("it solves");
                 assert_eq!((parted.roots.len(), parted.mode_count), (whole.roots.len(), whole.mode_count));
                 for (j, root) in parted.roots.iter().enumerate() {
-                    // Equal roots, of a pair that grows and decays alike, may stand in either order.
+                    // Equal frequencies of a growing and a decaying mode may be listed in either order.
                     let off = |k: &usize| (whole.roots[*k].lambda - root.lambda).norm();
                     let k = (0..whole.roots.len()).min_by(|a, b| off(a).total_cmp(&off(b))).expect("roots");
                     let (other, limit) = (&whole.roots[k], whole.roots[k].error.omega + root.error.omega);
@@ -247,7 +250,7 @@ mod tests {
                     let moved = (whole.friction_sensitivity[k] - parted.friction_sensitivity[j]).norm();
                     assert!(moved < 1e-7 * (1.0 + parted.friction_sensitivity[j].norm()), "{moved:e} at {root:?}");
                     assert!((other.pad_participation - root.pad_participation).abs() < 1e-8);
-                    // `y` takes a change of any one entry to the same change of the root.
+                    // With `y`, the change of a root due to a change of any one matrix entry is the same.
                     let left = |s: &Spectrum, k: usize| s.left[(3, k)].conj() * s.shapes[(6, k)];
                     assert!((left(&whole, k) - left(&parted, j)).norm() < 1e-8, "left vector at {root:?}");
                 }
@@ -260,7 +263,7 @@ mod tests {
         }
     }
 
-    /// `λ² + cλ + k = 0` by hand beside a coupled pair: free, static, over-damped.
+    /// `λ² + cλ + k = 0` solved by hand, next to a coupled pair: underdamped, overdamped, free, divergent.
     #[test]
     fn by_hand() {
         let coupled = [[4.0, 1.0], [1.0, 9.0]];

@@ -1,4 +1,4 @@
-//! The dense eigenvalue problem, symmetric or not, and its vectors in LAPACK's packing.
+//! The dense eigenvalue problem, symmetric or unsymmetric, with its vectors in LAPACK's packing.
 
 use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
 use faer::linalg::evd::{
@@ -9,8 +9,8 @@ use faer::{Auto, Col, Mat, MatRef, Par, Spec, c64};
 
 use super::spectrum::{SolveError, Vectors};
 
-/// Workspace of the dense eigenvalue problem, and its answer: values, and vectors in LAPACK's packing, a complex pair in two
-/// columns, real and imaginary part.
+/// Workspace and result of the dense eigenvalue problem: eigenvalues, and vectors in LAPACK's packing, in which a
+/// complex conjugate pair takes two columns, for real and imaginary part.
 pub struct Dense {
     pub values: Vec<c64>,
     pub left: Mat<f64>,
@@ -19,7 +19,7 @@ pub struct Dense {
 }
 
 impl Dense {
-    /// Nothing allocated yet.
+    /// A workspace with nothing allocated yet.
     pub fn new() -> Self {
         Self { values: vec![], left: Mat::new(), right: Mat::new(), memory: MemBuffer::new(StackReq::EMPTY) }
     }
@@ -36,13 +36,13 @@ impl Dense {
         self.values.clear();
     }
 
-    /// Eigenvalues of a symmetric `matrix`, and its vectors if asked for.
+    /// Computes the eigenvalues of a symmetric `matrix`, and its vectors if requested.
     pub fn symmetric_eigen(&mut self, matrix: MatRef<'_, f64>, vectors: Vectors) -> Result<(), SolveError> {
         let dimension = matrix.nrows();
         self.fit(dimension);
         let mut kappa = Col::<f64>::zeros(dimension);
-        // faer stops at an absolute tolerance near 1e-16: entries are brought near 1, by a power of two so that no
-        // digit changes.
+        // faer's iteration stops at an absolute tolerance near 1e-16. The entries are scaled to near 1 by a power of
+        // two, which is exact.
         let exponent = matrix.norm_max().log2().ceil();
         let unit = if exponent.is_finite() { exponent.exp2() } else { 1.0 };
         self_adjoint_evd(
@@ -58,7 +58,7 @@ impl Dense {
         Ok(())
     }
 
-    /// Eigenvalues of `matrix`, whose Frobenius norm is `norm`, and the vectors that are asked for.
+    /// Computes the eigenvalues of `matrix`, whose Frobenius norm is `norm`, and the requested vectors.
     pub fn eigen(&mut self, matrix: MatRef<'_, f64>, norm: f64, vectors: Vectors) -> Result<(), SolveError> {
         let dimension = matrix.nrows();
         self.fit(dimension);
@@ -84,7 +84,7 @@ impl Dense {
             self.right[(0, 0)] += 1e-3;
         }
         self.values.extend(re.iter().zip(im.iter()).map(|(&re, &im)| c64::new(re, im)));
-        // faer does not report whether the iteration converged; the traces of what it left tell.
+        // faer does not report whether the iteration converged, so the result is checked by traces.
         let rounding = 64.0 * dimension as f64 * f64::EPSILON;
         let mut trace_of_square = 0.0;
         for j in 0..dimension {
@@ -112,7 +112,7 @@ fn symmetric_params() -> Spec<SelfAdjointEvdParams, f64> {
     <SelfAdjointEvdParams as Auto<f64>>::auto().into()
 }
 
-/// Where LAPACK's packing keeps a vector: `re + i sign im`, real without `im`.
+/// Columns of a vector in LAPACK's packing: the vector is `re + i sign im`, or `re` if there is no `im`.
 #[derive(Clone, Copy)]
 pub struct Packing {
     pub re: usize,
@@ -120,8 +120,8 @@ pub struct Packing {
     sign: f64,
 }
 
-/// Where the vector of each of `values` is: the first of a complex pair holds real and imaginary part of its own vector
-/// in its two columns; the second is its conjugate.
+/// Columns of the vectors of `values`. The two columns of a complex conjugate pair hold real and imaginary part of
+/// the first vector; the second vector is its conjugate.
 pub fn packing(values: &[c64]) -> impl Iterator<Item = Packing> {
     let mut second = false;
     values.iter().enumerate().map(move |(k, value)| {
@@ -179,7 +179,7 @@ impl<'a> Packed<'a> {
     }
 }
 
-/// `Σ aᵢ bᵢ`, in eight sums side by side.
+/// `Σ aᵢ bᵢ`, in eight independent partial sums.
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 8];
     let (mut a, mut b) = (a.chunks_exact(8), b.chunks_exact(8));

@@ -1,6 +1,7 @@
-//! Contact through what truncated modes leave out: residual flexibility and residual inertia.
+//! Contact with residual flexibility and residual inertia of the truncated modes.
 //!
-//! With the residual flexibility `R` of both sides between contact pairs, the contact forces satisfy `S(μ) N = -B_n q`:
+//! Let `R` be the residual flexibility between contact pairs, the sum of both sides. The contact forces `N` satisfy
+//! `S(μ) N = -B_n q`:
 //!
 //! ```text
 //! S(μ) = K_c⁻¹ + R_nn + μ R_nt,   S⁻¹ = A K_c,   A = (I + K_c (R_nn + μ R_nt))⁻¹
@@ -9,11 +10,11 @@
 //! M(μ) = I + (B_n + μ B_t)ᵀ S⁻¹ (Q_nn + μ Q_nt) S⁻¹ B_n
 //! ```
 //!
-//! `M⁻¹ K` and `M⁻¹ C` are smooth in `μ` and become sums of terms: their value at 0, and `x` times a Chebyshev expansion
-//! of the rest divided by `x = s μ`. Friction's own damping acts on modal velocities, without `M⁻¹`: what that leaves
-//! out is of second order in the residual.
+//! `M⁻¹ K` and `M⁻¹ C` are smooth in `μ`. They become sums of terms: the value at 0, plus `x = s μ` times a Chebyshev
+//! expansion of `(f(x) - f(0)) / x`. Damping by the friction slope and by lateral friction acts on modal velocities
+//! without `M⁻¹`; the error is of second order in the residual.
 //!
-//! Source: MacNeal 1971 (residual flexibility); Rubin 1975 (its inertia); Craig and Chang 1977.
+//! Source: MacNeal 1971 (residual flexibility); Rubin 1975 (residual inertia); Craig and Chang 1977.
 
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef};
@@ -21,19 +22,20 @@ use faer::{Mat, MatRef};
 use super::chart::chebyshev;
 use super::model::{ContactPairs, Law, Model, ModelError};
 
-/// Largest condition number of `I + K_c R(μ)` that is accepted.
+/// Maximum condition number of `I + K_c R(μ)`.
 const CONDITION_LIMIT: f64 = 1e10;
-/// What the highest Chebyshev coefficients may be, relative to the largest entry of the matrix.
+/// Maximum size of the two highest Chebyshev coefficients, relative to the largest entry of the matrix.
 const FIT_LIMIT: f64 = 1e-9;
 
-/// Residuals of truncated modes between `c` contact pairs, sum of both sides; of relative displacement, pad minus disc.
+/// Residuals of the truncated modes between `c` contact pairs, for relative displacement, pad minus disc; sum of both
+/// sides.
 #[derive(Clone, Debug)]
 pub struct ResidualFlexibility {
-    /// `R_nn`, `c×c`, m/N: displacement along `n` from forces along `n`.
+    /// `R_nn`, `c×c`, m/N: displacement along `n` due to forces along `n`.
     pub normal: Mat<f64>,
-    /// `R_nt`, `c×c`, m/N: displacement along `n` from forces along `t`.
+    /// `R_nt`, `c×c`, m/N: displacement along `n` due to forces along `t`.
     pub sliding: Mat<f64>,
-    /// `Q_nn` and `Q_nt`, `c×c`, s²·m/N; none where the inertia of the residual is left out.
+    /// `Q_nn` and `Q_nt`, `c×c`, s²·m/N; `None` to omit residual inertia.
     pub inertia: Option<[Mat<f64>; 2]>,
 }
 
@@ -61,7 +63,8 @@ impl Model {
         self.with_friction_damping(pairs)
     }
 
-    /// The same without friction, and nothing fitted: a model for a friction coefficient of 0 alone.
+    /// Adds the contact without friction and without a Chebyshev expansion. The model is valid at friction
+    /// coefficient 0 only.
     ///
     /// # Errors
     /// Those of [`Model::with_contact`]; [`ModelError::FlexibleLoadExponent`], [`ModelError::IllConditioned`].
@@ -82,7 +85,7 @@ impl Model {
         self.add_damping("contact damping", damping, Law::ContactDamping)
     }
 
-    /// The contact, checked, between what the model has so far.
+    /// Checks the contact and combines it with the model's terms without contact.
     fn flexible_contact<'a>(
         &self,
         pairs: &'a ContactPairs,
@@ -125,7 +128,7 @@ struct FlexibleContact<'a> {
 }
 
 impl FlexibleContact<'_> {
-    /// What the contact adds to `K` and `C` at `x = s μ`.
+    /// The contribution of the contact to `M⁻¹ K` and `M⁻¹ C` at `x = s μ`, both `n×n`.
     fn at(&self, x: f64) -> Result<[Mat<f64>; 2], ModelError> {
         let ContactPairs { normal, sliding, stiffness_n_per_m, damping_n_s_per_m, .. } = self.pairs;
         let c = normal.nrows();
@@ -147,7 +150,7 @@ impl FlexibleContact<'_> {
             let limit = CONDITION_LIMIT;
             return Err(ModelError::IllConditioned { friction_coefficient: x, condition, limit });
         }
-        // Forces on the pads per displacement, K_c and C_c seen through the flexibility.
+        // Contact forces per displacement and per velocity: `K_c` and `C_c` in series with the residual flexibility.
         let springs = &inverse * scaled(stiffness_n_per_m, normal.as_ref());
         let seen = right.partial_piv_lu().solve(normal);
         let dampers = &inverse * scaled(damping_n_s_per_m, seen.as_ref());
@@ -155,7 +158,7 @@ impl FlexibleContact<'_> {
         let mut stiffness = forces.transpose() * &springs;
         let mut damping = forces.transpose() * &dampers;
         if x == 0.0 {
-            // Symmetric but for rounding: R is.
+            // Symmetric up to rounding because `R` is; made exactly symmetric.
             stiffness = symmetric_part(&stiffness);
             damping = symmetric_part(&damping);
         }
@@ -165,16 +168,16 @@ impl FlexibleContact<'_> {
             let n = normal.ncols();
             let mass = Mat::<f64>::identity(n, n) + forces.transpose() * response;
             let solver = mass.partial_piv_lu();
-            // M⁻¹ (K_free + K_contact) - K_free, and the same of C.
+            // `M⁻¹ (K_free + K_contact) - K_free`, and the same for `C`.
             stiffness = solver.solve(stiffness + &self.free[0]) - &self.free[0];
             damping = solver.solve(damping + &self.free[1]) - &self.free[1];
         }
         Ok([stiffness, damping])
     }
 
-    /// Chebyshev coefficients over `[-range, range]` of what [`Self::at`] gives, less `at_rest`, divided by `x`.
+    /// Chebyshev coefficients over `[-range, range]` of `(f(x) - at_rest) / x`, where `f` is [`Self::at`].
     fn expansion(&self, at_rest: &[Mat<f64>; 2], range: f64) -> Result<Vec<[Mat<f64>; 2]>, ModelError> {
-        // An even number of nodes: none of them is 0.
+        // The number of nodes is even so that no node is 0.
         let mut m = 8;
         loop {
             let mut quotients = vec![];
@@ -209,7 +212,7 @@ impl FlexibleContact<'_> {
     }
 }
 
-/// Coefficients of the interpolant through matrices at the nodes.
+/// Chebyshev coefficients of the interpolating polynomial through matrices at the nodes.
 fn coefficients(values: &[[Mat<f64>; 2]]) -> Vec<[Mat<f64>; 2]> {
     let m = values.len();
     let weights: Vec<Vec<f64>> = (0..m)
@@ -252,7 +255,7 @@ mod tests {
         1000.0 * (mode + 1) as f64
     }
 
-    /// Rows of relative displacement, no two alike.
+    /// Contact rows of relative displacement, all different.
     fn rows(modes: usize, phase: f64) -> Mat<f64> {
         Mat::from_fn(PAIRS, modes, |pair, mode| (phase + 1.7 * pair as f64 + 2.3 * mode as f64).sin())
     }
@@ -297,8 +300,8 @@ mod tests {
         [stiffness, damping]
     }
 
-    /// Block elimination of the modes beyond [`KEPT`] from the model of all of them: `K`, `M` and `C` of a motion in
-    /// which they follow the others statically.
+    /// Static condensation of the modes beyond [`KEPT`], by block elimination in the model of all modes. Returns `K`,
+    /// `M` and `C`.
     fn condensed(mu: f64) -> [Mat<f64>; 3] {
         let [stiffness, damping] = assembled(&free(ALL).with_contact(&pairs(ALL)).unwrap(), mu);
         let rest = ALL - KEPT;
@@ -333,12 +336,13 @@ mod tests {
                 (k_inertia, solver.solve(&stiffness)),
                 (c_inertia, solver.solve(&damping)),
             ] {
-                // The expansion is cut where its last coefficients fall below 1e-9.
+                // The expansion is truncated where its last coefficients fall below 1e-9.
                 let error = (&found - &expected).norm_max() / expected.norm_max();
                 assert!(error < 1e-8, "mu {mu}: {error:e}");
             }
         }
-        // At rest exactly symmetric, as the solver looks for it; and the same where nothing was fitted.
+        // At `μ = 0`, `K` is exactly symmetric, which the choice of the solver depends on; and equal to the model
+        // without expansion.
         let [k, _] = assembled(&without, 0.0);
         assert_eq!(k, k.transpose().to_owned());
         let at_rest = free(KEPT).with_flexible_contact_at_rest(&pairs(KEPT), &residual()).unwrap();
@@ -368,7 +372,7 @@ mod tests {
         };
         let hertzian = ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() };
         assert!(matches!(with(&residual(), hertzian, 1.0), ModelError::FlexibleLoadExponent { .. }));
-        // I + K_c R loses its first pivot near μ = 0.5: 1 + 2e6 (1e-6 - 3e-6 μ).
+        // The first pivot of `I + K_c R` becomes zero near `μ = 0.5`: `1 + 2e6 (1e-6 - 3e-6 μ)`.
         let one = |value: f64| Mat::from_fn(PAIRS, PAIRS, |i, j| if i == 0 && j == 0 { value } else { 0.0 });
         let singular = ResidualFlexibility { normal: one(1e-6), sliding: one(-3e-6), inertia: None };
         let refused = with(&singular, ContactLaw::default(), 1.0);

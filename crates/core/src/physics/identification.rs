@@ -1,39 +1,42 @@
-//! Contact stiffness from natural frequencies: the factor on the stiffness of all contact pairs that fits targets best.
+//! Identifies the contact stiffness from natural frequencies: the common factor on all contact pairs that fits
+//! targets best.
 //!
 //! ```text
 //! e_i(k) = f_i(k) / f_i* - 1,   rms(k) = sqrt(Σ e_i² / m) -> min
 //! ```
 //!
-//! over the first `m` natural frequencies at rest, ascending on both sides. The curve over decades of `k` is kept: its
-//! bottom is flat where the frequencies hardly know the stiffness. How well they know it is their sensitivity
+//! over the first `m` natural frequencies at rest, in ascending order like the targets. The curve over several
+//! decades of `k` is kept. Its minimum is flat where the frequencies depend little on the stiffness. The sensitivity
+//! measures this dependence:
 //!
 //! ```text
-//! S = sqrt(Σ (d ln f_i / d ln k)² / m):   frequencies wrong by ε leave k open by about ε / S
+//! S = sqrt(Σ (d ln f_i / d ln k)² / m):   a relative error ε of the frequencies leaves k uncertain by about ε / S
 //! ```
 //!
 //! Source: the paper's Figs. 12 and 13.
 
-/// Decades on both sides of the present stiffness that are searched.
+/// Search range on both sides of the present stiffness, in decades.
 const DECADES: f64 = 4.0;
-/// Points of the curve to a decade.
+/// Points of the curve per decade.
 const PER_DECADE: usize = 10;
-/// Change of `ln k` to both sides over which the sensitivity is taken.
+/// Half step in `ln k` of the central difference for the sensitivity.
 const SENSITIVITY_STEP: f64 = 0.01;
-/// Width of the last bracket of the minimiser, decades: a smooth minimum is found to half of the digits anyway.
+/// Final bracket width of the minimisation, in decades. A smooth minimum is only determined to half of the digits
+/// anyway.
 const BRACKET: f64 = 1e-9;
-/// To what part of their distance from the minimiser the ends of the range are found.
+/// Precision of the ends of the range, relative to their distance from the minimum.
 const RANGE_PRECISION: f64 = 1e-3;
 /// `(3 - sqrt 5) / 2`.
 const GOLDEN: f64 = 0.381_966_011_250_105_1;
 
-/// Errors of the frequencies at one stiffness.
+/// Errors of the frequencies for one stiffness.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trial {
     /// Factor on the stiffness of every pair.
     pub factor: f64,
-    /// `f_i`, Hz, as many as there are targets.
+    /// `f_i`, Hz, one for each target.
     pub frequencies_hz: Vec<f64>,
-    /// Root of the mean square of `e_i`.
+    /// Root mean square of `e_i`.
     pub rms_error: f64,
     /// Mean of `|e_i|`.
     pub mean_error: f64,
@@ -45,15 +48,16 @@ pub struct Trial {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Identified {
     pub best: Trial,
-    /// Factors between which the error stays below twice its minimum; `None` where the search ended before it rose.
+    /// Factors between which the error stays below twice its minimum; `None` where it does not reach that in the
+    /// search range.
     pub doubled: [Option<f64>; 2],
-    /// `S`: by how much the frequencies move, relatively, for a relative change of the stiffness.
+    /// `S`: relative change of the frequencies per relative change of the stiffness.
     pub sensitivity: f64,
-    /// Ascending in the factor.
+    /// The trials over the search range, ascending in the factor.
     pub curve: Vec<Trial>,
 }
 
-/// Why no stiffness was found.
+/// Why the stiffness could not be identified.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub enum IdentificationError<E> {
     #[error("{found} natural frequencies, expected at least the {expected} of the targets")]
@@ -66,7 +70,8 @@ pub enum IdentificationError<E> {
     Model(#[from] E),
 }
 
-/// Finds the factor that fits `targets_hz`; `frequencies` gives the natural frequencies at rest, Hz, ascending, for a factor.
+/// Finds the factor that fits `targets_hz`. `frequencies` returns the natural frequencies at rest for a factor, Hz,
+/// ascending.
 ///
 /// # Errors
 /// [`IdentificationError`].
@@ -108,7 +113,7 @@ pub fn identify<E>(
     if lowest == 0 || lowest == count {
         return Err(IdentificationError::AtTheEnd { factor: curve[lowest].factor });
     }
-    // Golden section between the neighbours of the lowest point.
+    // Golden-section search between the neighbours of the lowest point.
     let (mut low, mut high) = (exponent(lowest - 1), exponent(lowest + 1));
     let mut best = (exponent(lowest), curve[lowest].clone());
     while high - low > BRACKET {
@@ -152,7 +157,8 @@ mod tests {
     use super::*;
     use std::convert::Infallible;
 
-    /// Two masses on springs of 1 and 4 joined by one of 3 times the factor: `f²` are the eigenvalues of a 2x2 matrix.
+    /// Two masses on springs of 1 and 4, joined by a spring of 3 times the factor: `f²` are the eigenvalues of a 2x2
+    /// matrix.
     fn pair(factor: f64) -> Result<Vec<f64>, Infallible> {
         let k = 3.0 * factor;
         let (mean, half) = (2.5 + k, (1.5_f64.powi(2) + k * k).sqrt());
@@ -163,10 +169,12 @@ mod tests {
     fn the_stiffness_that_made_the_targets_is_found() {
         let targets = pair(7.3).unwrap();
         let found = identify(&targets, &mut pair).unwrap();
-        // The error falls linearly to 0 here: the last bracket decides, and rounding of 1e-16 in the frequencies.
+        // The error falls linearly to 0 here, so the accuracy is that of the final bracket and of rounding, 1e-16, in
+        // the frequencies.
         assert!((found.best.factor / 7.3 - 1.0).abs() < 1e-6, "{}", found.best.factor);
         assert!(found.best.rms_error < 1e-7 && found.curve.len() == 81);
-        // d ln f / d ln k of f² = 2.5 + k ∓ sqrt(1.5² + k²), by hand; differences over 1 % are good to its square.
+        // Closed form of `d ln f / d ln k` for `f² = 2.5 + k ∓ sqrt(1.5² + k²)`. Differences with a step of 1 % are
+        // accurate to its square.
         let k = 3.0_f64 * 7.3;
         let root = (2.25 + k * k).sqrt();
         let slope = |sign: f64| 0.5 * k * (1.0 + sign * k / root) / (2.5 + k + sign * root);

@@ -484,8 +484,8 @@ impl Model {
         Ok(())
     }
 
-    /// Derivative of the value of `law` at `p` with respect to `parameter`: per unit of the friction coefficient, per N,
-    /// per rad/s, or per relative change of contact stiffness or damping.
+    /// Derivative of the value of `law` at `p` with respect to `parameter`: per unit of the friction coefficient, per
+    /// N, per rad/s, or per relative change of contact stiffness or damping.
     pub(super) fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
         use Parameter::{ContactDamping, ContactStiffness, Friction, Load, Speed};
         let value = self.coefficient(law, p);

@@ -1,10 +1,11 @@
-//! Identities of modes: the one place where they are given, to modes that were solved and to modes read off a chart alike.
+//! Identities of modes. They are assigned only here, in the same way for solved and charted modes.
 //!
-//! A [`StabilityMap`] follows every root by its shape from friction coefficient 0, where identities ascend in frequency. Between
-//! two of its nodes the followed roots are interpolated; a mode then takes the identity of the interpolated root that has
-//! its rank in frequency. Where two frequencies are close but growth rates are not, ranks mean little: neighbours exchange their
-//! identities if the difference of the two roots points against that of the two interpolated ones, whatever both are off by
-//! together. Only values decide, so that it does not matter where a mode comes from.
+//! A [`StabilityMap`] follows every root by its shape from friction coefficient 0, where identities ascend in
+//! frequency. Between two nodes of the map the followed roots are interpolated. A mode takes the identity of the
+//! interpolated root with the same rank in frequency. Rank is unreliable where two frequencies are close but the
+//! growth rates are not. Two modes therefore exchange identities if the difference of their roots points opposite to
+//! the difference of the two interpolated roots; an error common to both cancels in the differences. Only the values
+//! of the roots are used, so solved and charted modes get the same identities.
 
 use faer::c64;
 
@@ -19,59 +20,61 @@ use super::summary::{Mode, Summary};
 use super::synthetic::Uniform;
 use super::tracking::tracked;
 
-/// Two roots closer than this, relative, are one as far as a chart can tell: they keep the order of the interpolated ones.
+/// Two roots closer than this, relative, cannot be distinguished on a chart; they keep the order of the interpolated
+/// roots.
 const TOGETHER: f64 = 1e-7;
-/// An interpolated root may stray from a straight line by this share of the distance to its nearest neighbour.
+/// Maximum deviation of an interpolated root from a straight line, relative to the distance to its nearest neighbour.
 const STRAY: f64 = 0.25;
-/// Modes that may exchange their identities are at most so many ranks apart.
+/// Maximum difference in rank of two modes that may exchange identities.
 const REACH: usize = 3;
-/// Followed roots that stay above the highest mode by this factor have nothing to do with it.
+/// Followed roots that stay above the highest mode by this factor are counted but not interpolated.
 const ABOVE: f64 = 1.2;
-/// Identities from here on are of modes that no node of the map has.
+/// First of the identities given to modes that no node of the map has.
 const UNKNOWN: u32 = 1_000_000;
 
-/// A followed root between two neighbouring nodes: its index at each, and whether a cubic through values and slopes is used
-/// rather than a straight line, which never crosses a neighbour that it does not cross at the nodes.
+/// A followed root between two neighbouring nodes: its index at each node, and whether it is interpolated by a cubic
+/// through values and slopes instead of a straight line. A straight line crosses only those neighbours that it also
+/// crosses at the nodes.
 #[derive(Clone, Copy, Debug)]
 struct Path {
     id: u32,
     left: Option<u32>,
     right: Option<u32>,
     curved: bool,
-    /// The lower of its frequencies at the two, rad/s.
+    /// The lower of its frequencies at the two nodes, rad/s.
     lowest: f64,
 }
 
-/// The followed roots between any two neighbouring nodes of a map.
+/// The followed roots between every two neighbouring nodes of a map.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Numbering {
     spans: Vec<Vec<Path>>,
 }
 
-/// A followed root at a friction coefficient.
+/// A followed root, interpolated to a friction coefficient.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Followed {
     id: u32,
     /// `λ²` of an undamped model, `λ` of a damped one.
     z: c64,
-    /// What it is ranked by.
+    /// Sort key: `ω` of a mode, `-|λ|` of a static root.
     rank: f64,
     growth: f64,
 }
 
-/// What is known of all roots at a point besides the modes to be numbered.
+/// Numbers of roots at a point, which are needed to number the modes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Census {
-    /// Whether no damping takes part.
+    /// Whether all damping is zero.
     pub undamped: bool,
-    /// Number of roots that are followed, in the band or not.
+    /// Number of followed roots, in the band or not.
     pub tracked: usize,
-    /// How many of these do not oscillate.
+    /// Number of followed roots that are static.
     pub statics: usize,
 }
 
 impl Census {
-    /// Of a spectrum.
+    /// The census of a spectrum.
     pub fn of(spectrum: &Spectrum) -> Self {
         let tracked = tracked(spectrum);
         Self { undamped: spectrum.undamped, tracked, statics: tracked - spectrum.mode_count }
@@ -79,7 +82,7 @@ impl Census {
 }
 
 impl Numbering {
-    /// Of the nodes of a map.
+    /// Connects the roots of neighbouring nodes of a map.
     pub(super) fn new(nodes: &[Node]) -> Self {
         let gaps: Vec<Vec<f64>> = nodes.iter().map(|node| gaps(&node.spectrum)).collect();
         let span = |k: usize| {
@@ -107,8 +110,10 @@ impl Numbering {
         Self { spans: (0..spans).map(span).collect() }
     }
 
-    /// The followed roots at friction coefficient `mu`, in the order of their rank, those of the node that has `tracked` of them;
-    /// beyond the nodes those of the last. Such as stay above `highest`, rad/s, are only counted: the number of all.
+    /// Writes the followed roots at friction coefficient `mu` to `out`, sorted by rank. If the two neighbouring nodes
+    /// have different numbers of followed roots, those of the node with `tracked` roots are used; beyond the nodes,
+    /// those of the last node. Roots that stay above `highest`, rad/s, are counted but not written. Returns the
+    /// number of all followed roots.
     fn at(&self, nodes: &[Node], mu: f64, tracked: usize, highest: f64, out: &mut Vec<Followed>) -> usize {
         out.clear();
         let after = nodes.partition_point(|node| node.mu() < mu);
@@ -151,8 +156,8 @@ impl Numbering {
 }
 
 impl StabilityMap {
-    /// Gives `modes`, the lowest of those at friction coefficient `mu`, none left out and ordered as in a [`Spectrum`], their
-    /// identities. `followed` is room to work in.
+    /// Assigns identities to `modes`, the lowest modes at friction coefficient `mu`, without gaps and ordered as in a
+    /// [`Spectrum`]. `followed` is a work array.
     pub fn number(&self, mu: f64, census: Census, modes: &mut [Mode], followed: &mut Vec<Followed>) {
         let comparable = self.nodes.first().is_some_and(|node| node.spectrum.undamped == census.undamped);
         if !comparable {
@@ -161,7 +166,7 @@ impl StabilityMap {
         }
         let highest = modes.last().map_or(0.0, |mode| mode.root.lambda.im);
         let all = self.numbering.at(&self.nodes, mu, census.tracked, ABOVE * highest, followed);
-        // Modes vanish, by ceasing to oscillate, at the lower end: they are counted from the upper one.
+        // Modes that become static disappear at the low end of the ranks, so modes are counted from the high end.
         let missing = census.tracked as isize - all as isize;
         let place = |k: usize| usize::try_from((k + census.statics) as isize - missing).ok();
         let at = |k: usize| place(k).filter(|&place| place < followed.len());
@@ -178,8 +183,8 @@ impl StabilityMap {
         let z = |root: &Root| if census.undamped { root.square } else { root.lambda };
         for _ in 0..count {
             let mut settled = true;
-            // Not only neighbours: the two of a flutter pair have one frequency, and another mode may stand between them and their
-            // identities.
+            // Not only direct neighbours: the two modes of a flutter pair have one frequency, and another mode may
+            // lie between them in rank.
             for (k, apart_by) in (1..=REACH).flat_map(|by| (by..count).map(move |k| (k, by))) {
                 let before = k - apart_by;
                 let (here, there) = (z(&modes[before].root), z(&modes[k].root));
@@ -198,8 +203,8 @@ impl StabilityMap {
         modes.iter_mut().zip(followed).for_each(|(mode, followed)| mode.id = followed.id);
     }
 
-    /// Identities of the roots of `spectrum`, solved at this map's load and speed or close to them; `None` for roots that are not
-    /// followed.
+    /// Identities of the roots of `spectrum`, which must be solved at this map's load and speed or close to them;
+    /// `None` for roots that are not followed.
     pub fn ids(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
         let mut modes: Vec<Mode> = spectrum.modes().iter().map(|&root| Mode { id: 0, root }).collect();
         let mut followed = vec![];
@@ -218,13 +223,13 @@ impl StabilityMap {
     }
 }
 
-/// What is interpolated.
+/// The interpolated quantity: `λ²` of an undamped model, `λ` of a damped one.
 fn value(spectrum: &Spectrum, k: usize) -> c64 {
     let root = &spectrum.roots[k];
     if spectrum.undamped { root.square } else { root.lambda }
 }
 
-/// Its slope along the friction coefficient.
+/// Derivative of the interpolated quantity with respect to the friction coefficient.
 fn slope(spectrum: &Spectrum, k: usize) -> c64 {
     let of_square = spectrum.friction_sensitivity[k];
     if spectrum.undamped { of_square } else { of_square / (2.0 * spectrum.roots[k].lambda) }
@@ -241,17 +246,17 @@ fn between(left: &Spectrum, i: usize, right: &Spectrum, j: usize, step: f64, sha
     line + share * rest * (rest * bend(left, i) - share * bend(right, j))
 }
 
-/// Whether a cubic through both ends stays close enough to the straight line.
+/// Whether a cubic through both ends stays close enough to the straight line between them.
 fn is_curved(left: &Node, i: usize, right: &Node, j: usize, gap: f64) -> bool {
     let (step, left, right) = (right.mu() - left.mu(), &left.spectrum, &right.spectrum);
     let along = value(right, j) - value(left, i);
     let bend = |spectrum: &Spectrum, k: usize| (step * slope(spectrum, k) - along).norm();
-    // The largest value of s (1 - s)² is 4/27.
+    // The maximum of `s (1 - s)²` is 4/27.
     let stray = 4.0 / 27.0 * (bend(left, i) + bend(right, j));
     stray <= STRAY * gap
 }
 
-/// The distance of each followed root to its nearest neighbour.
+/// Distance of each followed root to its nearest neighbour.
 fn gaps(spectrum: &Spectrum) -> Vec<f64> {
     let count = tracked(spectrum);
     let gap = |k: usize| {
@@ -261,26 +266,28 @@ fn gaps(spectrum: &Spectrum) -> Vec<f64> {
     (0..count).map(gap).collect()
 }
 
-/// What came of numbering modes that were read off a chart and solved.
+/// Result of comparing the identities of charted and solved modes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Agreement {
-    /// Conditions that the chart answered.
+    /// Number of points at which the chart gave roots.
     pub charted: usize,
-    /// Conditions that it did not answer.
+    /// Number of points at which it did not.
     pub solved: usize,
-    /// Modes that were compared.
+    /// Number of modes compared.
     pub modes: usize,
-    /// Modes that another solved mode is nearer to than the one of the same identity, which is not within the bounds of both either.
+    /// Number of charted modes whose identity disagrees: the solved mode of the same identity is neither the nearest
+    /// one nor within the bounds of both.
     pub different: usize,
-    /// Solved modes that their shapes number otherwise, leaving out those closer to another than 1e-3, relative.
+    /// Number of solved modes with another identity by shape. Modes closer than 1e-3, relative, to another are left
+    /// out.
     pub by_shape: usize,
 }
 
-/// Compares the identities of charted modes with those of solved ones at random conditions of the box of `charted`: at each of
-/// `places` loads and speeds, which have a map of their own, at `each` friction coefficients.
+/// Compares the identities of charted and solved modes at random points of the box of `charted`: at `each` friction
+/// coefficients for each of `places` pairs of load and speed, which have a map of their own.
 ///
 /// # Errors
-/// [`MapError`] where a solve fails.
+/// [`MapError`] if a solve fails.
 pub fn compare(
     model: &Model,
     mapped: &MapOptions,
@@ -335,8 +342,8 @@ mod tests {
     use super::super::synthetic::{Synthetic, rig};
     use super::*;
 
-    /// Rigs without damping, with contact that stiffens with the load, and damped: whatever the box of the chart, a charted mode has
-    /// the identity of the solved one, and nearly always the one its shape says.
+    /// Rigs without damping, with load-dependent contact stiffness, and with damping. Whatever the box of the chart,
+    /// a charted mode has the identity of the solved one, and nearly always the identity found by shape.
     #[test]
     fn charted_modes_have_the_identities_of_solved_ones() {
         let mapped = MapOptions {

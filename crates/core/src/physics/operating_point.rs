@@ -1,14 +1,14 @@
-//! The conditions a rig works under, and what they mean for its contact.
+//! Operating points and the contact state they imply.
 
-/// Below this disc speed the contact does not slide and friction does no work on it, rad/s.
+/// Disc speed below which the contact does not slide and friction does no work, rad/s.
 pub const SLIDING_SPEED_RAD_S: f64 = 0.01;
 
-/// One operating point `p` = (normal load, disc speed, friction coefficient).
+/// An operating point `p`: normal load, disc speed, friction coefficient.
 ///
-/// A negative speed turns the disc the other way, which reverses the sliding direction `t`.
+/// A negative speed is rotation in the opposite direction, which reverses the sliding direction `t`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OperatingPoint {
-    /// Total normal load, N; the static force of each contact pair is this over the number of pairs.
+    /// Total normal load, N. Each contact pair carries this divided by the number of pairs.
     pub normal_load_n: f64,
     /// Disc speed about the axis of the contact patch, right-handed, rad/s.
     pub disc_speed_rad_s: f64,
@@ -16,19 +16,19 @@ pub struct OperatingPoint {
     pub friction_coefficient: f64,
 }
 
-/// What an operating point makes of the contact between pad and disc.
+/// State of the contact between pad and disc at an operating point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ContactState {
     /// Closed and sliding: springs and friction act.
     Sliding,
-    /// Closed, slower than [`SLIDING_SPEED_RAD_S`]: springs act, the friction coefficient is taken as 0.
+    /// Closed, but slower than [`SLIDING_SPEED_RAD_S`]: springs act, the friction coefficient is taken as 0.
     NotSliding,
     /// No normal load: neither springs nor friction act.
     Open,
 }
 
 impl OperatingPoint {
-    /// The state of the contact at this point.
+    /// State of the contact at this operating point.
     pub fn contact_state(&self) -> ContactState {
         if self.normal_load_n <= 0.0 {
             ContactState::Open
@@ -39,7 +39,7 @@ impl OperatingPoint {
         }
     }
 
-    /// The state of a contact that never opens, whatever the load.
+    /// State of a contact that never opens, at any load.
     pub fn state_closed(&self) -> ContactState {
         Self { normal_load_n: 1.0, ..*self }.contact_state()
     }
@@ -56,7 +56,7 @@ impl OperatingPoint {
 }
 
 impl ContactState {
-    /// What to tell a reader about a contact that is not sliding; `None` where there is nothing to say.
+    /// Note for the user about a contact that does not slide; `None` for a sliding one.
     pub fn note(self) -> Option<&'static str> {
         match self {
             Self::Sliding => None,

@@ -1,16 +1,18 @@
-//! Roots to about thirty digits, to measure the others against: from dense roots by series and iterations in double-double
-//! arithmetic (Dekker 1971; Wilkinson 1963 for the refinement).
+//! Reference roots to about thirty digits, against which the dense roots are checked. They are obtained from the
+//! dense roots by series and iterations in double-double arithmetic (Dekker 1971; Wilkinson 1963 for iterative
+//! refinement).
 //!
-//! Roots that rounding does not tell apart are refined together. With `A(z) = z I + K` or `z² I + z C + K`, `m` the mean of
-//! `k` roots and `W` an orthonormal basis of their shapes,
+//! Roots that rounding does not separate are refined together. Let `A(z) = z I + K` or `z² I + z C + K`, `m` the mean
+//! of `k` roots and `W` an orthonormal basis of their shapes:
 //!
 //! ```text
 //! [ A(z)  s W ] [ X(z) ]   [ 0 ]
 //! [ Wᴴ     0  ] [ F(z) ] = [ I ],     det F(z) = 0 at the roots,
 //! ```
 //!
-//! and the bordered matrix is regular there, also where roots merge, so that the Taylor series of `F` about `m` converges
-//! like the ratio of the distances to these roots and to the next (Beyn and Thümmler 2009 for the bordering).
+//! The bordered matrix is regular near these roots, even where they merge. The Taylor series of `F` about `m`
+//! therefore converges like the ratio of the distance to these roots and the distance to the next one (Beyn and
+//! Thümmler 2009 for the bordering).
 
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef, c64};
@@ -18,7 +20,7 @@ use faer::{Mat, MatRef, c64};
 use super::spectrum::Spectrum;
 use super::synthetic::Uniform;
 
-/// An unevaluated sum `high + low` of two numbers.
+/// An unevaluated sum `high + low` of two floating-point numbers.
 #[derive(Clone, Copy, Debug, Default)]
 struct Double {
     high: f64,
@@ -58,7 +60,7 @@ impl Double {
     }
 }
 
-/// A complex number of doubled precision.
+/// A complex number in double-double precision.
 #[derive(Clone, Copy, Debug, Default)]
 struct Complex {
     re: Double,
@@ -90,7 +92,7 @@ impl Complex {
         Self { re: self.re.times(factor), im: self.im.times(factor) }
     }
 
-    /// `1 / self`, by a step of Newton's from what a double knows of it.
+    /// `1 / self`, by one Newton step from the inverse in double precision.
     fn inverse(self) -> Self {
         let guess = Self::from(self.rounded().inv());
         guess.times(Self::from(c64::new(2.0, 0.0)).minus(self.times(guess)))
@@ -101,27 +103,28 @@ impl Complex {
     }
 }
 
-/// Roots that rounding does not tell apart, or a single one, and what they are off by.
+/// A root, or several that rounding does not separate, with the errors of the dense values.
 #[derive(Clone, Debug)]
 pub struct Refined {
-    /// Which roots of the spectrum.
+    /// Indices of the roots in the spectrum.
     pub members: Vec<usize>,
-    /// What each lacks, in the number that was solved for: `λ²` of an undamped model, `λ` of a damped one.
+    /// Exact minus dense value of each root: of `λ²` for an undamped model, of `λ` for a damped one.
     pub errors: Vec<c64>,
-    /// What their mean lacks, likewise.
+    /// Exact minus dense value of their mean.
     pub mean_error: c64,
-    /// The discriminant of a pair, `((z₁ - z₂)/2)²`; 0 for any other number of roots.
+    /// Discriminant of a pair, `((z₁ - z₂)/2)²`; 0 for any other number of roots.
     pub discriminant: c64,
 }
 
-/// The most roots that are refined together.
+/// Maximum number of roots refined together.
 pub const MAX_TOGETHER: usize = 4;
-/// Roots nearer to one another than this many times their bounds are refined together.
+/// Roots closer than this many times their bounds are refined together.
 const APART: f64 = 100.0;
-/// So are those closer than this, relative to themselves: the bordered matrix of one alone would be too close to singular.
+/// Roots closer than this, relative, are refined together too: the bordered matrix of one of them would be almost
+/// singular.
 const CLOSE: f64 = 1e-9;
 
-/// Which modes of `spectrum` belong together: those that their bounds do not clearly keep apart.
+/// Groups the modes of `spectrum` that their bounds do not clearly separate.
 pub fn clusters(spectrum: &Spectrum) -> Vec<Vec<usize>> {
     let mut clusters: Vec<Vec<usize>> = vec![];
     for k in 0..spectrum.mode_count {
@@ -139,18 +142,18 @@ pub fn clusters(spectrum: &Spectrum) -> Vec<Vec<usize>> {
     clusters
 }
 
-/// The number that was solved for: `λ²` of an undamped model, `λ` of a damped one.
+/// The eigenvalue that was computed: `λ²` of an undamped model, `λ` of a damped one.
 pub fn solved_for(spectrum: &Spectrum, k: usize) -> c64 {
     if spectrum.undamped { spectrum.roots[k].square } else { spectrum.roots[k].lambda }
 }
 
-/// Bound of the error of that number.
+/// Bound of the error of that eigenvalue.
 pub fn bound(spectrum: &Spectrum, k: usize) -> f64 {
     if spectrum.undamped { spectrum.roots[k].error.square } else { spectrum.roots[k].error.omega }
 }
 
-/// The exact roots of `K` and `C`, `n×n`, near the roots `members` of `spectrum`, less those: errors to about ten digits.
-/// `None` where they could not be found.
+/// Errors of the roots `members` of `spectrum`, to about ten digits, relative to the exact roots of `K` and `C`, both
+/// `n×n`. `None` if the iteration fails.
 pub fn refine(
     stiffness: MatRef<'_, f64>,
     damping: MatRef<'_, f64>,
@@ -186,7 +189,7 @@ pub fn refine(
     })
 }
 
-/// `A(z)` about a point.
+/// The matrix function `A(z)` near the point `at`.
 struct Pencil<'a> {
     stiffness: MatRef<'a, f64>,
     damping: MatRef<'a, f64>,
@@ -194,14 +197,14 @@ struct Pencil<'a> {
     at: Complex,
 }
 
-/// A column vector of doubled precision.
+/// A column vector in double-double precision.
 type Vector = Vec<Complex>;
 
 impl Pencil<'_> {
-    /// `A x₀ + A' x₁ + ½A'' x₂` with derivatives at the point.
+    /// `A x₀ + A' x₁ + ½A'' x₂`, with `A` and its derivatives at the point.
     fn apply(&self, x0: &[Complex], x1: Option<&Vector>, x2: Option<&Vector>) -> Vector {
         let n = x0.len();
-        // z x₀ + x₁, of which C takes its product; z (z x₀ + x₁) + z x₁ + x₂ is the rest of the mass's part.
+        // `C` multiplies `z x₀ + x₁`; the mass contributes `z (z x₀ + x₁) + z x₁ + x₂`.
         let shifted = |i: usize| self.at.times(x0[i]).plus(x1.map_or(Complex::default(), |x| x[i]));
         let velocity: Vector = (0..n).map(shifted).collect();
         let mut out: Vector = if self.undamped {
@@ -225,7 +228,7 @@ impl Pencil<'_> {
         out
     }
 
-    /// Taylor coefficients of `F`, `k×k` row by row, up to `degree`.
+    /// Taylor coefficients of `F` up to `degree`; each is `k×k`, stored row by row.
     fn series(&self, basis: &[Vec<c64>], degree: usize) -> Option<Vec<Vec<Complex>>> {
         let (n, k) = (self.stiffness.nrows(), basis.len());
         let at = self.at.rounded();
@@ -293,7 +296,7 @@ impl Pencil<'_> {
     }
 }
 
-/// An orthonormal basis of the shapes of `members`; where they do not span as many directions, any others.
+/// An orthonormal basis of the shapes of `members`, completed by random vectors if the shapes are linearly dependent.
 fn orthonormal(spectrum: &Spectrum, members: &[usize]) -> Vec<Vec<c64>> {
     let mut basis: Vec<Vec<c64>> = vec![];
     let mut any = Uniform::new(1);
@@ -323,7 +326,7 @@ fn norm(vector: &[c64]) -> f64 {
     vector.iter().map(|v| v.norm_sqr()).sum::<f64>().sqrt()
 }
 
-/// The determinant of a series of `k×k` matrices, as a series, by expansion along the first row.
+/// The determinant of a power series of `k×k` matrices, as a power series, by expansion along the first row.
 fn determinant(series: &[Vec<Complex>]) -> Vec<Complex> {
     let degree = series.len();
     let k = series[0].len().isqrt();
@@ -347,12 +350,12 @@ fn determinant(series: &[Vec<Complex>]) -> Vec<Complex> {
     sum
 }
 
-/// The zeros of a polynomial, lowest coefficient first, nearest to `guesses`: Newton steps that keep off one another
-/// (Aberth 1973).
+/// The zeros of a polynomial, lowest coefficient first, nearest to `guesses`, by simultaneous Newton steps with
+/// mutual repulsion (Aberth 1973).
 fn roots_near(polynomial: &[Complex], guesses: &[Complex]) -> Option<Vec<Complex>> {
     let mut roots = guesses.to_vec();
     let size = |z: Complex| z.rounded().norm();
-    // The scale of the zeros: |p₀/p_k|^(1/k).
+    // Scale of the zeros: `|p₀/p_k|^(1/k)`.
     let k = guesses.len();
     let scale = (size(polynomial[0]) / size(polynomial[k])).powf(1.0 / k as f64);
     let scale = roots.iter().map(|&z| size(z)).fold(scale, f64::max);
@@ -360,7 +363,7 @@ fn roots_near(polynomial: &[Complex], guesses: &[Complex]) -> Option<Vec<Complex
         return Some(roots);
     }
     for (i, root) in roots.iter_mut().enumerate() {
-        // Equal guesses would never part.
+        // Equal initial values would never separate.
         let angle = 1.0 + std::f64::consts::TAU * i as f64 / k as f64;
         *root = root.plus(Complex::from(c64::new(angle.cos(), angle.sin()) * (1e-3 * scale)));
     }
@@ -385,7 +388,7 @@ fn roots_near(polynomial: &[Complex], guesses: &[Complex]) -> Option<Vec<Complex
             roots[i] = roots[i].minus(step);
             largest = largest.max(size(step));
         }
-        // Half of the thirty digits are left at a multiple zero, and steps that only halve the distance.
+        // At a multiple zero only half of the thirty digits remain, and each step only halves the distance.
         if largest <= 1e-26 * scale || (round > 100 && largest <= 1e-8 * scale) {
             return Some(roots);
         }
@@ -393,7 +396,7 @@ fn roots_near(polynomial: &[Complex], guesses: &[Complex]) -> Option<Vec<Complex
     None
 }
 
-/// `exact` in the order of `given`: the assignment of the least total distance.
+/// `exact` in the order of `given`: the assignment with the smallest total distance.
 fn matched(given: &[Complex], exact: Vec<Complex>) -> Vec<Complex> {
     let cost = |order: &[Complex]| -> f64 {
         order.iter().zip(given).map(|(exact, given)| exact.minus(*given).rounded().norm()).sum()
@@ -429,7 +432,7 @@ mod tests {
     use super::super::test_models::{REFERENCE, nine_dof, random_rig};
     use super::*;
 
-    /// A spectrum with its matrices.
+    /// The matrices and the spectrum of a model at an operating point.
     fn solved(model: &Model, p: &OperatingPoint) -> (Mat<f64>, Mat<f64>, Spectrum) {
         let n = model.dimension();
         let (mut k, mut c) = (Mat::zeros(n, n), Mat::zeros(n, n));
@@ -443,27 +446,30 @@ mod tests {
         Model::new(n, vec![term], vec![], ContactLaw::default(), None).unwrap()
     }
 
-    /// `√2` to thirty digits: the error of whichever double near it was found is known.
+    /// `√2` to thirty digits gives the exact error of the dense root.
     #[test]
     fn finds_what_a_double_lacks() {
-        // λ² = -2 ± √2; √2 = 1.4142135623730950488016887242097.
+        // `λ² = -2 ± √2`, `√2 = 1.4142135623730950488016887242097`.
         let (k, c, spectrum) = solved(&constant(mat![[2.0, 2.0], [1.0, 2.0]]), &REFERENCE);
         let (high, low) = (std::f64::consts::SQRT_2, -9.667_293_313_452_913e-17);
         for (j, sign) in [(0, 1.0), (1, -1.0)] {
             let refined = refine(k.as_ref(), c.as_ref(), &spectrum, &[j]).expect("it converges");
-            // The difference of doubles a factor of two apart is exact (Sterbenz 1974); so is that from -2.
+            // The difference of floating-point numbers within a factor of two is exact (Sterbenz 1974); so is that
+            // from -2.
             let expected = sign * high - (spectrum.roots[j].square.re + 2.0) + sign * low;
             assert!((refined.errors[0].re - expected).abs() < 1e-26, "{:?} is not {expected:e}", refined.errors);
         }
     }
 
-    /// Two modes that merge at `w = 0`, `[[4, 1], [w, 4]]`: `λ² = -4 ± √w`, whatever is left of it in the dense roots.
+    /// Two modes that merge at `w = 0`, `[[4, 1], [w, 4]]`: `λ² = -4 ± √w`, however few digits of it the dense roots
+    /// keep.
     #[test]
     fn tells_merging_roots_apart() {
         for w in [0.0, 1e-30, 1e-16, -1e-16, 1e-12, -1e-9] {
             let (k, c, spectrum) = solved(&constant(mat![[4.0, 1.0], [w, 4.0]]), &REFERENCE);
             let refined = refine(k.as_ref(), c.as_ref(), &spectrum, &[0, 1]).expect("it converges");
-            // Thirty digits of the matrix are thirty of the discriminant, relative to the product of the off-diagonals.
+            // Thirty digits of the matrix give thirty digits of the discriminant, relative to the product of the
+            // off-diagonal entries.
             assert!((refined.discriminant - c64::new(w, 0.0)).norm() <= 1e-26, "{w}: {refined:?}");
             for (&j, error) in refined.members.iter().zip(&refined.errors) {
                 let exact = spectrum.roots[j].square + error + 4.0;
@@ -472,8 +478,9 @@ mod tests {
         }
     }
 
-    /// Every root of random and of synthetic rigs, undamped and damped, merging or not, is within its bound of the root to
-    /// thirty digits; none is left out; and the bounds are not idle: most are within a few thousand of the error.
+    /// Every root of random and synthetic rigs, undamped and damped, merging or not, is within its bound of the
+    /// reference root. No root is left out. The bounds are not too loose: most are within a few thousand times the
+    /// error.
     #[test]
     fn dense_roots_are_within_their_bounds() {
         let mut ratios = vec![];
@@ -503,7 +510,7 @@ mod tests {
                 compare(&model, &REFERENCE.with_friction(0.13 * f64::from(step)), &format!("seed {seed}"));
             }
         }
-        // At a merging point of the nine-degree-of-freedom model, to thirty digits 0.82001495938185, and around it.
+        // At and around a merging point of the 9-degree-of-freedom model; 0.82001495938185 by 30-digit arithmetic.
         for exponent in 2..=17 {
             for sign in [-1.0, 1.0] {
                 let mu = 0.82001495938185 + sign * 10f64.powi(-exponent);

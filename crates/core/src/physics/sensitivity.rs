@@ -1,19 +1,20 @@
-//! How roots change with the conditions and with the contact, to first order, from left and right vectors.
+//! First derivatives of roots with respect to the conditions and the contact, from left and right vectors.
 //!
-//! With `z = λ²` of an undamped model and `z = λ` of a damped one, `z` is an eigenvalue of a matrix `A(p)`: of `-K`, or of
-//! the scaled state matrix. For a simple root `dz = yᴴ dA x / yᴴ x`. Of two roots close to merging only symmetric functions
-//! have a slope: with `V` a basis of the span of their right vectors, `W` of their left ones, `Wᴴ V = I`, and
-//! `T = Wᴴ A V`, mean and discriminant of the `2×2` matrix `T` are
+//! Let `z = λ²` for an undamped model and `z = λ` for a damped one. `z` is an eigenvalue of a matrix `A(p)`: of `-K`,
+//! or of the scaled state matrix. For a simple root `dz = yᴴ dA x / yᴴ x`. Of two roots close to merging only
+//! symmetric functions are differentiable. Let `V` be a basis of the span of their right vectors, `W` one of their
+//! left vectors with `Wᴴ V = I`, and `T = Wᴴ A V`. The `2×2` matrix `T` has the mean `m` and the discriminant `d`:
 //!
 //! ```text
 //! m = (T₁₁ + T₂₂) / 2        d = ((T₁₁ - T₂₂) / 2)² + T₁₂ T₂₁ = ((z₁ - z₂) / 2)²        z = m ± √d
 //! ```
 //!
-//! and to first order `T` changes by `dT = Wᴴ dA V`. The span of two merging vectors is well defined where they are not.
+//! To first order `T` changes by `dT = Wᴴ dA V`. The span of two merging vectors is well defined even where the
+//! vectors themselves are not.
 //!
 //! # Source
-//! Lancaster (1964) for simple roots; Kirillov, *Nonconservative Stability Problems of Modern Physics* (2013), chapter 2,
-//! for double ones.
+//! Lancaster (1964) for simple roots; Kirillov, *Nonconservative Stability Problems of Modern Physics* (2013),
+//! chapter 2, for double ones.
 
 use faer::prelude::Solve;
 use faer::{Mat, MatRef, c64};
@@ -22,42 +23,42 @@ use super::model::{Model, ModelError, Parameter};
 use super::solver::{ROUNDING, displacement_scale};
 use super::spectrum::Spectrum;
 
-/// Of two roots further apart than this, relative to their size, each is taken by itself.
+/// Relative distance beyond which two roots are treated separately.
 const APART: f64 = 0.05;
 
-/// The changes over which a linear law has to hold to be given: this share of a condition, and of the contact.
+/// Relative change of a condition or of the contact over which a linear law must hold to be reported.
 pub const REACH: f64 = 0.01;
-/// The least change of the friction coefficient over which it has to hold.
+/// Minimum change of the friction coefficient over which a linear law must hold.
 pub const FRICTION_REACH: f64 = 1e-3;
 
-/// A derivative with respect to each of [`Parameter::ALL`].
+/// Derivatives with respect to each of [`Parameter::ALL`].
 pub type Slopes = [c64; 5];
 
-/// Two roots by what stays analytic where they merge; in `z`, see the module.
+/// Mean and discriminant of two roots `z`, which stay analytic where the roots merge; see the module documentation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pair {
-    /// `m`.
+    /// Mean `m`.
     pub mean: c64,
-    /// Its derivatives.
+    /// Derivatives of `m`.
     pub mean_slope: Slopes,
-    /// `d`.
+    /// Discriminant `d`.
     pub discriminant: c64,
-    /// Its derivatives.
+    /// Derivatives of `d`.
     pub discriminant_slope: Slopes,
-    /// Bound of what rounding can have done to `d`.
+    /// Bound of the rounding error of `d`.
     pub discriminant_error: f64,
 }
 
-/// How a root changes.
+/// The law by which a root changes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Change {
-    /// `λ` along its tangent: derivatives of `λ`, 1/s per unit.
+    /// Linear: derivatives of `λ`, 1/s per unit of the parameter.
     Linear(Slopes),
-    /// `z = m + m' δ ± √(d + d' δ)`: together with the root of this index, to which it is too close for a tangent.
+    /// `z = m + m' δ ± √(d + d' δ)`, for a root too close to its partner for a linear law.
     SquareRoot {
-        /// The other root of the pair.
+        /// Index of the other root of the pair.
         partner: usize,
-        /// What changes linearly.
+        /// Mean and discriminant, which change linearly.
         pair: Pair,
     },
 }
@@ -67,15 +68,15 @@ pub enum Change {
 pub struct RootSensitivity {
     /// Index of the root in its spectrum.
     pub root: usize,
-    /// Derivatives of `z`; of no use close to a merging point, where they grow without bound.
+    /// Derivatives of `z`; not useful close to a merging point, where they are unbounded.
     pub slope: Slopes,
-    /// The law that holds over [`REACH`].
+    /// The law that holds for changes up to [`REACH`].
     pub change: Change,
-    /// Bound of what rounding can have done to `z`.
+    /// Bound of the rounding error of `z`.
     pub error: f64,
 }
 
-/// Why there are no sensitivities.
+/// Why sensitivities could not be computed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SensitivityError {
     #[error(transparent)]
@@ -86,19 +87,20 @@ pub enum SensitivityError {
     Singular { root: usize },
 }
 
-/// Roots that are treated together: one, or a pair.
+/// Roots treated together: one, or a pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Group {
     first: usize,
     second: Option<usize>,
 }
 
-/// What a group's part of `A` is, and how it changes; `1×1` matrices have zeros beside.
+/// Projection `T` of `A` on a group, and its derivatives. For a single root only the entry `(0, 0)` is used, the
+/// others are zero.
 #[derive(Clone, Copy, Debug)]
 struct Block {
     t: [[c64; 2]; 2],
     dt: [[[c64; 2]; 2]; 5],
-    /// Bound of what rounding does to the entries of `t`.
+    /// Bound of the rounding error of the entries of `t`.
     error: f64,
 }
 
@@ -144,7 +146,7 @@ pub fn of_pair(model: &Model, spectrum: &Spectrum, first: usize, second: usize) 
     let mut groups = vec![group];
     let others = grouped(spectrum).into_iter().filter(|other| !other.touches(&group));
     groups.extend(others);
-    // Those whose partner was taken are alone.
+    // Roots whose partner is in this pair become groups of one.
     for k in 0..spectrum.roots.len() {
         let single = Group { first: k, second: None };
         if !groups.iter().any(|group| group.touches(&single)) {
@@ -154,7 +156,7 @@ pub fn of_pair(model: &Model, spectrum: &Spectrum, first: usize, second: usize) 
     Ok(blocks(model, spectrum, &groups, &[group])?[0].pair())
 }
 
-/// How far each parameter may go from `spectrum` for a linear law to count.
+/// Change of each parameter over which a law must hold.
 fn reach(spectrum: &Spectrum) -> [f64; 5] {
     let p = &spectrum.point;
     let friction = (REACH * p.friction_coefficient.abs()).max(FRICTION_REACH);
@@ -168,7 +170,8 @@ impl Group {
     }
 }
 
-/// Every root in one group: mutually nearest ones closer than [`APART`] in pairs.
+/// Divides all roots into groups: two roots closer than [`APART`] that are each other's nearest neighbour form a
+/// pair.
 fn grouped(spectrum: &Spectrum) -> Vec<Group> {
     let count = spectrum.roots.len();
     let z: Vec<c64> = (0..count).map(|k| value(spectrum, k)).collect();
@@ -190,7 +193,7 @@ fn grouped(spectrum: &Spectrum) -> Vec<Group> {
 fn of_root(spectrum: &Spectrum, root: usize, group: &Group, block: &Block, reach: &[f64; 5]) -> RootSensitivity {
     let z = value(spectrum, root);
     let to_lambda = |slope: Slopes| {
-        // λ = √z of an undamped model.
+        // `λ = √z` for an undamped model.
         let lambda = spectrum.roots[root].lambda;
         if spectrum.undamped { slope.map(|dz| dz / (2.0 * lambda)) } else { slope }
     };
@@ -200,11 +203,11 @@ fn of_root(spectrum: &Spectrum, root: usize, group: &Group, block: &Block, reach
     };
     let partner = if root == group.first { second } else { group.first };
     let pair = block.pair();
-    // The sign of the square root that is this root.
+    // This root is `m + half`, the partner `m - half`.
     let half = 0.5 * (z - value(spectrum, partner));
     let slope: Slopes = std::array::from_fn(|k| pair.mean_slope[k] + pair.discriminant_slope[k] / (2.0 * half));
-    // Along a parameter d(δ) = d + d' δ + d'' δ², and a perfect square is two lines that cross: what it lacks of one
-    // bends both roots.
+    // Along a parameter `d(δ) = d + d' δ + d'' δ²`. If this is a perfect square, the roots are two straight lines
+    // that cross. Its deviation from a perfect square is the curvature of both roots.
     let bends = (0..5).any(|k| {
         let [[a, b], [c, e]] = block.dt[k];
         let curvature = 0.25 * (a - e) * (a - e) + b * c;
@@ -229,18 +232,18 @@ impl Block {
         }
     }
 
-    /// How far the entries are from those of a multiple of the identity.
+    /// Distance of the block from a multiple of the identity.
     fn spread(&self) -> f64 {
         let [[a, b], [c, e]] = self.t;
         0.5 * (a - e).norm() + b.norm() + c.norm()
     }
 }
 
-/// The matrix `A` of the module's documentation and what is needed to apply it and its derivatives.
+/// The matrix `A` of the module documentation, with what is needed to apply it and its derivatives.
 struct Operator {
     stiffness: Mat<f64>,
     damping: Mat<f64>,
-    /// `S` of a damped model, rad/s.
+    /// Scale `S` of a damped model, rad/s.
     scale: Option<Vec<f64>>,
 }
 
@@ -253,7 +256,7 @@ impl Operator {
         Ok(Self { stiffness, damping, scale })
     }
 
-    /// The right vector of root `k`: its shape, or its scaled state `[S x; λ x]`, of length 1.
+    /// The right vector of root `k`, of norm 1: its shape, or its scaled state `[S x; λ x]`.
     fn vector(&self, spectrum: &Spectrum, k: usize) -> Vec<c64> {
         let n = self.stiffness.nrows();
         let lambda = spectrum.roots[k].lambda;
@@ -283,7 +286,7 @@ impl Operator {
         out
     }
 
-    /// `dA V` for changes `dK`, `dC`; the scaling is no function of the conditions.
+    /// `dA V` for changes `dK` and `dC`. The scale `S` is held constant.
     fn forced(&self, stiffness: &Mat<f64>, damping: &Mat<f64>, v: MatRef<'_, c64>) -> Mat<c64> {
         let n = self.stiffness.nrows();
         let Some(scale) = &self.scale else { return times(stiffness, v) * faer::Scale(c64::new(-1.0, 0.0)) };
@@ -293,7 +296,7 @@ impl Operator {
     }
 }
 
-/// The blocks of the groups `wanted` of `groups`, which hold every root once.
+/// The blocks of the groups `wanted`. `groups` must contain every root exactly once.
 fn blocks(
     model: &Model,
     spectrum: &Spectrum,
@@ -311,7 +314,7 @@ fn blocks(
             let first = &basis[basis.len() - 1];
             let mut off = orthogonalise(&mut vector, first);
             if off < 1e-12 && operator.scale.is_some() {
-                // A double root at the origin has one shape; its velocity by itself is the other vector.
+                // A double root at the origin has a single shape; a state with velocity only gives the second vector.
                 let n = spectrum.shapes.nrows();
                 let shape = (0..n).map(|i| spectrum.shapes[(i, second)]);
                 vector = std::iter::repeat_n(c64::ZERO, n).chain(shape).collect();
@@ -324,7 +327,7 @@ fn blocks(
         }
     }
     if operator.scale.is_some() {
-        // Conjugates of the modes stand behind.
+        // The complex conjugates of the modes complete the basis.
         let mut conjugates = vec![];
         for (group, &place) in groups.iter().zip(&places) {
             let members = if group.second.is_some() { 2 } else { 1 };
@@ -347,7 +350,7 @@ fn blocks(
             place..place + if group.second.is_some() { 2 } else { 1 }
         })
         .collect();
-    // Rows of the inverse: Wᴴ V = I.
+    // Columns of `W = V⁻ᴴ`, so that `Wᴴ V = I`.
     let unit = Mat::from_fn(size, columns.len(), |i, j| if i == columns[j] { c64::ONE } else { c64::ZERO });
     let left = right.adjoint().to_owned().partial_piv_lu().solve(&unit);
     let chosen = Mat::from_fn(size, columns.len(), |i, j| right[(i, columns[j])]);
@@ -388,11 +391,11 @@ fn blocks(
     Ok(blocks)
 }
 
-/// Takes the part along the unit vector `unit` off, normalises the rest, and says how long it was.
+/// Removes the component along the unit vector `unit`, normalises the rest and returns its relative length.
 fn orthogonalise(vector: &mut [c64], unit: &[c64]) -> f64 {
     normalise(vector);
     let mut length = 1.0;
-    // Twice is enough (Kahan).
+    // Two passes are enough (Kahan).
     for _ in 0..2 {
         let along: c64 = unit.iter().zip(vector.iter()).map(|(u, v)| u.conj() * v).sum();
         vector.iter_mut().zip(unit).for_each(|(v, u)| *v -= along * u);
@@ -401,7 +404,7 @@ fn orthogonalise(vector: &mut [c64], unit: &[c64]) -> f64 {
     length
 }
 
-/// Makes a vector 1 long, and says how long it was.
+/// Scales a vector to norm 1 and returns its previous norm.
 fn normalise(vector: &mut [c64]) -> f64 {
     let length = vector.iter().map(|x| x.norm_sqr()).sum::<f64>().sqrt();
     if length > 0.0 {
@@ -450,18 +453,18 @@ mod tests {
     #[test]
     fn hoffmann_by_hand_before_at_and_beyond_the_merging_point() {
         let model = hoffmann();
-        // d = 1 - μ and m = -2 everywhere, so d' = -1 and m' = 0.
+        // `d = 1 - μ` and `m = -2` everywhere, so `d' = -1` and `m' = 0`.
         for mu in [0.2, 0.9, 0.999, 1.0 - 1e-9, 1.0 + 1e-9, 1.001, 1.5] {
             let spectrum = solve(&model, &REFERENCE.with_friction(mu));
             let pair = of_pair(&model, &spectrum, 0, 1).unwrap();
-            // The span of two vectors √(1e-9) apart is known to 1e-16 / √(1e-9).
+            // The span of two vectors `√1e-9` apart is accurate to `1e-16 / √1e-9`.
             assert!((pair.mean + 2.0).norm() < 1e-11 && pair.mean_slope[0].norm() < 1e-10, "{mu}: {pair:?}");
             assert!((pair.discriminant - (1.0 - mu)).norm() < 1e-11, "{mu}: {pair:?}");
             assert!((pair.discriminant - (1.0 - mu)).norm() <= pair.discriminant_error, "{mu}: {pair:?}");
             assert!((pair.discriminant_slope[0] + 1.0).norm() < 1e-10, "{mu}: {pair:?}");
         }
         let far = all(&model, &solve(&model, &REFERENCE.with_friction(0.2)));
-        // λ = iω, ω² = 2 - √0.8 first: dω/dμ = 1 / (4 ω √0.8).
+        // The first root is `λ = iω` with `ω² = 2 - √0.8`: `dω/dμ = 1 / (4 ω √0.8)`.
         let omega = (2.0 - 0.8f64.sqrt()).sqrt();
         let Change::Linear(slope) = far[0].change else { panic!("0.8 is far from merging: {:?}", far[0]) };
         assert!((slope[0] - c64::new(0.0, 1.0 / (4.0 * omega * 0.8f64.sqrt()))).norm() < 1e-13, "{slope:?}");
@@ -471,7 +474,7 @@ mod tests {
         }
     }
 
-    /// Two modes that cross without touching each other keep their tangents, however close.
+    /// Two modes that cross without coupling have linear laws, however close they are.
     #[test]
     fn a_crossing_is_no_merging() {
         let terms = vec![
@@ -481,7 +484,7 @@ mod tests {
         let model = Model::new(2, terms, vec![], ContactLaw::default(), None).unwrap();
         for sensitivity in all(&model, &solve(&model, &REFERENCE.with_friction(0.7 + 1e-7))) {
             assert!(matches!(sensitivity.change, Change::Linear(_)), "{sensitivity:?}");
-            // Roots of 4 that are 2e-7 apart: their distance is known to 4 ε / 2e-7.
+            // Roots near 4 that are 2e-7 apart: the relative error of their distance is 4 ε / 2e-7.
             assert!((sensitivity.slope[0].norm() - 1.0).abs() < 1e-7, "{sensitivity:?}");
         }
     }
@@ -495,7 +498,8 @@ mod tests {
         }
     }
 
-    /// Against central differences of the roots: everything load and speed can do, damped and undamped.
+    /// Comparison with central differences of the roots, with every dependence on load and speed, damped and
+    /// undamped.
     #[test]
     fn slopes_are_the_derivatives() {
         let laws = [
@@ -515,7 +519,8 @@ mod tests {
                     let Change::Linear(slope) = sensitivity.change else { continue };
                     let root = sensitivity.root;
                     let difference = (up.roots[root].lambda - down.roots[root].lambda) / (2.0 * step);
-                    // Rounding, 1e-13 |λ| / step; truncation of a root that bends over a hundredth, 1e-6.
+                    // Tolerance: rounding of `1e-13 |λ| / step`, and truncation, 1e-6 for a root that is nonlinear
+                    // over a relative change of 0.01.
                     let limit = 1e-13 * spectrum.roots[root].lambda.norm() / step + 1e-5 * slope[k].norm();
                     assert!((slope[k] - difference).norm() < limit, "{parameter:?} {root}: {} {difference}", slope[k]);
                     checked += usize::from(slope[k].norm() > 0.0);
@@ -525,7 +530,8 @@ mod tests {
         assert!(checked > 30, "{checked} slopes other than zero");
     }
 
-    /// Contact stiffness and damping, against the same rig with other springs and dashpots.
+    /// Derivatives with respect to contact stiffness and damping, compared with the same rig with other springs and
+    /// dampers.
     #[test]
     fn contact_slopes_are_the_derivatives() {
         let with = |stiffer: f64, damper: f64| {
@@ -565,8 +571,8 @@ mod tests {
         }
     }
 
-    /// The paper's nine degrees of freedom at its first merging: mean and discriminant along friction predict the roots
-    /// on both sides of the merging point, where a tangent would not.
+    /// The paper's 9-degree-of-freedom model at its first merging point: mean and discriminant, extrapolated linearly
+    /// in friction, predict the roots on both sides of it, where a linear law of the roots would not.
     #[test]
     fn nine_dof_square_root_law() {
         let model = nine_dof(1.0, 1.0, 1.0);
@@ -580,12 +586,14 @@ mod tests {
             let there = solve(&model, &REFERENCE.with_friction(mu + step));
             let off =
                 [1, 2].map(|k| (there.roots[k].square - predicted).norm()).into_iter().fold(f64::INFINITY, f64::min);
-            // The curvatures of mean and discriminant are below 10: step² of them, under the root.
+            // Second derivatives of mean and discriminant are below 10, so the error under the square root is of the
+            // order of 10 step².
             assert!(off < 30.0 * step.abs().powf(1.5), "{step}: {off}");
         }
     }
 
-    /// Hultén's damped model at its limit of stability: the growth rate there has the slope of a difference.
+    /// Hultén's damped model at its stability limit: the derivative of the growth rate agrees with a central
+    /// difference.
     #[test]
     fn hulten_growth() {
         let model = hulten(0.02, 0.10);

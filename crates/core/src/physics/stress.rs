@@ -1,21 +1,23 @@
-//! Extremes for the numerics, each with what must hold there. `tests/stress.rs` runs them all, `squealcast bench --stress` shows them.
+//! Extreme cases of the numerics, each with what must hold there. `tests/stress.rs` runs them,
+//! `squealcast bench --stress` shows them.
 //!
 //! | extreme | what happens |
 //! |---|---|
-//! | at and near a merging point | each root of the pair has an error bound of up to the root of the rounding, `√ε`; the pair's mean and discriminant keep their digits |
-//! | three modes meet | the same with the cube root; the bounds grow with it |
-//! | doublets split by rounding alone | both modes are kept, each with its bound; their shapes are arbitrary within their plane |
+//! | at and near a merging point | error bounds of both roots rise up to `√ε`, not those of mean and discriminant |
+//! | three modes merge | the same with the cube root of `ε`; the bounds grow accordingly |
+//! | doublets split by rounding only | both modes are found with bounds; shapes are arbitrary within their plane |
 //! | free modes | `λ = 0` exactly, static, no growth |
-//! | static divergence | a static root grows; the window is found like any other |
-//! | contact far softer or stiffer than the rig | solved to rounding of the largest stiffness: bounds of low modes grow with it, and say so |
-//! | any scale of mass and frequency | nothing changes but the scale |
+//! | static divergence | a static root grows; its window is found like any other |
+//! | contact far softer or stiffer than the rig | accurate to rounding of the largest stiffness, as the bounds show |
+//! | any scale of mass and frequency | the results scale likewise |
 //! | friction coefficients of any size and sign | solved like any other |
 //! | no load | the contact is open: neither springs nor friction |
-//! | speed towards zero | lateral damping grows as `μN/v` until sliding is taken to end at 0.01 rad/s: modes become static roots; below, friction is 0 |
-//! | matrices far from normal | bounds grow with the condition of the roots |
-//! | other order of nodes and modes, other signs, other units | the same roots within their bounds |
+//! | speed towards zero | lateral damping grows as `μN/v`, modes become static; below 0.01 rad/s `μ` is taken as 0 |
+//! | matrices far from normal | bounds grow with the condition numbers of the roots |
+//! | other order of nodes and modes, other signs or units | the same roots within their bounds |
 //!
-//! Where rounding leaves nothing, a solve is an error (a residual or a trace out of its limit), never a number.
+//! Where rounding leaves no accurate digits, a solve is an error (a residual or trace exceeds its limit), never a
+//! wrong number.
 
 use faer::{Mat, c64};
 
@@ -29,15 +31,15 @@ use super::stability_map::{MapOptions, StabilityMap, mirror};
 use super::synthetic::{Synthetic, Uniform, rig};
 use super::tracking::tracked;
 
-/// One extreme.
+/// An extreme case.
 pub struct Case {
-    /// What is done.
+    /// Description of the case.
     pub what: &'static str,
-    /// Does it; says what came out, or what is wrong with it.
+    /// Runs the case and returns a summary, or what went wrong.
     pub run: fn() -> Result<String, String>,
 }
 
-/// All of them.
+/// All cases.
 pub fn cases() -> Vec<Case> {
     let case = |what, run| Case { what, run };
     vec![
@@ -60,27 +62,28 @@ pub fn cases() -> Vec<Case> {
 const REFERENCE: OperatingPoint =
     OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.35 };
 
-/// A root whose bound is more than this, relative to it, says that it is not known.
+/// A root with an error bound above this, relative, counts as unknown.
 const VAGUE: f64 = 0.1;
 
-/// What was checked of some spectra.
+/// Statistics of the spectra checked.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Checked {
     roots: usize,
     together: usize,
-    /// Roots that their own bounds call unknown, or more of them in one place than are refined together.
+    /// Number of roots that are unknown by their bounds, or part of a cluster too large to be refined together.
     vague: usize,
-    /// The largest error, as a share of its bound.
+    /// The largest error as a fraction of its bound.
     share: f64,
     /// The largest bound, relative to the root.
     bound: f64,
 }
 
 impl Checked {
-    /// Solves `model` at `p`; every root must be finite, with a bound, and within its bound of the root to thirty digits.
+    /// Solves `model` at `p` and checks that every root is finite, has a bound, and is within that bound of the
+    /// reference root.
     ///
     /// # Errors
-    /// What is wrong.
+    /// The first check that failed.
     pub fn solve(&mut self, model: &Model, p: &OperatingPoint) -> Result<Spectrum, String> {
         let n = model.dimension();
         let failed = |what: String| format!("{p:?}: {what}");
@@ -143,7 +146,7 @@ fn map(model: &Model, mu_max: f64) -> Result<StabilityMap, String> {
     StabilityMap::build(model, &mut Solver::new(model.dimension()), &REFERENCE, &options).map_err(text)
 }
 
-/// 0 and ±1e-16, ±1e-15, ... ±1e-2.
+/// The distances 0 and ±1e-16, ±1e-15, ... ±1e-2.
 fn distances() -> impl Iterator<Item = f64> {
     let small = (2..=16).flat_map(|k| [1.0, -1.0].map(|sign| sign * 10f64.powi(-k)));
     std::iter::once(0.0).chain(small)
@@ -174,7 +177,7 @@ fn merging_points() -> Result<String, String> {
     Ok(format!("{} points: {}", ends.len(), checked.said()))
 }
 
-/// `[[4, 1, 0], [0, 4, 1], [w, 0, 4]]`: `λ² = -4 + ∛(-w)`.
+/// Three modes that merge at `w = 0`, `[[4, 1, 0], [0, 4, 1], [w, 0, 4]]`: `λ² = -4 + ∛(-w)`.
 fn three_modes() -> Result<String, String> {
     let mut checked = Checked::default();
     for w in distances() {
@@ -186,7 +189,8 @@ fn three_modes() -> Result<String, String> {
     Ok(checked.said())
 }
 
-/// Free-interface modes on contact pairs of random rows, the last two thirds doublets `split` apart.
+/// Free-interface modes in doublets `split` apart, coupled by `pairs`; with the modes in the given order and with
+/// given signs.
 fn with_pairs(split: f64, pairs: &ContactPairs, order: &[usize], signs: &[f64]) -> Result<Model, ModelError> {
     let n = order.len();
     let omega = |k: usize| 1.0 + (k / 2) as f64 * 0.7 + if k % 2 == 1 { split } else { 0.0 };
@@ -218,7 +222,7 @@ fn random_pairs(count: usize, n: usize, stiffness_n_per_m: f64) -> ContactPairs 
 fn doublets() -> Result<String, String> {
     let mut checked = Checked::default();
     let order: Vec<usize> = (0..12).collect();
-    // From a contact that leaves the doublets alone to one that tears them apart.
+    // The contact stiffness ranges from negligible to dominant relative to the splitting of the doublets.
     for stiffness in [1e-14, 1e-12, 1e-10, 1e-6, 1e-2, 1.0] {
         let model = with_pairs(1e-12, &random_pairs(2, 12, stiffness), &order, &[1.0; 12]).map_err(text)?;
         for step in 0..5 {
@@ -245,7 +249,7 @@ fn free_modes() -> Result<String, String> {
     Ok(format!("open: three pairs of roots at 0 exactly; {}", checked.said()))
 }
 
-/// `k₁ = 1 - μ` beside a mode that does not care.
+/// `k₁ = 1 - μ`, next to a mode that does not depend on friction.
 fn divergence() -> Result<String, String> {
     let mut ends = vec![];
     for damping in [0.0, 1e-6, 0.3, 3.0] {
@@ -268,7 +272,7 @@ fn divergence() -> Result<String, String> {
     Ok(format!("windows from {ends:?}"))
 }
 
-/// A contact in proportion to its load, so that the load scales it.
+/// A contact stiffness proportional to the load, so that the load sets it.
 fn proportional(damping_ratio: f64) -> Result<Model, String> {
     synthetic(20, damping_ratio, ContactLaw { exponent: 1.0, ..ContactLaw::default() })
 }
@@ -359,7 +363,7 @@ fn vanishing_speed() -> Result<String, String> {
     Ok(format!("up to {statics} static roots; {}", checked.said()))
 }
 
-/// `[[1, b], [0, 1 + g]]` blocks turned by random reflections: condition `√(1 + b²/g²)`.
+/// Blocks `[[1, b], [0, 1 + g]]`, transformed by random reflections; condition number `√(1 + b²/g²)`.
 fn non_normal() -> Result<String, String> {
     let mut checked = Checked::default();
     let mut uniform = Uniform::new(3);
@@ -422,15 +426,15 @@ fn scanned() -> Result<String, String> {
     scan(&model, &REFERENCE, 2.0, 100_000)
 }
 
-/// Ends of windows by the map and by bisection of a scan agree to this, relative.
+/// Relative tolerance between window ends of the map and those found by bisection of a scan.
 const ENDS_AGREE: f64 = 1e-10;
 
-/// `points` friction coefficients up to `mu_max`, solved without the map: each at which something grows must lie in a window of it,
-/// well inside a window something must grow, and where the number of growing roots changes from one to the next, bisected, an end
-/// of a window must be.
+/// Compares the windows of a map with `points` friction coefficients up to `mu_max`, solved independently of it.
+/// Every unstable point must lie in a window, and every point well inside a window must be unstable. Where the number
+/// of growing roots changes between two points, the change is located by bisection and must be the end of a window.
 ///
 /// # Errors
-/// The first point that disagrees.
+/// The first disagreement.
 pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> Result<String, String> {
     let mut solver = Solver::new(model.dimension());
     let options = MapOptions { mu_min: 0.0, mu_max, band_max_hz: None, instability_threshold: 1e-6, windows: true };
@@ -456,7 +460,8 @@ pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> R
         if let Some((left, below)) = before.replace((mu, count)).filter(|(_, below)| *below != count) {
             let mut bisect = |threshold: f64| change((left, below), mu, |mu| Ok(growing_roots(&solve(mu)?, threshold)));
             let end = if spectrum.undamped {
-                // Beyond the merging σ/|λ| is a square root: a threshold moves the end by its square.
+                // Beyond a merging point `σ/|λ|` rises like a square root, so a threshold moves the apparent end by
+                // its square.
                 let (near, far) = (bisect(GROWS)?, bisect(2.0 * GROWS)?);
                 near - (far - near) / 3.0
             } else {
@@ -476,16 +481,16 @@ pub fn scan(model: &Model, at: &OperatingPoint, mu_max: f64, points: usize) -> R
     ))
 }
 
-/// `σ/|λ|` above which a root of an undamped pair grows, for bisection: it rises like a square root from rounding, which takes
-/// half the digits.
+/// Threshold of `σ/|λ|` for the growth of an undamped pair, used by bisection. Rounding leaves half the digits at a
+/// merging point, where growth rises like a square root.
 const GROWS: f64 = 1e-7;
 
-/// How many roots grow.
+/// Number of unstable roots.
 fn growing_roots(spectrum: &Spectrum, threshold: f64) -> usize {
     spectrum.roots.iter().filter(|root| root.is_unstable(threshold)).count()
 }
 
-/// Where a count that is `below` at `left` and another at `right` changes, by bisection to the last digit.
+/// Locates the change of a count between `left`, where it is `below`, and `right`, by bisection to the last digit.
 fn change(
     (mut left, below): (f64, usize),
     mut right: f64,
@@ -500,15 +505,16 @@ fn change(
     }
 }
 
-/// Friction coefficients between two neighbouring ones are halved at most this often to see which mode becomes which.
+/// Maximum number of times the interval between two friction coefficients is halved to connect modes by shape.
 const HALVED: usize = 24;
 
-/// Follows the modes of an undamped or damped rig from 0 to `mu_max` in `steps` steps by the overlap of their shapes alone, in as
-/// small parts of a step as that takes, and compares with the identities of the map: two modes that change places are a swap.
-/// Through a merging point a pair keeps its two identities, whichever of them goes to which. How many modes were compared.
+/// Follows the modes of a rig from friction coefficient 0 to `mu_max` in `steps` steps by the overlap of their shapes
+/// alone, halving steps as needed, and compares with the identities of the map. Two modes that have exchanged
+/// identities are a swap. Through a merging point a pair must keep its two identities, in either order. Returns the
+/// number of modes compared, as text.
 ///
 /// # Errors
-/// The first swap, or a step whose shapes cannot be told apart.
+/// The first swap, or a step over which shapes cannot be followed.
 pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> Result<String, String> {
     let mut solver = Solver::new(model.dimension());
     let options = MapOptions { mu_min: 0.0, mu_max, band_max_hz: None, instability_threshold: 1e-6, windows: true };
@@ -540,7 +546,8 @@ pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> 
             let partner = mirror(&here, k);
             let same = |j: usize| found[k] == Some(ids[j]);
             if !same(k) && !partner.is_some_and(same) {
-                // Two that have parted again, or that are one to rounding.
+                // Exchanges are accepted within a pair that has separated again, and between roots that rounding does
+                // not separate.
                 let other = (0..ids.len()).find(|&j| same(j));
                 let may = |j: usize| was_pair(&map, ids[k], ids[j], target) || are_one(&here, k, j);
                 let swapped = other.is_none_or(|j| found[j] != Some(ids[k]) || !may(j));
@@ -551,21 +558,21 @@ pub fn follow(model: &Model, at: &OperatingPoint, mu_max: f64, steps: usize) -> 
             }
             compared += 1;
         }
-        // Within a pair the map's word is taken from here on.
+        // Within a pair the identities of the map are adopted from here on.
         ids = found.into_iter().take(ids.len()).map(Option::unwrap_or_default).collect();
     }
     Ok(format!("{compared} modes at {steps} steps, {halvings} of them halved, no swap"))
 }
 
-/// Whether rounding alone may tell two roots apart: the shapes of such a doublet are arbitrary within their plane.
+/// Whether rounding alone may separate two roots; the shapes of such a doublet are arbitrary within their plane.
 fn are_one(spectrum: &Spectrum, a: usize, b: usize) -> bool {
     let value = |k: usize| if spectrum.undamped { spectrum.roots[k].square } else { spectrum.roots[k].lambda };
     (value(a) - value(b)).norm() <= 2.0 * ROUNDING * f64::EPSILON * spectrum.matrix_norm
 }
 
-/// Identities of `next` by the overlap of its shapes with those of `here`; `None` unless each shape has one counterpart that is
-/// clearly its own, or is one of two that merge or part, whose shapes are nearly one, or of a doublet: these keep the order of their
-/// frequencies.
+/// Identities of `next` by the overlap of its shapes with those of `here`. Every shape must have one clear
+/// counterpart, with two exceptions: two roots that merge or separate, whose shapes are nearly equal, and doublets.
+/// These keep the order of their frequencies. `None` if a shape has no counterpart.
 fn carried(here: &Spectrum, ids: &[u32], next: &Spectrum) -> Option<Vec<u32>> {
     let count = tracked(next);
     if count != ids.len() {
@@ -578,7 +585,8 @@ fn carried(here: &Spectrum, ids: &[u32], next: &Spectrum) -> Option<Vec<u32>> {
         let mut best: Vec<usize> = (0..count).collect();
         best.sort_by(|&a, &b| overlap[(b, j)].norm().total_cmp(&overlap[(a, j)].norm()));
         let [first, second] = [best[0], *best.get(1)?].map(|k| overlap[(k, j)].norm_sqr());
-        // Shapes need not be orthogonal: how far it has moved is held against how far the next one is.
+        // Shapes need not be orthogonal, so the overlap deficit of the best candidate is compared with that of the
+        // second best.
         let clear = 1.0 - first < 0.1 * (1.0 - second);
         let merging = mirror(next, j).is_some() || nearly_merged(here, best[0], best[1]);
         let doublet = are_one(here, best[0], best[1]);
@@ -594,13 +602,13 @@ fn carried(here: &Spectrum, ids: &[u32], next: &Spectrum) -> Option<Vec<u32>> {
     of.into_iter().collect()
 }
 
-/// Whether two roots are so close that their shapes cannot be told apart.
+/// Whether two roots are so close that their shapes are nearly equal.
 fn nearly_merged(spectrum: &Spectrum, a: usize, b: usize) -> bool {
     let (a, b) = (spectrum.roots[a].square, spectrum.roots[b].square);
     (a - b).norm() < 1e-2 * a.norm()
 }
 
-/// Whether the map knows two identities to have merged below `mu`.
+/// Whether two identities are a pair of a window of the map that begins at or below `mu`.
 fn was_pair(map: &StabilityMap, a: u32, b: u32, mu: f64) -> bool {
     map.windows.iter().any(|w| w.mu_from <= mu && w.mode_ids.contains(&a) && w.mode_ids.contains(&b))
 }

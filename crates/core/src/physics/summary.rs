@@ -1,4 +1,4 @@
-//! What a spectrum says about the modes of a rig's band.
+//! Summary of a spectrum: the modes of the band, and which of them grow.
 
 use super::numbering::{Census, Followed};
 use super::spectrum::{Root, Spectrum};
@@ -7,32 +7,32 @@ use super::stability_map::StabilityMap;
 /// A mode with its identity.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mode {
-    /// Identity: ascending `ω` at `μ = 0`, from 0, continued in `μ`.
+    /// Identity: numbered from 0 in ascending `ω` at `μ = 0`, and followed in `μ` from there.
     pub id: u32,
-    /// Its root.
+    /// The root.
     pub root: Root,
 }
 
-/// The modes of the band, and how many of them grow, how fast.
+/// The modes of the band, with number and growth rate of the unstable ones.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Summary {
     /// Modes of the band, ascending in frequency.
     pub modes: Vec<Mode>,
-    /// Unstable modes of the band and growing static roots.
+    /// Number of unstable modes of the band and unstable static roots.
     pub unstable_modes: u32,
-    /// The largest growth rate of a mode of the band or of a static root, 1/s; `None` without any.
+    /// Largest growth rate of the modes of the band and the static roots, 1/s; `None` if there are neither.
     pub max_growth_rate_per_s: Option<f64>,
-    /// Frequency of the fastest growing mode, Hz, 0 for a static root; `None` where nothing is unstable.
+    /// Frequency of the fastest growing mode, Hz, 0 for a static root; `None` if nothing is unstable.
     pub worst_frequency_hz: Option<f64>,
-    /// Growth rates of the roots that do not oscillate, 1/s, descending.
+    /// Growth rates of the static roots, 1/s, descending.
     pub nonoscillatory_growth_per_s: Vec<f64>,
-    /// Room to number modes in.
+    /// Work array for numbering.
     followed: Vec<Followed>,
 }
 
 impl Summary {
-    /// Summarises `spectrum` for modes up to `band_max_hz`, with the identities that `map` gives them; without a map they are
-    /// numbered in the order of their frequencies. A root is unstable when `σ > threshold · |λ|`.
+    /// Summarises the modes of `spectrum` up to `band_max_hz`. Identities come from `map`; without a map the modes
+    /// are numbered by frequency. A root is unstable if `σ > threshold · |λ|`.
     pub fn of_spectrum(
         spectrum: &Spectrum,
         map: Option<&StabilityMap>,
@@ -44,7 +44,7 @@ impl Summary {
         summary
     }
 
-    /// Becomes what [`Summary::of_spectrum`] makes, in the memory it has.
+    /// Does the same as [`Summary::of_spectrum`], reusing the memory of this summary.
     pub fn take_spectrum(
         &mut self,
         spectrum: &Spectrum,
@@ -64,7 +64,8 @@ impl Summary {
         self.number(map, spectrum.point.friction_coefficient, Census::of(spectrum));
     }
 
-    /// Becomes the summary of roots read off a chart at friction coefficient `mu`, in any order, in the memory it has.
+    /// Summarises roots read off a chart at friction coefficient `mu`, in any order, reusing the memory of this
+    /// summary.
     pub fn take_chart(
         &mut self,
         charted: &[Root],
@@ -78,7 +79,7 @@ impl Summary {
         self.modes.extend(charted.iter().filter(|root| root.oscillates()).map(|&root| Mode { id: 0, root }));
         sort_almost_sorted(&mut self.modes);
         let statics = charted.iter().copied().filter(|root| !root.oscillates());
-        // Only those of undamped models are charted, each for both signs.
+        // Static roots are charted for undamped models only; each represents both signs.
         self.nonoscillatory_growth_per_s.clear();
         self.nonoscillatory_growth_per_s
             .extend(statics.clone().flat_map(|root| [root.lambda.re, 0.0 - root.lambda.re]));
@@ -86,7 +87,7 @@ impl Summary {
         self.number(map, mu, all);
     }
 
-    /// Gives the modes their identities.
+    /// Assigns identities to the modes.
     fn number(&mut self, map: Option<&StabilityMap>, mu: f64, all: Census) {
         match map {
             Some(map) => map.number(mu, all, &mut self.modes, &mut self.followed),
@@ -94,7 +95,7 @@ impl Summary {
         }
     }
 
-    /// Keeps the modes of the band and says how they and the static roots do.
+    /// Removes modes above the band, then counts unstable roots and finds the fastest growing one.
     fn judge(&mut self, statics: impl Iterator<Item = Root> + Clone, band_max_hz: Option<f64>, threshold: f64) {
         self.modes.retain(|mode| band_max_hz.is_none_or(|max_hz| mode.root.frequency_hz() <= max_hz));
         self.nonoscillatory_growth_per_s.sort_unstable_by(|a, b| b.total_cmp(a));
@@ -105,14 +106,14 @@ impl Summary {
         self.worst_frequency_hz = fastest.filter(|root| root.is_unstable(threshold)).map(|root| root.frequency_hz());
     }
 
-    /// The fastest growing static root, if it grows.
+    /// Whether a static root grows.
     pub fn diverges(&self) -> bool {
         self.nonoscillatory_growth_per_s.first().is_some_and(|&growth| growth > 0.0)
     }
 }
 
-/// Sorts modes by insertion, which for those of a chart, almost sorted as they come, takes a step or two each; where it takes
-/// more, they are sorted anew.
+/// Sorts modes by insertion. Those of a chart are almost sorted, which takes one or two steps each; if it takes many
+/// more, a general sort is used.
 fn sort_almost_sorted(modes: &mut [Mode]) {
     let order = |a: &Mode, b: &Mode| super::spectrum::order(&a.root, &b.root);
     let mut steps = 8 * modes.len();

@@ -1,16 +1,17 @@
-//! Seeded rigs of a tribometer's structure, for tests and benchmarks: no real rig, but disc doublets, smooth shapes on a
-//! patch of contact pairs, frequencies from 0.3 to 10 kHz.
+//! Random rigs with the structure of a tribometer, reproducible from a seed, for tests and benchmarks. They do not
+//! represent a real rig, but have disc doublets, smooth shapes on a patch of contact pairs and frequencies from 0.3
+//! to 10 kHz.
 
 use faer::Mat;
 
 use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
 
-/// A pseudo-random stream, uniform in `[-1, 1)` (Marsaglia's xorshift, 2003): the same on every machine.
+/// A pseudo-random stream, uniform in `[-1, 1)` (Marsaglia's xorshift, 2003), identical on every machine.
 #[derive(Clone, Debug)]
 pub struct Uniform(u64);
 
 impl Uniform {
-    /// The stream of `seed`.
+    /// The stream of a seed.
     pub fn new(seed: u64) -> Self {
         Self(seed.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
     }
@@ -24,30 +25,30 @@ impl Uniform {
     }
 }
 
-/// What a synthetic rig is like.
+/// Parameters of a synthetic rig.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Synthetic {
-    /// Modes in all; half of the pad's, half of the disc's.
+    /// Total number of modes, half of them the pad's and half the disc's.
     pub modes: usize,
-    /// Contact pairs.
+    /// Number of contact pairs.
     pub pairs: usize,
     /// Damping ratio of every mode; 0 for an undamped rig.
     pub damping_ratio: f64,
-    /// How contact and friction depend on load and speed.
+    /// Parameters of contact and friction.
     pub contact_law: ContactLaw,
-    /// The same seed gives the same rig.
+    /// Seed of the random stream: the same seed gives the same rig.
     pub seed: u64,
 }
 
-/// Contact stiffness of all pairs together, N/m.
+/// Total contact stiffness of all pairs, N/m.
 const STIFFNESS_N_PER_M: f64 = 4e7;
-/// Amplitude of a mass-normalised shape, kg^-1/2: a part of about 2 kg.
+/// Amplitude of a mass-normalised shape, kg^-1/2: that of a part of about 2 kg.
 const AMPLITUDE: f64 = 0.7;
 
 /// Builds the rig.
 ///
 /// # Errors
-/// [`ModelError`] where `contact_law` makes no sense.
+/// [`ModelError`] if `contact_law` is not valid.
 pub fn rig(synthetic: &Synthetic) -> Result<Model, ModelError> {
     let Synthetic { modes, pairs, damping_ratio, contact_law, seed } = *synthetic;
     let mut uniform = Uniform::new(seed);
@@ -57,12 +58,12 @@ pub fn rig(synthetic: &Synthetic) -> Result<Model, ModelError> {
     let mut omega: Vec<f64> =
         (0..pad).map(|k| between(300.0, 1e4, (k as f64 + 0.5 + 0.4 * uniform.draw()) / pad as f64)).collect();
     for k in 0..disc {
-        // Doublets, split by a few parts in ten thousand.
+        // Doublets, split by up to 5e-4, relative.
         let split = if k % 2 == 1 { 1.0 + 5e-4 * uniform.draw().abs() } else { 1.0 };
         let rank = (k - k % 2) as f64 + 0.5;
         omega.push(between(400.0, 1e4, rank / disc as f64) * split);
     }
-    // The patch: a sector of a ring, 0.08 to 0.12 m from the axis, 0.5 rad wide.
+    // The contact patch is a sector of a ring, 0.08 to 0.12 m from the axis and 0.5 rad wide.
     let place: Vec<(f64, f64)> = (0..pairs).map(|_| (0.25 * uniform.draw(), 0.1 + 0.02 * uniform.draw())).collect();
     let (mut normal, mut sliding, mut lateral) =
         (Mat::zeros(pairs, modes), Mat::zeros(pairs, modes), Mat::zeros(pairs, modes));

@@ -13,8 +13,8 @@ fn constant(matrix: Mat<f64>) -> Term {
     Term { matrix, law: Law::Constant }
 }
 
-/// The paper's 9-degree-of-freedom slider on a belt, all modes kept, with belt mass `m`, belt springs `k` in `y` and
-/// contact springs `kc`: case 1 is (1, 1, 1), case 2 (2, 2, 5).
+/// The paper's 9-degree-of-freedom slider on a belt, with all modes kept. `m` is the belt mass, `k` the stiffness of
+/// the belt springs in `y`, `kc` that of the contact springs. Case 1 is (1, 1, 1), case 2 is (2, 2, 5).
 pub fn nine_dof(m: f64, k: f64, kc: f64) -> Model {
     let mut stiffness = Mat::<f64>::zeros(9, 9);
     let slider = mat![
@@ -32,7 +32,7 @@ pub fn nine_dof(m: f64, k: f64, kc: f64) -> Model {
     mass[(6, 6)] = m;
     (mass[(7, 7)], mass[(8, 8)]) = (0.25 * (m + j), 0.25 * (m + j));
     (mass[(7, 8)], mass[(8, 7)]) = (0.25 * (m - j), 0.25 * (m - j));
-    // Contact rows: n = -y, t = +x; pad minus disc.
+    // Contact rows with `n = -y` and `t = +x`; pad minus disc.
     let belt = |l: f64| (0.5 * (1.0 + l), 0.5 * (1.0 - l));
     let mut normal = Mat::<f64>::zeros(2, 9);
     let mut sliding = Mat::<f64>::zeros(2, 9);
@@ -40,7 +40,7 @@ pub fn nine_dof(m: f64, k: f64, kc: f64) -> Model {
         (normal[(pair, y)], normal[(pair, 7)], normal[(pair, 8)]) = (-1.0, belt(l).0, belt(l).1);
         (sliding[(pair, x)], sliding[(pair, 6)]) = (1.0, -1.0);
     }
-    // Mass-normalised coordinates: M = L Lᵀ, x = L⁻ᵀ q.
+    // Mass-normalised coordinates: `M = L Lᵀ`, `x = L⁻ᵀ q`.
     let factor = mass.llt(Side::Lower).expect("the mass is positive definite");
     let mut to_q = Mat::<f64>::identity(9, 9);
     faer::linalg::triangular_solve::solve_lower_triangular_in_place(factor.L(), to_q.as_mut(), faer::Par::Seq);
@@ -68,8 +68,8 @@ pub fn hulten(eta_1: f64, eta_2: f64) -> Model {
         .expect("the model is well formed")
 }
 
-/// A random pad on a disc of `n` modes and `pairs` contact pairs: disc doublets included, `damping` the modal damping
-/// ratio of every mode.
+/// A random pad and disc with `n` modes and `pairs` contact pairs. The disc modes are doublets; `damping` is the
+/// damping ratio of every mode.
 pub fn random_rig(seed: u64, n: usize, pairs: usize, damping: f64) -> Model {
     let mut uniform = Uniform::new(seed);
     let pad = n / 2;

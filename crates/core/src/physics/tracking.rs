@@ -1,38 +1,38 @@
-//! Which root of one spectrum continues as which root of another: by shape first, by predicted value second,
-//! never by order.
+//! Connects the roots of two spectra: first by shape, then by predicted value, never by order.
 
 use faer::c64;
 
 use super::spectrum::Spectrum;
 
-/// Overlap of shapes from which two roots count as the same mode without a closer look.
+/// Overlap of shapes above which two roots are accepted as the same mode without refinement.
 pub const CLEAR_OVERLAP: f64 = 0.8;
 
-/// Overlap above which pairs are tried before all others.
+/// Overlap above which pairs are considered before all others.
 const LARGE_OVERLAP: f64 = 0.5;
 
-/// `|z1 - z2|` relative to `|z1| + |z2|` below which two roots are one multiple root, whose shapes are arbitrary within
-/// their span.
+/// Relative distance `|z1 - z2| / (|z1| + |z2|)` up to which two roots are one multiple root. Its shapes are
+/// arbitrary within their span.
 const MULTIPLE: f64 = 1e-10;
 
-/// How the roots of one spectrum continue in another.
+/// The roots of a spectrum as continuations of those of another.
 #[derive(Clone, Debug)]
 pub struct Continuation {
-    /// For each root of the later spectrum, the root of the earlier one it continues.
+    /// For each root of the later spectrum, the root of the earlier one that it continues.
     pub source: Vec<Option<usize>>,
-    /// Every tracked root found its counterpart, and all of them with [`CLEAR_OVERLAP`].
+    /// Whether every followed root has a counterpart with an overlap above [`CLEAR_OVERLAP`].
     pub clear: bool,
 }
 
-/// The roots that are followed: all of an undamped spectrum (there are always `n`), the modes of a damped one.
+/// Number of roots that are followed: all `n` of an undamped spectrum, the modes of a damped one.
 pub fn tracked(spectrum: &Spectrum) -> usize {
     if spectrum.undamped { spectrum.roots.len() } else { spectrum.mode_count }
 }
 
-/// Continues the roots of `from` in `to`, two spectra of one model at nearby operating points.
+/// Connects the roots of `from` to those of `to`, two spectra of one model at nearby operating points.
 ///
-/// Each candidate pair scores `|xᵢᴴ yⱼ|² - |ẑᵢ - zⱼ| / (|ẑᵢ| + |zⱼ|)`, with `ẑ` the square of the root extrapolated by its
-/// friction sensitivity where that is known; the best scores are taken first, each root once.
+/// The score of a pair is `|xᵢᴴ yⱼ|² - |ẑᵢ - zⱼ| / (|ẑᵢ| + |zⱼ|)`. `ẑ` is the square of the root, extrapolated by its
+/// friction sensitivity if that is known and predicts better. Pairs are accepted in descending order of score, each
+/// root once.
 pub fn continue_roots(from: &Spectrum, to: &Spectrum) -> Continuation {
     let (count_from, count_to) = (tracked(from), tracked(to));
     let overlap = from.shapes.get(.., ..count_from).adjoint() * to.shapes.get(.., ..count_to);
@@ -40,7 +40,7 @@ pub fn continue_roots(from: &Spectrum, to: &Spectrum) -> Continuation {
 
     let score = |i: usize, j: usize| {
         let z = to.roots[j].square;
-        // A sensitivity grows without bound near a merging point: there the plain value predicts better.
+        // Near a merging point the sensitivity is unbounded and the value without extrapolation predicts better.
         let off = relative_distance(predicted[i], z).min(relative_distance(from.roots[i].square, z));
         (overlap[(i, j)].norm_sqr() - off, i, j)
     };
@@ -48,7 +48,8 @@ pub fn continue_roots(from: &Spectrum, to: &Spectrum) -> Continuation {
     let mut taken = vec![false; count_from];
     let mut clear = count_from == count_to;
     let mut left = count_from.min(count_to);
-    // Scores are at most the overlap: nearly always the pairs of a large one settle it, and few have one.
+    // A score is at most the overlap. Pairs with a large overlap are few and nearly always connect all roots, so they
+    // come first.
     for large in [true, false] {
         let pairs = (0..count_to).flat_map(|j| (0..count_from).map(move |i| (i, j)));
         let considered = pairs.filter(|&(i, j)| !large || overlap[(i, j)].norm_sqr() > LARGE_OVERLAP);
@@ -71,7 +72,7 @@ pub fn continue_roots(from: &Spectrum, to: &Spectrum) -> Continuation {
     Continuation { source, clear }
 }
 
-/// The squares of the tracked roots of `spectrum`, extrapolated to friction coefficient `mu`.
+/// The squares of the followed roots of `spectrum`, extrapolated to friction coefficient `mu`.
 fn extrapolated(spectrum: &Spectrum, mu: f64) -> Vec<c64> {
     let step = mu - spectrum.point.friction_coefficient;
     (0..tracked(spectrum))
@@ -88,7 +89,8 @@ fn relative_distance(a: c64, b: c64) -> f64 {
     if scale > 0.0 && distance.is_finite() { distance } else { 0.0 }
 }
 
-/// Overlap of shape `i` of `from` with the span of all shapes of `to` that share root `j`, by Gram-Schmidt.
+/// Overlap of shape `i` of `from` with the span of the shapes of `to` that belong to the same multiple root as root
+/// `j`, by Gram-Schmidt orthogonalisation.
 fn span_overlap(from: &Spectrum, i: usize, to: &Spectrum, j: usize) -> f64 {
     let n = to.shapes.nrows();
     let z = to.roots[j].square;
