@@ -1,6 +1,6 @@
-//! The files of the page, inside the program.
+//! The files of the page, embedded in the program.
 //!
-//! `vendor/` holds uPlot 1.6.32 and three.js 0.184.0 as their npm packages ship them, with their licences.
+//! `vendor/` contains uPlot 1.6.32 and three.js 0.184.0 as published on npm, with their licences.
 
 use std::sync::OnceLock;
 
@@ -17,7 +17,7 @@ impl Asset {
         Self { path, media_type, bytes, compressed: OnceLock::new() }
     }
 
-    /// Its zstd form, made when it is first asked for.
+    /// The file compressed with zstd, on first use.
     pub fn compressed(&self) -> &[u8] {
         self.compressed.get_or_init(|| zstd::bulk::compress(self.bytes, 9).unwrap_or_else(|_| self.bytes.to_vec()))
     }
@@ -33,7 +33,7 @@ const JS: &str = "text/javascript; charset=utf-8";
 const CSS: &str = "text/css; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
 
-/// Every file of the page; the first is the page itself.
+/// All files of the page; the first is the page itself.
 pub static ASSETS: [Asset; 20] = assets! {
     "index.html": "text/html; charset=utf-8",
     "style.css": CSS,
@@ -57,7 +57,7 @@ pub static ASSETS: [Asset; 20] = assets! {
     "vendor/uplot.LICENSE": TEXT,
 };
 
-/// The file at a path below the root; the root is the page.
+/// The file at a path below the root; an empty path is the page.
 pub fn find(path: &str) -> Option<&'static Asset> {
     let path = if path.is_empty() { "index.html" } else { path };
     ASSETS.iter().find(|asset| asset.path == path)
@@ -78,7 +78,7 @@ mod tests {
         assert!(find("../Cargo.toml").is_none());
     }
 
-    /// The page may not name another origin: licences and namespaces aside, no address in it.
+    /// The page must not refer to another origin: apart from licences and namespaces it contains no addresses.
     #[test]
     fn the_page_asks_nobody_else() {
         for asset in ASSETS.iter().filter(|asset| !asset.path.starts_with("vendor/")) {
@@ -90,7 +90,7 @@ mod tests {
 
     type Rgb = [f64; 3];
 
-    /// Colours as eyes without one kind of cone see them, in linear RGB: Machado, Oliveira and Fernandes (2009), severity 1.
+    /// Linear RGB as seen with one kind of cone missing: Machado, Oliveira and Fernandes (2009), severity 1.
     const SEEN: [(&str, [Rgb; 3]); 4] = [
         ("no deficiency", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
         (
@@ -150,14 +150,14 @@ mod tests {
         a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
     }
 
-    /// Contrast after WCAG 2.2; 3 is asked of lines of a figure.
+    /// Contrast ratio of WCAG 2.2, which requires 3 for lines of a figure.
     fn contrast(a: Rgb, b: Rgb) -> f64 {
         let luminance = |rgb: Rgb| 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2];
         let (a, b) = (luminance(a) + 0.05, luminance(b) + 0.05);
         a.max(b) / a.min(b)
     }
 
-    /// Every value of a colour in the style sheet, in order: of the light theme, of the dark one, and again of the dark one.
+    /// Every value of a colour in the style sheet, in order: light theme, dark theme, dark theme again.
     fn colours(name: &str) -> Vec<[u8; 3]> {
         let css = std::str::from_utf8(find("style.css").unwrap().bytes).unwrap();
         let hex = |text: &str| {

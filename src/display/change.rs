@@ -1,7 +1,7 @@
-//! What makes a mode grow faster or slower: its growth rate after small changes of the conditions and of the contact.
+//! How small changes of the conditions and of the contact change the growth rate of a mode.
 //!
-//! A simple root moves along its tangent. Two roots close to merging move as `z = m ± √d`, of which mean and discriminant are
-//! linear (`physics::sensitivity`).
+//! A simple root moves along its tangent. Two roots close to merging move as `z = m ± √d`, whose mean `m` and
+//! discriminant `d` change linearly (`physics::sensitivity`).
 
 use faer::c64;
 use serde::Serialize;
@@ -10,10 +10,10 @@ use super::curves::root;
 use crate::physics::sensitivity::{Change, SensitivityError, of_roots};
 use crate::physics::{Model, Spectrum};
 
-/// Every parameter is changed by this share of itself; the laws hold over it.
+/// Relative change of each parameter. The linear laws hold over it.
 const SHARE: f64 = 0.01;
 
-/// How much the growth rate of a mode rises, 1/s, when one parameter rises by 1 %; `null` where that is not known.
+/// Change of a mode's growth rate, 1/s, when one parameter increases by 1 %; `null` if unknown.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct GrowthChange {
     pub friction: Option<f64>,
@@ -24,7 +24,7 @@ pub struct GrowthChange {
 }
 
 impl GrowthChange {
-    /// Of the mode at `index` of `spectrum`.
+    /// For the mode at `index` of `spectrum`.
     ///
     /// # Errors
     /// [`SensitivityError`].
@@ -37,7 +37,7 @@ impl GrowthChange {
             SHARE * p.friction_coefficient,
             SHARE * p.normal_load_n,
             SHARE * p.disc_speed_rad_s,
-            // By the logarithm of a factor.
+            // Contact stiffness and damping are parametrised by the logarithm of a factor.
             SHARE.ln_1p(),
             SHARE.ln_1p(),
         ];
@@ -48,7 +48,7 @@ impl GrowthChange {
                 let half = (pair.discriminant + pair.discriminant_slope[k] * steps[k]).sqrt();
                 let lambda = |z: c64| if spectrum.undamped { root(z) } else { z };
                 let (a, b) = (lambda(mean + half), lambda(mean - half));
-                // What grows is the one to ask about; of two that do not, each is followed.
+                // Of a merged pair, follow the growing root; of two stable roots, the one nearest to the present root.
                 let first = if now.re > 0.0 { a.re > b.re } else { (a - now).norm() < (b - now).norm() };
                 if first { a } else { b }
             }
@@ -71,7 +71,7 @@ mod tests {
     use crate::physics::{OperatingPoint, Solver, Vectors};
     use crate::rig::Rig;
 
-    /// Against solves at the changed conditions, in the middle of a window and close to its beginning (0.3559).
+    /// Compared with solves at the changed conditions, in the middle of a window and close to its beginning (0.3559).
     #[test]
     fn changes_of_growth_are_those_of_spectra_at_the_changed_conditions() {
         let rig = Rig::load("nine-dof-case-2").unwrap();
@@ -92,8 +92,8 @@ mod tests {
             let (more_load, _) = growth(&OperatingPoint { normal_load_n: 1.01 * p.normal_load_n, ..p });
             for (solved, found) in [(more_friction, change.friction), (more_load, change.load)] {
                 let (solved, found) = (solved - now, found.unwrap());
-                // Growth rises about as the root of the distance from the window's beginning: with a step of the share x of
-                // that distance, √(1 + x) - 1 against x / 2 differs by a share of x / 4.
+                // The growth rate rises approximately as the square root of the distance from the beginning of the
+                // window. For a step of x times that distance, √(1 + x) - 1 differs from x / 2 by a fraction x / 4.
                 let share = 0.25 * SHARE * mu / (mu - 0.3559);
                 let tolerance = (1.2 * share + 0.01) * solved.abs() + 1e-9;
                 assert!((solved - found).abs() < tolerance, "at {mu}: {found}, solved {solved}");

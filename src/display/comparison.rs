@@ -1,43 +1,43 @@
-//! The measured vibration against what was predicted: hits, misses and false alarms.
+//! Compares the measured vibration with the predictions: hits, misses and false alarms.
 //!
-//! - A *measured squeal* is a stretch of measurements whose level is at or above a threshold, from the first to the last
-//!   of them, with interruptions shorter than a quarter of a second, that lasts a least time. Its frequency is that of
-//!   its loudest measurement. A second without any measurement ends it.
-//! - A *predicted squeal* is a SQUEAL event of [`Events`]. Its frequencies are the ranges over which its unstable modes
-//!   went meanwhile.
-//! - They *match* where they overlap in time, the prediction widened by the time tolerance at both ends, and where the
-//!   measured frequency is not farther than the frequency tolerance, relative, from one of those ranges.
-//! - A measured squeal with a match is a *hit*, one without a *miss*. A predicted squeal without a match is a *false
-//!   alarm*, unless nothing was measured during it or it has no frequency (static divergence): then it is not judged.
-//! - The *lead* of a hit is how long before the measured onset the earliest matching prediction began; negative where it
-//!   came after.
+//! - A *measured squeal* is an interval of measurements whose level is at or above a threshold, from the first of them
+//!   to the last. Interruptions shorter than a quarter of a second are included, and it must last a minimum time. Its
+//!   frequency is that of its loudest measurement. A second without measurements ends it.
+//! - A *predicted squeal* is a SQUEAL event of [`Events`]. Its frequencies are the ranges that its unstable modes
+//!   covered.
+//! - They *match* if they overlap in time, with the prediction extended by the time tolerance at both ends, and if the
+//!   measured frequency is within the relative frequency tolerance of one of the predicted ranges.
+//! - A measured squeal with a match is a *hit*, one without is a *miss*. A predicted squeal without a match is a *false
+//!   alarm*. It is not judged if nothing was measured during it or if it has no frequency (static divergence).
+//! - The *lead* of a hit is the time from the onset of the earliest matching prediction to the measured onset; negative
+//!   if the prediction came later.
 
 use serde::Serialize;
 
 use super::events::{BRIDGED_S, Event, EventKind, Events, seconds};
 use crate::node::VibrationSample;
 
-/// Without a measurement for longer than this nothing is known of the vibration, s.
+/// A longer interval without measurements is a gap, in which the vibration is unknown, s.
 const GAP_S: f64 = 1.0;
 
-/// What counts as what.
+/// Definitions of a measured squeal and of a match.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Criteria {
     pub threshold_db: f64,
     pub least_duration_s: f64,
     pub time_tolerance_s: f64,
-    /// Relative.
+    /// Relative to the predicted frequency.
     pub frequency_tolerance: f64,
 }
 
 impl Default for Criteria {
-    /// 70 dB, from which on dynamometer tests count noise; 0.1 s; 0.5 s; 5 %.
+    /// The defaults: 70 dB, from which on dynamometer tests count noise; 0.1 s; 0.5 s; 5 %.
     fn default() -> Self {
         Self { threshold_db: 70.0, least_duration_s: 0.1, time_tolerance_s: 0.5, frequency_tolerance: 0.05 }
     }
 }
 
-/// A stretch of measurements at or above the threshold.
+/// An interval of measurements at or above the threshold.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct MeasuredSqueal {
     pub onset_s: f64,
@@ -46,16 +46,16 @@ pub struct MeasuredSqueal {
     pub frequency_hz: f64,
 }
 
-/// What became of a measured squeal.
+/// The result for a measured squeal.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(tag = "verdict", rename_all = "snake_case")]
 pub enum Verdict {
-    /// Predicted by the event of that number with that mode; `frequency_difference` is relative and from the range of
-    /// the mode, 0 within it.
+    /// Predicted by that event with that mode. `frequency_difference` is relative and measured from the frequency range
+    /// of the mode; 0 inside it.
     Hit { event: u64, mode_id: u32, lead_s: f64, frequency_difference: f64 },
-    /// Nothing was predicted about then.
+    /// No squeal was predicted near that time.
     NotPredicted,
-    /// Something was predicted about then, at other frequencies.
+    /// Squeal was predicted near that time, but at other frequencies.
     OtherFrequency,
 }
 
@@ -66,34 +66,34 @@ impl Verdict {
     }
 }
 
-/// Measurements in order, on their way to become squeals.
+/// The measurements so far and the measured squeals formed from them.
 #[derive(Clone, Debug)]
 pub struct Measurements {
     criteria: Criteria,
     count: u64,
     squeals: Vec<MeasuredSqueal>,
     open: Option<MeasuredSqueal>,
-    /// Stretches of time in which the vibration was measured.
+    /// Intervals in which the vibration was measured.
     measured: Vec<(f64, f64)>,
 }
 
 impl Measurements {
-    /// None yet.
+    /// No measurements yet.
     pub fn new(criteria: Criteria) -> Self {
         Self { criteria, count: 0, squeals: vec![], open: None, measured: vec![] }
     }
 
-    /// What counts as what.
+    /// The criteria in use.
     pub fn criteria(&self) -> &Criteria {
         &self.criteria
     }
 
-    /// How many there were.
+    /// Number of measurements.
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// Takes the next measurement in. Time that runs backward stays at the latest.
+    /// Adds the next measurement. A time before the latest one is set to the latest.
     pub fn push(&mut self, sample: &VibrationSample) {
         self.count += 1;
         let mut time_s = seconds(sample.time_ns);
@@ -125,7 +125,7 @@ impl Measurements {
         self.squeals.extend(self.open.take().filter(|squeal| self.lasts(squeal)));
     }
 
-    /// Whether it lasts long enough; stamps have rounded nanoseconds.
+    /// Whether a squeal lasts long enough. Times have rounding errors, hence the allowance.
     fn lasts(&self, squeal: &MeasuredSqueal) -> bool {
         squeal.end_s - squeal.onset_s >= self.criteria.least_duration_s - 1e-6
     }
@@ -135,8 +135,8 @@ impl Measurements {
         self.measured.iter().any(|&(first, last)| first <= to_s && last >= from_s)
     }
 
-    /// The measured squeals against `events`, the last of which may have lasted until `end_s`; `None` where nothing was
-    /// measured.
+    /// Compares the measured squeals with `events`, the last of which may extend to `end_s`. `None` without
+    /// measurements.
     pub fn compare(&self, events: &Events, end_s: f64) -> Option<Comparison> {
         if self.count == 0 {
             return None;
@@ -154,7 +154,7 @@ impl Measurements {
                 }
                 let hit = self.same_frequency(squeal, event);
                 *matched |= hit.is_some();
-                // The earliest that matches gave the warning.
+                // The earliest match gave the warning.
                 if !verdict.is_hit() {
                     verdict = hit.unwrap_or(Verdict::OtherFrequency);
                 }
@@ -176,7 +176,7 @@ impl Measurements {
         Some(comparison)
     }
 
-    /// The hit that it is, if the frequencies are near enough.
+    /// The hit, if the frequencies match.
     fn same_frequency(&self, squeal: &MeasuredSqueal, event: &Event) -> Option<Verdict> {
         let hz = squeal.frequency_hz;
         let differences = event.modes.iter().map(|mode| {
@@ -200,25 +200,25 @@ pub struct Judged {
     pub verdict: Verdict,
 }
 
-/// How the prediction did.
+/// Result of comparing measurements with predictions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
     pub criteria: Criteria,
     /// In order.
     pub measured: Vec<Judged>,
-    /// Numbers of the predicted squeals that were measured, that were not, and of which that is not known.
+    /// Numbers of the predicted squeals that were measured, that were false alarms, and that were not judged.
     pub confirmed: Vec<u64>,
     pub false_alarms: Vec<u64>,
     pub unjudged: Vec<u64>,
 }
 
 impl Comparison {
-    /// Measured squeals that were predicted.
+    /// Number of measured squeals that were predicted.
     pub fn hits(&self) -> usize {
         self.measured.iter().filter(|judged| judged.verdict.is_hit()).count()
     }
 
-    /// Measured squeals that were not.
+    /// Number of measured squeals that were not predicted.
     pub fn misses(&self) -> usize {
         self.measured.len() - self.hits()
     }
@@ -241,7 +241,7 @@ mod tests {
     use crate::display::events::tests::sample;
     use crate::node::status::Status;
 
-    /// Predictions every 10 ms over 60 s: mode 3 at 1500 Hz is unstable within the given seconds.
+    /// Predictions every 10 ms over 60 s, in which mode 3 at 1500 Hz is unstable in the given intervals (s).
     fn predicted(squeals: &[(f64, f64)]) -> Events {
         let mut events = Events::default();
         for k in 0..6000 {
@@ -252,7 +252,7 @@ mod tests {
         events
     }
 
-    /// Measurements every 50 ms between two times, a tone of 90 dB within the given seconds.
+    /// Measurements every 50 ms between two times, with a tone of 90 dB in the given intervals (s).
     fn heard(from_s: f64, to_s: f64, tones: &[(f64, f64, f64)]) -> Measurements {
         let mut measurements = Measurements::new(Criteria::default());
         for k in 0..1200 {
@@ -304,7 +304,7 @@ mod tests {
             .map(|j| ((j.squeal.onset_s * 20.0).round(), (j.squeal.end_s * 20.0).round()))
             .collect();
         assert_eq!(stretches, [(100.0, 139.0), (150.0, 159.0)]);
-        // A second and more without a measurement; and a squeal that lasts to the end.
+        // A gap of more than a second in the measurements, and a squeal that lasts to the end.
         let mut measurements = Measurements::new(Criteria::default());
         for time_ms in (0..500).chain(2000..2500) {
             let time_ns = time_ms * 1_000_000;

@@ -1,8 +1,8 @@
-//! The connections of browsers: a bounded number, none of which can keep others out.
+//! The connections of browsers: limited in number, and none can keep others out.
 //!
-//! A connection is closed when a request takes too long to arrive, when its other end stops reading, and when nothing
-//! was sent over it for a while. Bytes that a client sends do not prolong its time. Beyond the bound a new connection
-//! takes the place of the one that made progress the longest ago.
+//! A connection is closed if a request takes too long to arrive, if the client stops reading, or if nothing was sent
+//! over it for a while. Bytes sent by the client do not extend these times. At the limit, a new connection replaces the
+//! one to which nothing was sent for the longest time.
 
 use std::convert::Infallible;
 use std::io;
@@ -22,16 +22,16 @@ use tokio::net::{TcpListener, TcpSocket, TcpStream};
 use tokio::sync::oneshot;
 use tokio::time::{Instant, Sleep, sleep};
 
-/// What a client may take.
+/// Limits for a client.
 #[derive(Clone, Copy, Debug)]
 pub struct Bounds {
-    /// Connections at a time.
+    /// Number of simultaneous connections.
     pub connections: usize,
-    /// From the opening of a connection, or the end of an answer, to the end of the header of the next request.
+    /// Time for the header of a request, from the opening of the connection or the end of the previous answer.
     pub request: Duration,
-    /// Without taking any of the bytes that wait for it.
+    /// Time without the client taking any of the bytes waiting for it.
     pub patience: Duration,
-    /// Without anything being sent to it, longer than any answer takes to prepare.
+    /// Time without anything being sent to the client; longer than any answer takes to prepare.
     pub idle: Duration,
 }
 
@@ -42,23 +42,23 @@ impl Default for Bounds {
     }
 }
 
-/// Bytes that the system keeps for a client that does not read; the usual megabytes would hide it for a minute.
+/// Send buffer of the system for a client, bytes. The usual megabytes would hide for a minute that it does not read.
 const SEND_BUFFER: u32 = 128 * 1024;
-/// Bytes of a request; ours have a few hundred.
+/// Largest request, bytes; those of the page have a few hundred.
 const MOST_REQUEST_BYTES: usize = 16 * 1024;
-/// Connections that the system may hold until they are accepted.
+/// Connections that the system holds until they are accepted.
 const BACKLOG: u32 = 1024;
 
-/// Listens on the first of `addresses` that is free.
+/// Listens on the first free address of `addresses`.
 ///
 /// # Errors
-/// That of the last address, where none is free.
+/// The error for the last address, if none is free.
 pub fn listen(addresses: &[SocketAddr]) -> io::Result<TcpListener> {
     let mut refused = io::ErrorKind::InvalidInput.into();
     for &address in addresses {
         let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
         socket.set_reuseaddr(true)?;
-        // Accepted connections inherit it.
+        // Accepted connections inherit this setting.
         socket.set_send_buffer_size(SEND_BUFFER)?;
         match socket.bind(address).and_then(|()| socket.listen(BACKLOG)) {
             Ok(listener) => return Ok(listener),
@@ -68,7 +68,7 @@ pub fn listen(addresses: &[SocketAddr]) -> io::Result<TcpListener> {
     Err(refused)
 }
 
-/// Answers requests with `router` until it is dropped.
+/// Answers requests with `router` until the future is dropped.
 pub async fn serve(listener: TcpListener, router: Router, bounds: Bounds) {
     let mut http = http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(bounds.request).max_buf_size(MOST_REQUEST_BYTES);
@@ -78,23 +78,23 @@ pub async fn serve(listener: TcpListener, router: Router, bounds: Bounds) {
             Ok((stream, _)) => {
                 let _ = stream.set_nodelay(true);
                 let stream = TokioIo::new(open.admit(stream));
-                // An error ends its own connection and nothing else.
+                // An error ends its own connection only.
                 tokio::spawn(http.serve_connection(stream, TowerToHyperService::new(router.clone())));
             }
-            // Out of file descriptors, or the client has gone again.
+            // No file descriptors are left, or the client has disconnected.
             Err(_) => sleep(Duration::from_millis(50)).await,
         }
     }
 }
 
-/// The connections that are open, oldest first.
+/// The open connections, oldest first.
 struct Open {
     places: Vec<Place>,
     began: Instant,
     bounds: Bounds,
 }
 
-/// The place of an open connection; dropping it closes the connection.
+/// Entry of an open connection; dropping it closes the connection.
 struct Place {
     /// When something was sent last, microseconds after [`Open::began`] and at least 1; 0 before the first answer.
     sent_us: Arc<AtomicU64>,
@@ -102,8 +102,8 @@ struct Place {
 }
 
 impl Open {
-    /// Gives a connection a place, that of another where there is none left: the oldest of those that were never
-    /// answered, or else the one to which nothing was sent for the longest time.
+    /// Registers a new connection. At the limit it replaces another one: the oldest of those that were never answered,
+    /// else the one to which nothing was sent for the longest time.
     fn admit(&mut self, stream: TcpStream) -> Bounded {
         self.places.retain(|place| !place.held.is_closed());
         if self.places.len() >= self.bounds.connections {
@@ -120,25 +120,25 @@ impl Open {
     }
 }
 
-/// A connection that fails when its time is over.
+/// A connection whose operations fail once a time limit is exceeded.
 struct Bounded {
     stream: TcpStream,
     sent_us: Arc<AtomicU64>,
     began: Instant,
     evicted: oneshot::Receiver<Infallible>,
     over: bool,
-    /// Ends when the client took nothing for too long.
+    /// Expires when the client has taken nothing for too long.
     waiting: Option<Pin<Box<Sleep>>>,
     patience: Duration,
-    /// Ends when nothing was sent for too long.
+    /// Expires when nothing has been sent for too long.
     alone: Pin<Box<Sleep>>,
     idle: Duration,
 }
 
 impl Bounded {
-    /// Whether its time is over.
+    /// Whether a time limit is exceeded or the connection was replaced.
     fn is_over(&mut self, context: &mut Context<'_>) -> bool {
-        // The channel may not be asked again once it has answered.
+        // The channel must not be polled again after it has answered.
         self.over = self.over
             || Pin::new(&mut self.evicted).poll(context).is_ready()
             || self.alone.as_mut().poll(context).is_ready();
@@ -209,21 +209,21 @@ mod tests {
 
     use super::*;
 
-    /// Longer than any test.
+    /// Longer than any test takes.
     const NEVER: Duration = Duration::from_secs(3600);
-    /// How long a test waits for what must happen.
+    /// How long a test waits for an event that must occur.
     const LONG: Duration = Duration::from_secs(60);
     const SOON: Duration = Duration::from_millis(300);
 
     /// A server with an answer at `/` and an endless one at `/endless`; it ends with the test's runtime.
     struct Served {
         address: SocketAddr,
-        /// Hears of the end of an endless answer.
+        /// Notified when an endless answer is dropped.
         given_up: mpsc::Receiver<()>,
         _runtime: tokio::runtime::Runtime,
     }
 
-    /// Says when it is dropped.
+    /// Sends a notification when it is dropped.
     struct Guard(mpsc::Sender<()>);
 
     impl Drop for Guard {
@@ -265,7 +265,7 @@ mod tests {
         write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
     }
 
-    /// Asks for `/` and reads the answer.
+    /// Requests `/` and reads the answer.
     fn is_answered(stream: &mut TcpStream) -> bool {
         ask(stream, "/");
         let mut answer = vec![];
@@ -283,7 +283,7 @@ mod tests {
         matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut)
     }
 
-    /// Whether the other end closes a connection over which nothing more is sent.
+    /// Whether the other end has closed the connection.
     fn is_closed(stream: &mut TcpStream) -> bool {
         match stream.read(&mut [0]) {
             Ok(count) => count == 0,
@@ -304,7 +304,7 @@ mod tests {
             slow.write_all(b"GET / HTTP/1.1\r\nX-Slow: ").unwrap();
             let asked = std::time::Instant::now();
             loop {
-                // A byte with every look whether it is closed.
+                // Send one byte before each check whether the connection is closed.
                 if slow.write_all(b"x").is_err() || !slow.read(&mut [0; 64]).is_err_and(|error| waits(&error)) {
                     break;
                 }

@@ -1,7 +1,7 @@
-//! A stability map as curves: frequency and growth rate of every mode of the band against the friction coefficient.
+//! Curves of a stability map: frequency and growth rate of every mode in the band over the friction coefficient.
 //!
-//! Between the nodes of the map `λ²` is interpolated by cubics through values and sensitivities. Where two undamped
-//! modes merge it is not smooth, but half the sum and the discriminant of the pair are:
+//! Between the nodes of the map, `λ²` is interpolated by cubic polynomials through values and first derivatives. Where
+//! two undamped modes merge, `λ²` is not smooth, but the mean and the discriminant of the pair are:
 //!
 //! ```text
 //! s = (λ₁² + λ₂²)/2,   d = ((λ₁² - λ₂²)/2)²,   λ² = s ± √d
@@ -15,15 +15,15 @@ use serde::Serialize;
 use crate::physics::StabilityMap;
 use crate::physics::stability_map::Node as MapNode;
 
-/// The curves of one map.
+/// The curves of one stability map.
 #[derive(Clone, Debug, Serialize)]
 pub struct Curves {
-    /// Load and speed the map was made for.
+    /// Load and speed of the map.
     pub normal_load_n: f64,
     pub disc_speed_rad_s: f64,
     /// Friction coefficients, ascending.
     pub mu: Vec<f64>,
-    /// One curve for each mode that is in the band somewhere.
+    /// One curve for each mode that is in the band at some friction coefficient.
     pub modes: Vec<Curve>,
     pub windows: Vec<WindowShown>,
     pub critical_friction: Option<f64>,
@@ -32,7 +32,7 @@ pub struct Curves {
     pub complete: bool,
 }
 
-/// A mode along [`Curves::mu`]; `null` where it is not.
+/// A mode along [`Curves::mu`]; `null` where it does not exist.
 #[derive(Clone, Debug, Serialize)]
 pub struct Curve {
     pub id: u32,
@@ -44,18 +44,18 @@ pub struct Curve {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct WindowShown {
     pub mu_from: f64,
-    /// `null` where it is open at the end of the range.
+    /// `null` if the window is open at the end of the range.
     pub mu_to: Option<f64>,
     pub frequency_hz: f64,
     pub kind: &'static str,
     pub mode_ids: Vec<u32>,
 }
 
-/// More intervals than this are not drawn: neighbouring nodes are left out instead.
+/// Number of intervals drawn at most; of a finer map, nodes are skipped.
 const MOST_INTERVALS: usize = 700;
-/// Points the range of friction coefficients is given at least.
+/// Number of points over the range of friction coefficients, at least.
 const POINTS: f64 = 300.0;
-/// Points put into an interval in which modes merge, denser towards the merging.
+/// Number of points in an interval in which modes merge, denser towards the merging point.
 const AT_MERGING: usize = 24;
 
 impl Curves {
@@ -73,7 +73,7 @@ impl Curves {
             .filter_map(|(_, id)| *id)
             .collect();
         let range = nodes.first().zip(nodes.last()).map_or(0.0, |(first, last)| last.mu() - first.mu());
-        // People look at where it begins: at least 40 points up to there.
+        // The beginning of instability matters most: at least 40 points up to there.
         let critical = map.critical_friction().filter(|&mu| mu > 0.0).unwrap_or(range);
         let spacing = (range / POINTS).min(critical / 40.0).max(range / 4000.0);
 
@@ -129,7 +129,7 @@ impl Curves {
     }
 }
 
-/// `λ` of `λ²` with `ω ≥ 0`, and `σ ≥ 0` where `ω = 0`.
+/// The root `λ` of `λ²` with `ω ≥ 0`, and with `σ ≥ 0` if `ω = 0`.
 pub(super) fn root(square: c64) -> c64 {
     let root = square.sqrt();
     if root.im < 0.0 || (root.im == 0.0 && root.re < 0.0) { -root } else { root }
@@ -142,13 +142,14 @@ struct Interval<'a> {
     merging: Vec<Merging>,
 }
 
-/// A pair of undamped modes that merges, or separates, in an interval.
+/// A pair of undamped modes that merges or separates within an interval.
 struct Merging {
     ids: (u32, u32),
-    /// `s` and `d` at both ends with their slopes.
+    /// `s` and `d` at both ends, with their derivatives.
     mean: [(c64, c64); 2],
     discriminant: [(f64, f64); 2],
-    /// Which way the first of the pair lies from the mean: of `√d` where separate, of `i√-d` where merged.
+    /// Sign of the first mode's distance from the mean: that of `√d` where the pair is separate, that of `i√-d` where
+    /// it is merged.
     sign: (f64, f64),
 }
 
@@ -194,7 +195,7 @@ impl<'a> Interval<'a> {
         self.right.mu() - self.left.mu()
     }
 
-    /// Where to draw, from the left end to before the right end.
+    /// Friction coefficients to draw, measured from the left end, without the right end.
     fn points(&self, spacing: f64) -> Vec<f64> {
         let (from, step) = (self.left.mu(), self.step());
         let count = (step / spacing).ceil().max(1.0) as usize;
@@ -213,7 +214,7 @@ impl<'a> Interval<'a> {
         points
     }
 
-    /// `λ²` of a mode.
+    /// `λ²` of a mode at `mu`.
     fn square(&self, id: u32, mu: f64) -> Option<c64> {
         let (at, step) = (mu - self.left.mu(), self.step());
         if let Some(merging) = self.merging.iter().find(|m| m.ids.0 == id || m.ids.1 == id) {
@@ -238,7 +239,7 @@ impl Merging {
         cubic(left, right, step, at).re
     }
 
-    /// Where the discriminant is zero, from the left end.
+    /// Where the discriminant vanishes, measured from the left end.
     fn at(&self, step: f64) -> f64 {
         let (mut low, mut high) = (0.0, step);
         let falls = self.discriminant[0].0 > 0.0;
@@ -252,7 +253,7 @@ impl Merging {
     fn square(&self, at: f64, step: f64, side: f64) -> c64 {
         let mean = cubic(self.mean[0], self.mean[1], step, at);
         let d = self.discriminant(at, step);
-        // The mean of a pair of real squares, or of two conjugate ones, is real.
+        // The mean of two real squares or of two conjugate squares is real.
         let mean = c64::from(mean.re);
         if d >= 0.0 {
             mean + c64::from(side * self.sign.0 * d.sqrt())
@@ -262,7 +263,7 @@ impl Merging {
     }
 }
 
-/// The identity of the root whose `λ²` is conjugate to that of `id`, where that is complex.
+/// The identity of the root whose `λ²` is the conjugate of that of `id`, if that is complex.
 fn partner(node: &MapNode, id: u32) -> Option<u32> {
     let square = node.spectrum.roots[node.find(id)?].square;
     if square.im == 0.0 {
@@ -273,7 +274,7 @@ fn partner(node: &MapNode, id: u32) -> Option<u32> {
     node.ids[other].filter(|&other| other != id)
 }
 
-/// The cubic with given values and slopes at 0 and `step`.
+/// The cubic polynomial with given values and derivatives at 0 and `step`.
 fn cubic(left: (c64, c64), right: (c64, c64), step: f64, at: f64) -> c64 {
     let s = at / step;
     let (s2, s3) = (s * s, s * s * s);
@@ -290,10 +291,10 @@ mod tests {
     use crate::rig::{EMBEDDED, Rig};
     use crate::session::map_options;
 
-    /// The curves against spectra solved where they are drawn.
+    /// The curves compared with spectra solved at the friction coefficients drawn.
     #[test]
     fn curves_follow_the_modes_between_the_nodes_and_through_mergings() {
-        // Those of which all modes are in the band.
+        // Rigs whose modes are all in the band.
         for embedded in EMBEDDED.iter().filter(|embedded| embedded.name.starts_with("nine-dof")) {
             let rig = Rig::load(embedded.name).unwrap();
             let name = embedded.name;
@@ -304,8 +305,8 @@ mod tests {
             assert_eq!(curves.modes.len(), rig.model.dimension());
             assert_eq!(curves.critical_friction, map.critical_friction());
             for (k, &mu) in curves.mu.iter().enumerate() {
-                // Between nodes it is a picture, not a solution: a few pixels of 500, more where a merging turns the
-                // curve vertical.
+                // Between nodes the curves are only for display: the tolerance is a few of 500 pixels, and more where
+                // merging modes make the curve vertical.
                 let near_merging = curves.windows.iter().any(|window| {
                     [Some(window.mu_from), window.mu_to].into_iter().flatten().any(|end| (end - mu).abs() < 0.02)
                 });

@@ -1,4 +1,4 @@
-//! Squeals, faults and silences, from predictions in order.
+//! Squeals, faults and silences, detected in a sequence of predictions.
 
 use std::collections::VecDeque;
 
@@ -8,20 +8,20 @@ use crate::node::status::Status;
 use crate::node::{Sample, UnstableMode};
 use crate::wire::Time;
 
-/// What an event is.
+/// The kind of an event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub enum EventKind {
     #[serde(rename = "SQUEAL")]
     Squeal,
     #[serde(rename = "FAULT")]
     Fault,
-    /// Inputs stopped.
+    /// Inputs have stopped.
     #[serde(rename = "NO DATA")]
     NoData,
 }
 
 impl EventKind {
-    /// The event that a prediction of `status` belongs to. Waiting for the first input is none.
+    /// The kind of event that a prediction with `status` belongs to; `None` for OK, WARN and WAITING.
     fn of(status: Status) -> Option<Self> {
         match status {
             Status::Squeal => Some(Self::Squeal),
@@ -31,7 +31,7 @@ impl EventKind {
         }
     }
 
-    /// As people read it.
+    /// The kind as displays show it.
     pub fn name(self) -> &'static str {
         match self {
             Self::Squeal => Status::Squeal.name(),
@@ -41,34 +41,34 @@ impl EventKind {
     }
 }
 
-/// A stretch of predictions that were all of one kind, with interruptions shorter than a quarter of a second.
+/// An interval of predictions of the same kind; interruptions shorter than a quarter of a second are included.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Event {
     /// Counted from 1.
     pub number: u64,
     pub kind: EventKind,
-    /// Time of its first prediction, s since the epoch.
+    /// Time of the first prediction, s since the epoch.
     pub onset_s: f64,
-    /// Time of the first prediction that was not of its kind any more; `null` while it lasts.
+    /// Time of the first prediction that no longer belongs to the event, s since the epoch; `null` while it lasts.
     pub end_s: Option<f64>,
-    /// How often it was interrupted: noise about the limit is not a new event each time.
+    /// Number of interruptions: noise at the limit does not start a new event each time.
     pub interruptions: u32,
-    /// Where its onset is in the sequence of inputs.
+    /// Sequence number of the input at the onset.
     pub input_seq: u64,
-    /// The frequencies over which its unstable modes went, of the fastest at every moment.
+    /// Frequency ranges of its unstable modes; of each prediction the fastest growing ones are included.
     pub modes: Vec<ModeRange>,
-    /// Its first prediction.
+    /// The first prediction.
     pub onset: EventMoment,
-    /// The prediction with the fastest growth; `null` for faults and silences.
+    /// The prediction with the largest growth rate; `null` for faults and silences.
     pub peak: Option<EventMoment>,
 }
 
-/// One prediction of an event: its conditions and the fastest growing mode under them. What is not known is `null`.
+/// One prediction of an event: its conditions and its fastest growing mode; unknown values are `null`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct EventMoment {
     /// s since the epoch.
     pub time_s: f64,
-    /// `null` where nothing grows, or a static root alone.
+    /// `null` if no mode grows, or only a static root.
     pub mode_id: Option<u32>,
     pub frequency_hz: Option<f64>,
     pub growth_rate_per_s: Option<f64>,
@@ -95,7 +95,7 @@ impl EventMoment {
         }
     }
 
-    /// Names and units of the columns of a CSV file, in the order of [`EventMoment::cells`].
+    /// Names of the CSV columns, with units, in the order of [`EventMoment::cells`].
     const COLUMNS: [&str; 8] = [
         "utc",
         "mode_id",
@@ -129,22 +129,22 @@ pub struct ModeRange {
     pub high_hz: f64,
 }
 
-/// The events so far, the oldest forgotten beyond a bound.
+/// The events so far; the oldest are dropped beyond 10 000.
 #[derive(Clone, Debug, Default)]
 pub struct Events {
     events: VecDeque<Event>,
     count: u64,
-    /// The latest event has not ended.
+    /// Whether the latest event has not ended.
     open: bool,
 }
 
 /// An interruption shorter than this does not end an event, s.
 pub(super) const BRIDGED_S: f64 = 0.25;
-/// Events kept; older ones are forgotten.
+/// Number of events kept.
 const MOST_EVENTS: usize = 10_000;
 
 impl Events {
-    /// Takes the next prediction in; whether something began or ended.
+    /// Adds the next prediction; returns whether an event began or ended.
     pub fn push(&mut self, sample: &Sample) -> bool {
         let kind = EventKind::of(sample.status);
         let time_s = seconds(sample.time_ns);
@@ -196,20 +196,19 @@ impl Events {
         self.events.iter()
     }
 
-    /// How many there were, the forgotten ones included.
+    /// Number of events so far, including dropped ones.
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// As comma-separated values with a header that names the units, times in ISO 8601. Onset and peak have columns of
-    /// their own.
+    /// The events as CSV. The header contains the units, times are ISO 8601, onset and peak have separate columns.
     pub fn to_csv(&self) -> String {
         let mut header: Vec<String> =
             ["number", "kind", "onset_utc", "end_utc", "duration_s", "interruptions", "input_seq"]
                 .map(String::from)
                 .into();
         for when in ["onset", "peak"] {
-            // The time of the onset has its place already.
+            // The time of the onset already has a column.
             let columns = EventMoment::COLUMNS.iter().skip(usize::from(when == "onset"));
             header.extend(columns.map(|column| format!("{when}_{column}")));
         }
@@ -239,7 +238,7 @@ fn cell<T: ToString>(value: Option<T>) -> String {
 }
 
 impl Event {
-    /// Takes one of its predictions in.
+    /// Adds a prediction to the event.
     fn take(&mut self, sample: &Sample) {
         for UnstableMode { id, frequency_hz: hz, .. } in sample.unstable.iter().flatten().copied() {
             match self.modes.iter_mut().find(|range| range.id == id) {
@@ -260,7 +259,7 @@ pub fn seconds(ns: i64) -> f64 {
     ns as f64 * 1e-9
 }
 
-/// A time as people and spreadsheets read it, UTC.
+/// A time in UTC as people and spreadsheets read it (ISO 8601).
 pub fn iso(time_s: f64) -> String {
     let time = Time::from_ns((time_s * 1e6).round() as i64 * 1000);
     jiff::Timestamp::new(i64::from(time.sec), time.nanosec as i32)
@@ -294,7 +293,7 @@ pub(super) mod tests {
         }
     }
 
-    /// Onset and peak are moments that were: each has the conditions and the mode of its own prediction.
+    /// Onset and peak are actual predictions: each has its own conditions and mode.
     #[test]
     fn a_squeal_is_one_event_whose_onset_and_peak_have_their_own_conditions() {
         let mut events = Events::default();

@@ -1,4 +1,4 @@
-//! The last minutes as bins of equal length, each with the range of what fell into it.
+//! The last minutes in bins of equal length, each with the ranges of the values in it.
 
 use std::collections::VecDeque;
 
@@ -10,30 +10,30 @@ use crate::node::{SAMPLE_MODES, Sample, UnstableMode, VibrationSample};
 /// Quantities with a range in every bin, in the order of [`Bin::ranges`].
 pub const QUANTITIES: [&str; 5] = ["load", "speed", "mu", "growth", "margin"];
 
-/// A bin as JSON is seldom longer, bytes.
+/// Usual upper limit on the JSON of a bin, bytes.
 const BIN_JSON: usize = 256;
 
-/// A stretch of time.
+/// Values of one interval of time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Bin {
-    /// Number of the bin: its beginning over the length of a bin.
+    /// Number of the bin: its start time divided by the bin length.
     #[serde(rename = "k")]
     pub index: i64,
-    /// Smallest and largest of each quantity; `null` where there was none.
+    /// Smallest and largest value of each quantity; `null` without values.
     #[serde(rename = "r")]
     pub ranges: [Option<(f32, f32)>; QUANTITIES.len()],
-    /// The gravest level; `null` where nothing was predicted.
+    /// The most severe level; `null` without a prediction.
     #[serde(rename = "l")]
     pub level: Option<u8>,
-    /// Frequency and growth rate of the unstable modes at the moment of the fastest growth.
+    /// Frequency and growth rate of the unstable modes at the moment of the largest growth rate.
     #[serde(rename = "u", serialize_with = "present")]
     pub unstable: [Option<(f32, f32)>; SAMPLE_MODES],
-    /// What was measured of the vibration.
+    /// The measured vibration.
     #[serde(rename = "v", skip_serializing_if = "Option::is_none")]
     pub vibration: Option<Vibration>,
 }
 
-/// Smallest and largest level of a measured vibration, and the frequency of the largest.
+/// Smallest and largest level of the measured vibration, and the frequency at the largest.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Vibration {
     #[serde(rename = "lo")]
@@ -51,7 +51,7 @@ impl Vibration {
     }
 }
 
-/// Only those that are there.
+/// Serialises the entries that are present.
 fn present<S: Serializer>(unstable: &[Option<(f32, f32)>; SAMPLE_MODES], serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_seq(unstable.iter().flatten())
 }
@@ -81,7 +81,8 @@ impl Bin {
     }
 }
 
-/// Bins up to now, the last of them still open: the latest ones, or all, longer and longer.
+/// Bins up to now, of which the last is still open. Either the latest bins are kept, or all of them with increasing
+/// length.
 #[derive(Clone, Debug)]
 pub struct History {
     bin_ns: i64,
@@ -91,22 +92,22 @@ pub struct History {
 }
 
 impl History {
-    /// At most `capacity` bins of `bin_ns`.
+    /// Keeps the latest `capacity` bins of length `bin_ns`.
     pub fn new(bin_ns: i64, capacity: usize) -> Self {
         assert!(bin_ns > 0 && capacity > 0, "bins of {bin_ns} ns, {capacity} of them");
-        // Written to once, so that the memory is there from the beginning and does not grow as it fills.
+        // Written once, so that the memory is resident from the start and does not grow as the history fills.
         let mut bins: VecDeque<Bin> = (0..capacity).map(|_| Bin::empty(0)).collect();
         bins.clear();
         Self { bin_ns, capacity, coarsens: false, bins }
     }
 
-    /// At most `capacity` bins of `bin_ns` or longer, so that nothing has to be forgotten.
+    /// Keeps everything in at most `capacity` bins: their length starts at `bin_ns` and doubles when necessary.
     pub fn coarsening(bin_ns: i64, capacity: usize) -> Self {
         assert!(capacity > 1, "{capacity} bins that are to be merged");
         Self { coarsens: true, ..Self::new(bin_ns, capacity) }
     }
 
-    /// Makes two bins one until there are fewer than may be.
+    /// Merges pairs of bins until there are fewer than the capacity.
     fn coarsen(&mut self) {
         while self.bins.len() >= self.capacity {
             self.bin_ns *= 2;
@@ -132,26 +133,26 @@ impl History {
         &self.bins
     }
 
-    /// All of it as JSON, written as it is read: a tree of it would take many times the memory.
+    /// The history as JSON, serialised directly: an intermediate tree would take many times the memory.
     pub fn to_json(&self) -> String {
         #[derive(Serialize)]
         struct Whole<'a> {
             bin_s: f64,
             bins: &'a VecDeque<Bin>,
         }
-        // As much as a full history takes, from the first time on: what the allocator keeps of it does not grow.
+        // Reserves the memory of a full history from the start, so that the allocator's share does not grow.
         let mut text = Vec::with_capacity(64 + BIN_JSON * self.capacity);
-        // Numbers only: nothing that JSON cannot hold.
+        // Only numbers, so serialisation cannot fail.
         let whole = Whole { bin_s: seconds(self.bin_ns), bins: &self.bins };
         serde_json::to_writer(&mut text, &whole).ok().and_then(|()| String::from_utf8(text).ok()).unwrap_or_default()
     }
 
-    /// The bins from `index` on.
+    /// The bins from number `index` on.
     pub fn since(&self, index: i64) -> impl Iterator<Item = &Bin> {
         self.bins.range(self.bins.partition_point(|bin| bin.index < index)..)
     }
 
-    /// The bin of a time. Time that runs backward stays in the latest bin.
+    /// The bin of a time. A time before the latest bin is put into the latest bin.
     fn bin(&mut self, time_ns: i64) -> Option<&mut Bin> {
         let mut index = time_ns.div_euclid(self.bin_ns);
         if self.coarsens && self.bins.len() == self.capacity && self.bins.back().is_none_or(|last| last.index < index) {
@@ -167,7 +168,7 @@ impl History {
         self.bins.back_mut()
     }
 
-    /// Takes a measured vibration in.
+    /// Adds a measured vibration.
     pub fn push_vibration(&mut self, sample: &VibrationSample) {
         let (level_db, frequency_hz) = (sample.level_db as f32, sample.frequency_hz as f32);
         let Some(bin) = self.bin(sample.time_ns).filter(|_| level_db.is_finite() && frequency_hz.is_finite()) else {
@@ -177,7 +178,7 @@ impl History {
         bin.vibration = Some(bin.vibration.map_or(new, |before| before.merge(new)));
     }
 
-    /// Takes a sample in.
+    /// Adds a sample.
     pub fn push(&mut self, sample: &Sample) {
         let Some(bin) = self.bin(sample.time_ns) else { return };
         let values = [

@@ -1,4 +1,4 @@
-//! A node, as the page sees it: follows its watch.
+//! The page's source for a running node, which follows the node's watch.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -17,9 +17,9 @@ use crate::rig::Rig;
 
 /// Length of a bin of the history, ns.
 const BIN_NS: i64 = 200_000_000;
-/// Bins kept: 10 minutes.
+/// Number of bins kept: 10 minutes.
 const BINS: usize = 3000;
-/// A state is sent this often although nothing happened, so that the page knows it is still there.
+/// Interval at which a state is sent even without changes, so that the page knows that the connection works.
 const SIGN_OF_LIFE: Duration = Duration::from_millis(500);
 
 /// Follows a node.
@@ -37,10 +37,10 @@ struct Followed {
     history: History,
     events: Events,
     event_changes: u64,
-    /// Index of the last bin of the state sent before.
+    /// Number of the last bin in the state sent before.
     sent: i64,
     sent_at: Option<Instant>,
-    /// Predictions of the ticks of the last second.
+    /// Number of predictions in each tick of the last second.
     ticks: VecDeque<(Instant, usize)>,
     map: Option<Arc<StabilityMap>>,
     map_number: u64,
@@ -48,7 +48,7 @@ struct Followed {
 }
 
 impl Live {
-    /// Follows from its first tick on: one that is served nowhere takes nothing.
+    /// Follows the node from the first tick on; without a server nothing is collected.
     pub fn new(rig: Arc<Rig>, watch: Watch, about: About) -> Self {
         let solver = Mutex::new(Solver::new(rig.model.dimension()));
         let followed = Followed {
@@ -73,7 +73,7 @@ impl Live {
 }
 
 impl Followed {
-    /// Takes in what happened since; whether anything did.
+    /// Collects what happened since the last call; returns whether anything did.
     fn follow(&mut self, watch: &Watch) -> bool {
         watch.take_samples(&mut self.samples);
         for sample in &self.samples {
@@ -115,7 +115,7 @@ impl Followed {
             counters: Some(CountersShown::new(snapshot.counters, snapshot.passed_over)),
             bins,
         };
-        // Numbers and strings: nothing that JSON cannot hold.
+        // Only numbers and strings, so serialisation cannot fail.
         let text = serde_json::to_string(&state).unwrap_or_default();
         if with_bins {
             self.sent = self.history.bins().back().map_or(i64::MIN, |bin| bin.index);
@@ -142,7 +142,7 @@ impl Source for Live {
     }
 
     fn history(&self) -> String {
-        // The next state waits for this; the node does not, and a copy would cost memory.
+        // The next state has to wait meanwhile, but the node does not; a copy would cost memory.
         self.followed().history.to_json()
     }
 
@@ -182,7 +182,7 @@ mod tests {
     use crate::node::status::InputSources;
     use crate::wire::{OperatingPoint, Prediction, level};
 
-    /// What the page is sent is what was predicted, at every level, and nothing is asserted where nothing is known.
+    /// The page gets the predicted level, at every level, and no statement where nothing is known.
     #[test]
     fn the_page_is_sent_the_level_that_was_predicted() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));

@@ -1,9 +1,9 @@
-//! What people look at: a page that shows a node or a recording, and a report.
+//! Displays for people: a page that shows a node or a recording, and a report.
 //!
-//! The pure part turns what is known into what is shown: [`history`], [`events`] and [`curves`] from samples and
-//! stability maps, [`comparison`] from a measured vibration, [`shape`] and [`change`] from a spectrum, [`state`] from a snapshot. [`live`] and [`recorded`] feed it; [`server`]
-//! hands it to browsers. Nothing here can change a node: a node only updates its [`crate::node::Watch`], whether
-//! somebody looks or not, and text is encoded only while a page listens.
+//! The pure modules convert data to what is shown: [`history`], [`events`] and [`curves`] use samples and stability
+//! maps, [`comparison`] a measured vibration, [`shape`] and [`change`] a spectrum, [`state`] a snapshot. [`live`] and
+//! [`recorded`] provide the data; [`server`] serves browsers. Nothing here can affect a node: a node only updates its
+//! [`crate::node::Watch`], whether or not it is displayed. Text is only encoded while a page is connected.
 
 mod assets;
 pub mod change;

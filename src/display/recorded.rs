@@ -1,4 +1,4 @@
-//! A recording, as the page sees it: read once, then asked moment by moment.
+//! The page's source for a recording: read once, then queried for single moments.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -20,65 +20,65 @@ use crate::rig::Rig;
 use crate::simulator;
 use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind, level};
 
-/// Bins of the history; they get longer with the recording.
+/// Bins of the history; their length grows with the recording.
 const BINS: usize = 3000;
-/// Length of a bin to begin with, ns.
+/// Initial length of a bin, ns.
 const FIRST_BIN_NS: i64 = 50_000_000;
-/// Moments kept in full. Of a longer recording only every second, fourth ... prediction can be looked at, and those
-/// where the level changes; events and history count them all.
+/// Number of predictions kept in full. Of a longer recording only every second, fourth ... prediction is kept, and
+/// those at which the status changes. Events and history include all of them.
 const MOST_MOMENTS: usize = 40_000;
-/// Inputs remembered until their prediction comes.
+/// Inputs remembered until their prediction is read.
 const INPUTS: usize = 1024;
-/// Maps kept computed.
+/// Stability maps kept in memory.
 const MAPS: usize = 8;
 
-/// One prediction with its conditions.
+/// One prediction with its input.
 #[derive(Clone, Debug)]
 pub struct Moment {
-    /// By the stamps; see [`TimeLine`].
+    /// Time according to the stamps; see [`TimeLine`].
     pub time_ns: i64,
     pub input: Option<OperatingPoint>,
     pub prediction: Prediction,
     status: Status,
     /// Number of the prediction in the recording.
     index: u64,
-    /// Its status is not that of the prediction before.
+    /// Whether its status differs from that of the previous prediction.
     changed: bool,
 }
 
-/// What a recording holds, in the form of a page or a report.
+/// The content of a recording, prepared for the page and the report.
 pub struct Recorded {
     pub rig: Arc<Rig>,
     pub history: History,
     pub events: Events,
-    /// The vibration that was measured meanwhile.
+    /// The measured vibration.
     pub vibration: Measurements,
-    /// In order; see [`Recorded::stride`].
+    /// The predictions kept, in order; see [`Recorded::stride`].
     pub moments: Vec<Moment>,
-    /// Of how many predictions one is kept.
+    /// One of this many predictions is kept.
     pub stride: u64,
-    /// Predictions by status.
+    /// Number of predictions by status.
     pub counts: HashMap<Status, u64>,
-    /// Whether the rig simulator made an input.
+    /// Whether any input came from the rig simulator.
     pub simulated: bool,
-    /// Inputs that were recorded, and those of them that were predicted.
+    /// Number of inputs recorded, and of those predicted.
     pub inputs: u64,
     pub answered: u64,
-    /// What the node counted last.
+    /// The node's latest diagnostics.
     pub counted: Option<DiagnosticArray>,
     pub reused: u64,
-    /// Settings and maps, in order, with their time on the time line of the stamps.
+    /// Settings, maps and other session events in order, with their time on the time line of the stamps.
     pub session_events: Vec<(i64, SessionEvent)>,
     pub damage: Vec<FileDamage>,
     status_before: Option<Status>,
-    /// Whether inputs came at the latest entry that was read.
+    /// Whether inputs arrived at the latest entry read.
     flow: Inputs,
     maps: Mutex<VecDeque<(u64, Arc<StabilityMap>)>>,
     solver: Mutex<Solver>,
 }
 
 impl Recorded {
-    /// Reads `recording`, made with `rig`; `criteria` say what squeal is in a measured vibration.
+    /// Reads `recording`, which was made with `rig`. `criteria` define squeal in a measured vibration.
     pub fn read(recording: &Recording, rig: Arc<Rig>, criteria: Criteria) -> Self {
         let mut recorded = Self {
             solver: Mutex::new(Solver::new(rig.model.dimension())),
@@ -116,12 +116,12 @@ impl Recorded {
                 }
                 Content::Known(Payload::Prediction(prediction)) => {
                     let input = inputs.iter().rev().find(|input| input.seq == prediction.input_seq);
-                    // A fault for want of inputs names the last one and has a stamp of the node's clock.
+                    // The FAULT of a silence refers to the last input, but its stamp is from the node's clock.
                     let stamp = prediction.header.stamp;
                     let measured = input.map_or(prediction.level != level::FAULT, |input| input.header.stamp == stamp);
                     let time_ns = if measured { line.stamped(stamp, log_ns) } else { line.unstamped(log_ns) };
                     if recorded.moments.is_empty() {
-                        // What was before it had no stamp to follow.
+                        // Earlier events had no stamped message to follow.
                         for (event_ns, _) in &mut recorded.session_events {
                             *event_ns = time_ns.saturating_sub(log_ns.saturating_sub(*event_ns));
                         }
@@ -169,7 +169,7 @@ impl Recorded {
             let stride = self.stride;
             let regular = |moment: &Moment| moment.index.is_multiple_of(stride);
             self.moments.retain(|moment| moment.changed || regular(moment));
-            // A level that changes all the time is no reason to keep everything.
+            // If the status changes all the time, keep only every `stride`-th prediction.
             if self.moments.len() > MOST_MOMENTS / 4 * 3 {
                 self.moments.retain(regular);
             }
@@ -177,17 +177,17 @@ impl Recorded {
         self.moments.push(Moment { time_ns, input: input.cloned(), prediction, status, index: count, changed });
     }
 
-    /// How many predictions there were.
+    /// Number of predictions.
     pub fn predictions(&self) -> u64 {
         self.counts.values().sum()
     }
 
-    /// How many predictions of a status there were.
+    /// Number of predictions with a status.
     pub fn count(&self, status: Status) -> u64 {
         self.counts.get(&status).copied().unwrap_or(0)
     }
 
-    /// What is said first of a moment.
+    /// The assessment of a moment.
     fn assessment(&self, moment: &Moment) -> Assessment {
         let map = moment.status.is_known().then(|| self.stability_map(self.map_number(seconds(moment.time_ns))));
         let map = map.flatten();
@@ -195,23 +195,23 @@ impl Recorded {
         Assessment::new(moment.status, &moment.prediction, moment.input.as_ref(), windows)
     }
 
-    /// First and last moment, s since the epoch; `None` without any prediction.
+    /// First and last moment, s since the epoch; `None` without predictions.
     pub fn span_s(&self) -> Option<(f64, f64)> {
         let first = seconds(self.moments.first()?.time_ns);
         let bin_s = seconds(self.history.bin_ns());
         let last = self.moments.last().map_or(first, |last| seconds(last.time_ns));
-        // The very last predictions may be among those that are not kept.
+        // The last predictions may not be among those kept.
         let end = self.history.bins().back().map_or(last, |bin| bin.index as f64 * bin_s);
         Some((first, last.max(end)))
     }
 
-    /// The latest kept prediction up to a moment; the first before any.
+    /// The latest kept prediction up to a time; before the first one, the first.
     pub fn moment(&self, at_s: f64) -> Option<&Moment> {
         let after = self.moments.partition_point(|moment| seconds(moment.time_ns) <= at_s + 1e-7);
         self.moments.get(after.saturating_sub(1))
     }
 
-    /// The measured vibration against the predictions; `None` where none was recorded.
+    /// The measured vibration compared with the predictions; `None` if none was recorded.
     pub fn comparison(&self) -> Option<Comparison> {
         self.vibration.compare(&self.events, self.span_s()?.1)
     }
@@ -220,19 +220,19 @@ impl Recorded {
         self.session_events.iter().filter(|(_, event)| event.kind == event_kind::STABILITY_MAP)
     }
 
-    /// Number of the map that was in use, from 1; 0 before the first.
+    /// Number of the map in force at a time, from 1; 0 before the first.
     pub fn map_number(&self, at_s: f64) -> u64 {
         self.map_events().take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7).count() as u64
     }
 
-    /// The margin below which the node warned at a moment; `None` where that was not recorded.
+    /// The margin below which the node warned at a time; `None` if not recorded.
     pub fn warn_margin(&self, at_s: f64) -> Option<f64> {
         let named = |event: &&SessionEvent| event.kind == event_kind::PARAMETER && event.name == "warn_margin";
         let before = self.session_events.iter().take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7);
         before.map(|(_, event)| event).filter(named).last().map(|event| event.value)
     }
 
-    /// The map of that number, computed again; `None` where there is none or it cannot be had.
+    /// The map with that number, computed again; `None` if there is none or the computation fails.
     pub fn stability_map(&self, number: u64) -> Option<Arc<StabilityMap>> {
         let known = |maps: &VecDeque<(u64, Arc<StabilityMap>)>| {
             maps.iter().find(|(known, _)| *known == number).map(|(_, map)| map.clone())
@@ -347,7 +347,8 @@ mod tests {
 
     const STEPS: u32 = 40;
 
-    /// A simulated session every 0.1 s, at friction coefficients from 0.28 to 0.45: `nine-dof-case-2` squeals above 0.3559.
+    /// A simulated session with a step of 0.1 s and friction coefficients from 0.28 to 0.45: `nine-dof-case-2` squeals
+    /// above 0.3559.
     fn ramp(directory: &std::path::Path) -> Recorded {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
         let inputs = (0..STEPS).map(|seq| {

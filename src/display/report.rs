@@ -1,4 +1,4 @@
-//! A recording as one HTML file that needs nothing else.
+//! A recording as one self-contained HTML file.
 
 use std::fmt::Write;
 
@@ -11,22 +11,22 @@ use crate::node::status::Status;
 use crate::plot;
 use crate::wire::{SessionEvent, event_kind};
 
-/// Stability maps drawn.
+/// Number of stability maps drawn.
 const WORST: usize = 3;
-/// Events listed; the rest is in the CSV file.
+/// Number of events listed; all of them are in the CSV file.
 const LISTED: usize = 500;
 
-/// Settings of the first moment are those the session starts with, s.
+/// Settings recorded in this initial time are those the session started with, s.
 const STARTING_S: f64 = 0.5;
 
-/// What the report says about where its recording came from.
+/// The origin of the recording, as the report states it.
 #[derive(Clone, Debug)]
 pub struct Origin {
     pub file: String,
     pub version: Option<String>,
 }
 
-/// The report.
+/// Writes the report as HTML.
 ///
 /// # Errors
 /// A figure cannot be drawn.
@@ -64,7 +64,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         let Some(peak) = event.peak else { continue };
         let at_s = peak.time_s;
         let number = recorded.map_number(at_s).max(1);
-        // One figure of each map, at its worst moment.
+        // One figure for each map, at its worst moment.
         if drawn.len() == WORST || drawn.contains(&number) {
             continue;
         }
@@ -100,7 +100,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
     Ok(page(&format!("squealcast report: {title}"), &html))
 }
 
-/// One sentence for who reads no further.
+/// One sentence that summarises the recording.
 fn verdict(recorded: &Recorded, to_s: f64) -> String {
     let events = &recorded.events;
     let predictions = recorded.predictions();
@@ -205,7 +205,7 @@ fn events(events: &Events, from_s: f64) -> String {
     html
 }
 
-/// When it was, what grew fastest, and under which conditions.
+/// Cells for a moment of an event: time, fastest growing mode and conditions.
 fn event_moment(moment: &EventMoment, from_s: f64) -> Vec<String> {
     vec![
         format!("{:.3}", moment.time_s - from_s),
@@ -218,7 +218,7 @@ fn event_moment(moment: &EventMoment, from_s: f64) -> Vec<String> {
     ]
 }
 
-/// Hits, misses and false alarms, and what these words mean.
+/// The section on hits, misses and false alarms, with definitions.
 fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
     let criteria = &found.criteria;
     let (hits, misses, false_alarms) = (found.hits(), found.misses(), found.false_alarms.len());
@@ -306,7 +306,7 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
     html
 }
 
-/// When maps and charts became ready, and settings were changed.
+/// The section on maps, charts and changed settings.
 fn session_events(recorded: &Recorded, from_s: f64) -> String {
     let told = |(time_ns, event): &(i64, SessionEvent)| {
         let after_s = seconds(*time_ns) - from_s;
@@ -316,7 +316,7 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
             }
             event_kind::CHART => ("chart ready", "predictions are read off it from here on".to_owned()),
             event_kind::SILENCE => ("silence", "no input came for too long".to_owned()),
-            // Those a session starts with are in the table at the top.
+            // The initial settings are in the table at the top.
             event_kind::PARAMETER if after_s > STARTING_S => ("setting", format!("{} = {}", event.name, event.value)),
             _ => return None,
         };
@@ -340,7 +340,7 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
     html
 }
 
-/// The events that grow, the fastest first.
+/// Events with growing modes, in descending order of growth rate.
 fn worst(events: &Events) -> Vec<&Event> {
     let growth = |event: &Event| event.peak.and_then(|peak| peak.growth_rate_per_s);
     let mut squeals: Vec<&Event> = events.iter().filter(|event| growth(event).is_some()).collect();
@@ -348,7 +348,7 @@ fn worst(events: &Events) -> Vec<&Event> {
     squeals
 }
 
-/// The largest bounds over the session, by mode.
+/// A table of the largest error bounds of each mode over the session.
 fn error_bounds(recorded: &Recorded) -> String {
     let mut bounds: std::collections::BTreeMap<u32, [f64; 3]> = std::collections::BTreeMap::new();
     for mode in recorded.moments.iter().flat_map(|moment| &moment.prediction.modes) {
@@ -403,7 +403,7 @@ fn optional(value: Option<f64>) -> String {
     number(value.unwrap_or(f64::NAN))
 }
 
-/// A number with six significant digits at most.
+/// A number with at most six significant digits.
 fn number(value: f64) -> String {
     if !value.is_finite() {
         return "–".to_owned();

@@ -1,7 +1,7 @@
-//! Hands a [`Source`] to browsers: HTTP/1.1, GET only, one stream of states.
+//! Serves a [`Source`] to browsers: HTTP/1.1, GET only, with one stream of states.
 //!
-//! Runs on a thread of its own. All pages together get one encoding of a state, at most 30 times a second; a page that
-//! reads too slowly misses states. [`connections`] bounds what clients can take. No request changes anything.
+//! Runs on its own thread. A state is encoded once for all pages, at most 30 times a second. A page that reads too
+//! slowly misses states. [`connections`] limits what clients can use. No request changes anything.
 
 use std::convert::Infallible;
 use std::io;
@@ -32,23 +32,25 @@ use super::events::Events;
 use crate::node::status::InputSources;
 use crate::rig::Rig;
 
-/// Time between two states: not more than 30 a second.
+/// Time between two states: at most 30 per second.
 const EVERY: Duration = Duration::from_millis(34);
-/// Maps, shapes and histories that are prepared at a time; more wait. Two may wait for each other's map.
+/// Number of maps, shapes and histories prepared at the same time; further requests wait. Two may wait for each other's
+/// map.
 const BLOCKING_THREADS: usize = 4;
 
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; \
                       base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// What a page can ask for. Every text is JSON.
+/// Provides the data of a page. Every text is JSON.
 pub trait Source: Send + Sync + 'static {
     fn about(&self) -> About;
-    /// Called 30 times a second; the state to send, where there is a new one and anybody listens.
+    /// Called 30 times a second. Returns the state to send if there is a new one and a page is connected.
     fn tick(&self, listened_to: bool) -> Option<String>;
     fn state(&self, at_s: Option<f64>) -> String;
     fn history(&self) -> String;
     fn events(&self) -> Events;
-    /// The measured vibration against the predictions; `None` where there is none, or a session still goes on.
+    /// The measured vibration compared with the predictions; `None` without measurements, or while a session is
+    /// running.
     fn comparison(&self) -> Option<Comparison> {
         None
     }
@@ -57,11 +59,11 @@ pub trait Source: Send + Sync + 'static {
     /// The shape of a mode.
     ///
     /// # Errors
-    /// Why there is none.
+    /// Why it cannot be computed.
     fn shape(&self, id: u32, at_s: Option<f64>) -> Result<String, String>;
 }
 
-/// What does not change.
+/// Constant properties of a source.
 #[derive(Clone, Debug, Serialize)]
 pub struct About {
     /// `live` or `recording`.
@@ -73,15 +75,15 @@ pub struct About {
     pub mu_max: f64,
     pub warn_margin: f64,
     pub instability_threshold: f64,
-    /// From which level on a measured vibration counts as squeal.
+    /// Level from which on a measured vibration counts as squeal, dB.
     pub vibration_threshold_db: f64,
-    /// Whether the inputs come, or came, from the rig simulator.
+    /// Whether the inputs are from the rig simulator.
     pub simulated: bool,
-    /// What a node listens to.
+    /// Where a node expects its inputs.
     pub inputs: Option<InputSources>,
     /// First and last moment of a recording, s since the epoch.
     pub span_s: Option<(f64, f64)>,
-    /// When maps and charts of a recording became ready.
+    /// When maps and charts of a recording became available.
     pub notes: Vec<Note>,
 }
 
@@ -90,7 +92,7 @@ pub struct About {
 pub struct Note {
     pub onset_s: f64,
     pub what: &'static str,
-    /// Of a map.
+    /// Load and speed of a map.
     pub normal_load_n: Option<f64>,
     pub disc_speed_rad_s: Option<f64>,
 }
@@ -115,7 +117,7 @@ impl About {
     }
 }
 
-/// A running server; it ends when this is dropped.
+/// A running server; it stops when it is dropped.
 pub struct Server {
     address: SocketAddr,
     stop: Option<oneshot::Sender<()>>,
@@ -123,20 +125,20 @@ pub struct Server {
 }
 
 impl Server {
-    /// Serves `source` on the first of `addresses` that is free.
+    /// Serves `source` on the first free address of `addresses`.
     ///
     /// # Errors
-    /// None of them is, or the system gives no runtime.
+    /// No address is free, or the system cannot provide a runtime.
     pub fn start(addresses: &[SocketAddr], source: Arc<dyn Source>) -> io::Result<Self> {
-        // Few threads for what takes longer: the allocator keeps memory for each.
+        // Few threads for blocking work, since the allocator keeps memory for each.
         let mut runtime = tokio::runtime::Builder::new_current_thread();
         let runtime = runtime.enable_io().enable_time().max_blocking_threads(BLOCKING_THREADS).build()?;
         let listener = runtime.block_on(async { connections::listen(addresses) })?;
         let address = listener.local_addr()?;
         let (stop, stopped) = oneshot::channel();
         let thread = std::thread::Builder::new().name("display".to_owned()).spawn(move || {
-            // Where there are too few processors, the node comes first. Threads made from here on inherit it; a system
-            // that refuses changes nothing else.
+            // On a machine with few processors the node has precedence. Threads created from here on inherit the
+            // niceness; a refusal of the system has no other effect.
             let _ = rustix::process::nice(5);
             runtime.block_on(async {
                 tokio::select! { () = serve(listener, address, source) => {}, _ = stopped => {} }
@@ -146,7 +148,7 @@ impl Server {
         Ok(Self { address, stop: Some(stop), thread: Some(thread) })
     }
 
-    /// Where it serves.
+    /// The address on which it serves.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
@@ -202,8 +204,8 @@ async fn send_states(app: App) {
     }
 }
 
-/// Refuses names this server is not known by, so that no other site can reach it through a name of its own; and
-/// tells the browser to load nothing from elsewhere.
+/// Refuses requests for host names that are not the server's own, so that no other site can reach it through a name of
+/// its own. Tells the browser to load nothing from other origins.
 async fn guard(Shared(app): Shared<App>, request: Request, next: Next) -> Response {
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or("");
     let mut response = if is_own_name(host, app.address.ip()) {
@@ -225,7 +227,7 @@ async fn guard(Shared(app): Shared<App>, request: Request, next: Next) -> Respon
     response
 }
 
-/// Whether a Host header names an address rather than a name of somebody else's; on loopback, a loopback address.
+/// Whether a Host header contains an address instead of a foreign name; on loopback, a loopback address.
 fn is_own_name(host: &str, bound: IpAddr) -> bool {
     let bracketed = || host.strip_prefix('[')?.strip_suffix(']')?.parse::<Ipv6Addr>().ok().map(IpAddr::from);
     let with_port = host.parse::<SocketAddr>().ok().map(|address| address.ip());
@@ -238,7 +240,7 @@ fn is_own_name(host: &str, bound: IpAddr) -> bool {
     }
 }
 
-/// Whether an `Accept-Encoding` header takes zstd: named, and not with a weight of 0.
+/// Whether an `Accept-Encoding` header accepts zstd: listed, with a weight other than 0.
 fn takes_zstd(accepted: &str) -> bool {
     accepted.split(',').any(|encoding| {
         let mut parts = encoding.split(';').map(str::trim);
@@ -248,7 +250,7 @@ fn takes_zstd(accepted: &str) -> bool {
     })
 }
 
-/// Counts a page for as long as it listens.
+/// Counts a page as long as it is connected.
 struct Listening(Arc<AtomicUsize>);
 
 impl Drop for Listening {
@@ -352,7 +354,7 @@ fn json(text: String) -> Response {
     ([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response()
 }
 
-/// Work that may take a while, beside the thread that sends states.
+/// Runs work that may take long on another thread than the one that sends states.
 async fn aside(work: impl FnOnce() -> Response + Send + 'static) -> Response {
     match tokio::task::spawn_blocking(work).await {
         Ok(response) => response,

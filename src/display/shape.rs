@@ -1,7 +1,7 @@
-//! The shape of a mode at an operating point, as displacements of the rig's degrees of freedom or interface nodes.
+//! The shape of a mode at an operating point: displacements of the rig's degrees of freedom or interface nodes.
 //!
-//! A mode moves as `Re(x e^{λt})`: with `x = |x| e^{iφ}` a point moves as `|x| cos(ωt + φ)`, so that what has the
-//! larger phase moves first.
+//! A mode moves as `Re(x e^{λt})`. With `x = |x| e^{iφ}` a point moves as `|x| cos(ωt + φ)`, so a point with larger
+//! phase leads.
 
 use faer::{MatRef, c64};
 use serde::Serialize;
@@ -11,27 +11,27 @@ use crate::physics::{OperatingPoint, Solver, StabilityMap, Vectors};
 use crate::rig::{DiscAxis, Rig};
 use crate::session::numbers;
 
-/// A mode's shape; the largest displacement has magnitude 1 and phase 0.
+/// The shape of a mode, scaled so that the largest displacement has magnitude 1 and phase 0.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Shape {
     pub id: u32,
     pub frequency_hz: f64,
     pub growth_rate_per_s: f64,
-    /// The pad's share of the motion; `null` where the rig does not tell pad and disc apart.
+    /// The pad's share of the motion; `null` if the rig does not distinguish pad and disc.
     pub pad_share: Option<f64>,
-    /// What makes it grow faster or slower; `null` where that is not known.
+    /// Sensitivity of the growth rate to conditions and contact; `null` if unknown.
     pub growth_change: Option<GrowthChange>,
-    /// The axis about which the disc turns, for its outline.
+    /// The axis of rotation of the disc, for drawing its outline.
     pub disc: Option<DiscAxis>,
-    /// Pad, disc, or the whole system.
+    /// Pad and disc, or the whole system.
     pub parts: Vec<Part>,
 }
 
-/// Displacements of one side.
+/// Displacements of one part.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Part {
     pub name: String,
-    /// Whether the displacements are of nodes in space, three for each, or of numbered degrees of freedom.
+    /// Whether the displacements are those of nodes in space, three for each node, or of numbered degrees of freedom.
     pub spatial: bool,
     /// Positions of the nodes, m.
     pub nodes_m: Vec<[f64; 3]>,
@@ -42,7 +42,7 @@ pub struct Part {
 /// The shape of the mode with identity `id`.
 ///
 /// # Errors
-/// Why there is none, in words.
+/// Why it cannot be computed, as text.
 pub fn shape(
     rig: &Rig,
     solver: &mut Solver,
@@ -108,7 +108,7 @@ mod tests {
     use super::*;
     use crate::rig::RigFile;
 
-    /// One mass on a belt: above the merging `(K - λ²...) x = 0` gives `x₁/x₂` in closed form.
+    /// One mass on a belt: beyond the merging point the equation of motion gives `x₁/x₂` in closed form.
     #[test]
     fn the_shape_of_one_mass_on_a_belt_is_the_closed_form() {
         let text = include_str!("../../launch/rigs/hoffmann.toml");
@@ -127,8 +127,8 @@ mod tests {
         );
         assert_eq!(shape.disc, None);
         let u: Vec<c64> = shape.parts[0].re.iter().zip(&shape.parts[0].im).map(|(&re, &im)| c64::new(re, im)).collect();
-        // First row of the equation of motion, the paper's equation (3): λ² x + k11 x + (k12 ± μ kn) y = 0; the belt
-        // runs along +x and the normal is -y, so that the friction force on the mass is -μ kn y.
+        // First row of the equation of motion, equation (3) of the paper: λ² x + k11 x + (k12 ± μ kn) y = 0. The belt
+        // runs along +x and the normal is -y, so the friction force on the mass is -μ kn y.
         let k12 = 0.75 - mu * 4.0 / 3.0;
         let ratio = -(root.square + c64::from(1.5)) / k12;
         let found = u[1] / u[0];
@@ -144,7 +144,7 @@ mod tests {
         let names: Vec<&str> = shape.parts.iter().map(|part| part.name.as_str()).collect();
         assert_eq!(names, ["pad", "disc"]);
         assert!(shape.pad_share.is_some_and(|share| (0.0..=1.0).contains(&share)), "{:?}", shape.pad_share);
-        // As `launch/rigs/tribometer.toml` says.
+        // As in `launch/rigs/tribometer.toml`.
         let up = [0.0, 1.0, 0.0];
         let axis = DiscAxis { axis_point_m: [0.0; 3], axis_direction: up, normal: up };
         assert_eq!(shape.disc, Some(axis));

@@ -1,4 +1,4 @@
-//! What the page is told: the latest prediction with its surroundings.
+//! The state sent to the page: the latest prediction with its context.
 
 use serde::Serialize;
 
@@ -9,17 +9,17 @@ use crate::session::Counters;
 use crate::simulator;
 use crate::wire::{OperatingPoint, Prediction};
 
-/// How far back spread and trend look, s.
+/// Time over which spread and trend are computed, s.
 const RECENT_S: f64 = 2.0;
 
-/// Everything about one moment. Numbers that are not known are `null`.
+/// Everything about one moment; unknown numbers are `null`.
 #[derive(Clone, Debug, Serialize)]
 pub struct State<'a> {
     /// Time of the moment, s since the epoch.
     pub time_s: f64,
-    /// Seconds since the last input; `null` before the first.
+    /// Time since the last input, s; `null` before the first.
     pub age_s: Option<f64>,
-    /// Predictions in the last second.
+    /// Number of predictions in the last second.
     pub rate_hz: Option<f64>,
     #[serde(flatten)]
     pub assessment: Assessment,
@@ -29,19 +29,19 @@ pub struct State<'a> {
     pub spread: Option<(f32, f32)>,
     /// Change of the margin over the last 2 s, 1/s.
     pub trend_per_s: Option<f64>,
-    /// Below this margin the node warns; `null` where that is not known.
+    /// Margin below which the node warns; `null` if unknown.
     pub warn_margin: Option<f64>,
-    /// Which stability map belongs to it; 0 before the first.
+    /// Number of the stability map in force; 0 before the first.
     pub map: u64,
-    /// Changes when an event begins or ends.
+    /// Changes whenever an event begins or ends.
     pub events: u64,
     pub counters: Option<CountersShown>,
-    /// The bins that changed since the last state that was sent, the first of them known before.
+    /// Bins that changed since the last state sent; the first of them was part of that state.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub bins: Vec<&'a Bin>,
 }
 
-/// A prediction with its conditions.
+/// A prediction with its operating point.
 #[derive(Clone, Debug, Serialize)]
 pub struct Shown<'a> {
     pub level: u8,
@@ -49,7 +49,7 @@ pub struct Shown<'a> {
     pub seq: u64,
     pub stamp_s: f64,
     pub reused: bool,
-    /// Whether the input came from the rig simulator. Shared memory does not carry that.
+    /// Whether the input is from the rig simulator. Messages in shared memory do not carry this.
     pub simulated: bool,
     pub load: Option<f64>,
     pub speed: Option<f64>,
@@ -59,11 +59,12 @@ pub struct Shown<'a> {
     pub growth: f64,
     pub worst_hz: f64,
     pub unstable: u32,
-    /// Identity, frequency, growth rate, damping ratio, pad share, and errors of frequency and growth rate.
+    /// Identity, then frequency, growth rate, damping ratio, pad share, and the error bounds of frequency and growth
+    /// rate.
     pub modes: Vec<(u32, [f64; 6])>,
 }
 
-/// What was done so far.
+/// Counters of the session.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct CountersShown {
     pub solved: u64,
@@ -81,7 +82,7 @@ impl CountersShown {
 }
 
 impl<'a> Shown<'a> {
-    /// `input` is what `prediction` was made for.
+    /// `input` must be the input of `prediction`; another one is ignored.
     pub fn new(input: Option<&OperatingPoint>, prediction: &'a Prediction) -> Self {
         let input = input.filter(|input| input.seq == prediction.input_seq);
         let mode = |mode: &crate::wire::Mode| {
@@ -115,7 +116,7 @@ impl<'a> Shown<'a> {
     }
 }
 
-/// The bins of the last 2 s up to `time_s`.
+/// The bins of the last 2 s before `time_s`.
 fn recent(history: &History, time_s: f64) -> impl Iterator<Item = &Bin> {
     let length_s = seconds(history.bin_ns());
     let (first, last) = (((time_s - RECENT_S) / length_s) as i64, (time_s / length_s) as i64);
@@ -128,7 +129,7 @@ pub fn spread(history: &History, time_s: f64) -> Option<(f32, f32)> {
     ranges.reduce(|all, range| (all.0.min(range.0), all.1.max(range.1)))
 }
 
-/// Slope of the margin over the last 2 s by least squares, 1/s; `None` without three bins that have one.
+/// Slope of the margin over the last 2 s by least squares, 1/s; `None` with fewer than three bins that have a margin.
 pub fn trend_per_s(history: &History, time_s: f64) -> Option<f64> {
     let length_s = seconds(history.bin_ns());
     let points: Vec<(f64, f64)> = recent(history, time_s)

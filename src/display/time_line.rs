@@ -1,23 +1,23 @@
-//! The time of what was recorded is that of its stamps: a recording that was played at ten times the speed into a node still
-//! lasts as long as the measurement did.
+//! Places recorded messages by their stamps, so that a recording made from a tenfold playback still spans the time of
+//! the original measurement.
 
 use crate::wire::Time;
 
-/// Stamps that run backward by more than this begin anew, ns: a recording that was played again.
+/// Stamps that run backward by more than this start again, ns: a recording was played another time.
 const BACKWARD_NS: i64 = 1_000_000_000;
 
-/// Places messages, in the order in which they were recorded, at a time in ns.
+/// Assigns a time in ns to messages, in the order in which they were recorded.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct TimeLine {
-    /// When the latest message with a stamp was recorded, and its place.
+    /// Log time and assigned time of the latest message with a stamp, ns.
     latest: Option<(i64, i64)>,
-    /// From stamps to places; changes where stamps begin anew.
+    /// Difference between assigned times and stamps; changes when stamps start again.
     shift_ns: i64,
 }
 
 impl TimeLine {
-    /// The place of a prediction with its input's stamp; never before the one before. Where stamps begin anew, time goes on as
-    /// it did while recording.
+    /// The time of a prediction by its input's stamp; never earlier than the previous one. If stamps start again, the
+    /// elapsed log time is used instead.
     pub fn stamped(&mut self, stamp: Time, log_ns: i64) -> i64 {
         if stamp == Time::default() {
             return self.unstamped(log_ns); // nobody has set it
@@ -35,12 +35,13 @@ impl TimeLine {
         place
     }
 
-    /// The place of a message with a stamp of the same clock that is not an input's.
+    /// The time of a message that is not an input but has a stamp of the same clock.
     pub fn beside(&self, stamp: Time, log_ns: i64) -> i64 {
         if stamp == Time::default() { self.unstamped(log_ns) } else { stamp.as_ns().saturating_add(self.shift_ns) }
     }
 
-    /// The place of what the node did by its own clock: as long after the latest stamped message as it was recorded after it.
+    /// The time of something that the node did by its own clock: the time of the latest stamped message plus the log
+    /// time elapsed since.
     pub fn unstamped(&self, log_ns: i64) -> i64 {
         self.latest.map_or(log_ns, |(logged, place)| place.saturating_add(log_ns.saturating_sub(logged).max(0)))
     }
@@ -56,7 +57,7 @@ mod tests {
     fn stamps_decide_and_what_has_none_follows_the_recording() {
         let mut line = TimeLine::default();
         assert_eq!(line.unstamped(90 * S), 90 * S, "nothing is known of the stamps");
-        // Recorded at ten times the speed.
+        // Recorded during a tenfold playback.
         assert_eq!(line.stamped(Time::from_ns(5 * S), 100 * S), 5 * S);
         assert_eq!(line.stamped(Time::from_ns(15 * S), 101 * S), 15 * S);
         assert_eq!(line.unstamped(103 * S), 17 * S);
@@ -68,7 +69,7 @@ mod tests {
         let mut line = TimeLine::default();
         line.stamped(Time::from_ns(50 * S), 200 * S);
         assert_eq!(line.stamped(Time::from_ns(50 * S - 5), 200 * S), 50 * S, "two sources that are not quite in step");
-        // Played again: the stamps of before.
+        // Played again, with the same stamps.
         assert_eq!(line.stamped(Time::from_ns(10 * S), 203 * S), 53 * S);
         assert_eq!(line.stamped(Time::from_ns(12 * S), 204 * S), 55 * S);
         assert_eq!(line.beside(Time::from_ns(12 * S), 204 * S), 55 * S);
