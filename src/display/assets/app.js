@@ -1,4 +1,4 @@
-// Wires the page to what is served: a node's stream of states, or a recording asked moment by moment.
+// Connects the page with its source: a node's stream of states, or a recording that is queried for moments.
 
 import { next } from "./clock.js";
 import { Events } from "./events.js";
@@ -16,7 +16,7 @@ const ask = async (path) => {
   if (!answer.ok) throw new Error(await answer.text());
   return answer.json();
 };
-/** Time between two changes of the numbers, ms: faster than that nobody reads. */
+/** Interval between updates of the numbers, ms: nobody can read faster. */
 const NUMBERS_EVERY = 300;
 
 const about = await ask("about.json");
@@ -38,19 +38,19 @@ let mapShown = 0;
 let eventsShown = -1;
 let asking = { map: false, history: false, events: false };
 
-/** Time for which a shape stays before another one is asked for, ms. */
+/** Time for which a shape stays before another one is requested, ms. */
 const SETTLED = 1500;
-/** The same before that of another mode. */
+/** The same before the shape of another mode is requested, ms. */
 const FOLLOWED = 500;
 
 let chosenAt = 0;
 let later;
 let chosenFor = [];
 let choices = 0;
-/** Whether the shape is that of the mode which grows, or else of the one that will next. */
+/** Whether the shape shown follows the fastest growing mode, or else the next mode to become unstable. */
 let following = true;
 
-/** The conditions, and how far each may move before a shape is asked for again. */
+/** The conditions, and how far each may change before the shape is requested again. */
 const conditions = (state) => [state.mu, state.load, state.speed];
 const moved = (now, then) => now.some((value, k) => !(Math.abs(value - then[k]) <= (k ? 0.02 * Math.abs(then[k]) : 0.005)));
 
@@ -61,7 +61,7 @@ async function choose(id) {
   try {
     const moment = recording && latest ? `&at=${latest.time_s}` : "";
     const answer = await ask(`shape.json?id=${id}${moment}`);
-    // Of two on their way the later one counts.
+    // If two requests overlap, the later one counts.
     if (order === choices) await shape.show(answer, Math.sign(latest?.speed ?? 1));
   } catch (error) {
     shape.missing(error.message);
@@ -75,14 +75,14 @@ function follow(on) {
 }
 at("shape-follow").addEventListener("click", () => follow(!following));
 
-/** Does one thing at a time of each kind; what is asked meanwhile is asked again by the next state. */
+/** Runs one task of each kind at a time; requests made meanwhile are repeated with the next state. */
 async function once(kind, work) {
   if (asking[kind]) return;
   asking[kind] = true;
   try {
     await work();
   } catch {
-    // The connection is gone, or there is no such map yet: the next state asks again.
+    // The connection is lost, or there is no such map yet: the next state requests it again.
   } finally {
     asking[kind] = false;
   }
@@ -90,7 +90,7 @@ async function once(kind, work) {
 
 const loadHistory = () => once("history", async () => history.load(await ask("history.json")));
 
-/** Without inputs, or after a fault, what was predicted before is not shown as if it still held. */
+/** Without inputs or after a fault, earlier predictions are not shown as if they still held. */
 function sifted(state) {
   if (asserts(state)) return state;
   const nothing = { margin: null, growth: null, worst_hz: null, unstable: null, modes: [], fastest: null, next: null, spread: null, trend_per_s: null };
@@ -111,11 +111,11 @@ function take(heard) {
       const number = state.map;
       map.show(await ask(`map.json?number=${number}`));
       mapShown = number;
-      // Which mode to look at first is for the map to say.
+      // The map determines which mode to show first.
       if (recording) next(numbers);
     });
   }
-  // Those of a recording are all there from the beginning.
+  // The events of a recording are complete from the beginning.
   if (!recording && state.events !== eventsShown) {
     once("events", async () => {
       const change = state.events;
@@ -125,9 +125,9 @@ function take(heard) {
   }
 }
 
-/** What moves with every state. */
+/** Draws what moves with every state. */
 function paint() {
-  // It may have been due when the connection went.
+  // The frame may have been scheduled before the connection was lost.
   if (at("link").dataset.link === "gone") return;
   status.level(latest);
   status.needle(latest);
@@ -145,11 +145,11 @@ function numbers() {
   const wanted = latest.fastest?.id ?? latest.next?.ids[0] ?? modes.chosen ?? latest.modes?.[0]?.[0];
   const since = performance.now() - chosenAt;
   const settled = since > SETTLED;
-  // A recording that is not played says nothing more by itself.
+  // A recording that is paused sends no further states.
   clearTimeout(later);
   if (recording && !settled) later = setTimeout(numbers, SETTLED);
   if (following && wanted !== undefined && wanted !== modes.chosen && (since > FOLLOWED || modes.chosen === null)) modes.select(wanted);
-  // Its shape changes with the conditions.
+  // The shape of a mode changes with the conditions.
   else if (modes.chosen !== null && settled && known(latest.mu) && moved(conditions(latest), chosenFor)) choose(modes.chosen);
 }
 
@@ -167,7 +167,7 @@ function link(kind, text) {
   map.cursor(latest);
 }
 
-/** The page hears from the node; green only where the node hears from the rig. */
+/** The page is connected to the node; the sign is green only if the node receives inputs. */
 function connected() {
   const kind = asserts(latest) ? "live" : "up";
   if (at("link").dataset.link !== kind) link(kind, kind === "live" ? "live" : "connected");
@@ -191,7 +191,7 @@ at("theme").addEventListener("click", () => {
   try {
     localStorage.setItem("squealcast-theme", chosen);
   } catch {
-    // Not kept then.
+    // Storage is not available: the choice is not kept.
   }
   theme();
   repaint();
@@ -230,14 +230,14 @@ if (recording) {
       link("up", "connected");
       mapShown = 0;
       loadHistory();
-      // Another node may serve here now.
+      // Another node may be serving here by now.
       const now = await ask("about.json").catch(() => about);
       if (JSON.stringify(now) !== JSON.stringify(about)) location.reload();
     };
     stream.onerror = () => link("gone", "no connection");
     stream.onmessage = (event) => take(JSON.parse(event.data));
   };
-  // A browser keeps few connections to one place: a page that nobody sees leaves its own to others.
+  // A browser opens only a few connections to one origin: hidden pages leave theirs to others.
   document.addEventListener("visibilitychange", () => {
     stream?.close();
     stream = undefined;
@@ -246,7 +246,7 @@ if (recording) {
   if (!document.hidden) listen();
   setInterval(() => {
     if (document.hidden) return;
-    // A node that lives sends twice a second.
+    // A running node sends at least twice a second.
     if (latest && performance.now() - heardAt > 3000) link("gone", "no answer");
     next(numbers);
     next(refresh);

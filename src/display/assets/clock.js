@@ -1,13 +1,13 @@
-// One clock for everything that moves: at most 20 pictures a second, and all in the same picture.
+// One clock for everything that moves: at most 20 frames a second, with all changes in the same frame.
 
-/** Least time between two pictures, ms; on a screen of 60 pictures a second every third one then. */
+/** Minimum time between two frames, ms. A screen with 60 frames a second shows every third one. */
 const EVERY = 42;
 
 let due = new Set();
 let scheduled = false;
 let last = 0;
 
-/** Calls `work` once before the next picture; none comes while the page is hidden. */
+/** Calls `work` once before the next frame; there are no frames while the page is hidden. */
 export function next(work) {
   due.add(work);
   if (scheduled) return;

@@ -1,4 +1,4 @@
-// The table of onsets and ends; in a recording with what else happened and what was measured.
+// The table of events; in a recording also session events and measured squeals.
 
 import { NONE, fixed, known, time } from "./format.js";
 
@@ -16,7 +16,7 @@ export class Events {
     this.notes = (about.notes ?? []).slice(0, MOST_NOTES).map((note) => ({ ...note, kind: note.what, class: "aside" }));
   }
 
-  /** `comparison` is `null` where nothing was measured. */
+  /** `comparison` is `null` without measurements. */
   show(events, comparison = null) {
     const measured = (comparison?.measured ?? []).map((squeal) => ({ ...squeal, kind: VERDICTS[squeal.verdict], class: squeal.verdict === "hit" ? "aside" : "missed" }));
     const alarms = new Set(comparison?.false_alarms);
@@ -35,7 +35,7 @@ export class Events {
     row.className = event.class ?? (event.kind === "SQUEAL" ? "squeal" : "fault");
     const moment = (at_s) => (this.start === undefined ? time(at_s) : `${fixed(at_s - this.start, 2)} s`);
     const ends = known(event.end_s);
-    // Where it grows fastest; a fault where it begins; notes and measurements have values of their own.
+    // The moment of fastest growth; for a fault its onset. Notes and measurements have values of their own.
     const shown = event.peak ?? event.onset ?? event;
     const values = [
       event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, moment(event.onset_s),
@@ -60,7 +60,7 @@ export class Events {
     return row;
   }
 
-  /** At the onset, and where it grows fastest. */
+  /** Friction coefficient at the onset and at the fastest growth. */
   #friction({ onset, peak, friction_coefficient: measured }) {
     const [from, to] = [onset, peak].map((moment) => moment?.friction_coefficient);
     return known(from) && known(to) ? `${fixed(from, 4)} → ${fixed(to, 4)}` : fixed(from ?? to ?? measured, 4);

@@ -1,23 +1,23 @@
-// Numbers as people read them: the same number of digits from one moment to the next.
+// Formats numbers for reading, with the same number of digits from one moment to the next.
 
 export const NONE = "–";
 
 export const known = (value) => typeof value === "number" && Number.isFinite(value);
 
-/** A number with fixed decimals and a true minus; a dash where there is none. */
+/** A number with fixed decimals and a true minus sign; a dash for an unknown value. */
 export function fixed(value, decimals) {
   if (!known(value)) return NONE;
   const text = value.toFixed(decimals);
   return (Number(text) === 0 ? text.replace("-", "") : text).replace("-", "\u2212");
 }
 
-/** As `fixed`, with a sign always. */
+/** As `fixed`, always with a sign. */
 export function signed(value, decimals) {
   const text = fixed(value, decimals);
   return text === NONE || text.startsWith("\u2212") ? text : `+${text}`;
 }
 
-/** Labels of evenly spaced ticks: as many decimals as the step between them needs, or a single tick itself. */
+/** Labels of evenly spaced ticks, with the decimals that their spacing (or a single tick itself) needs. */
 export function labels(ticks) {
   const step = Math.abs(ticks.length > 1 ? ticks[1] - ticks[0] : ticks[0]);
   let decimals = 0;
@@ -25,7 +25,7 @@ export function labels(ticks) {
   return ticks.map((tick) => fixed(tick, decimals));
 }
 
-/** Decimals for a quantity by the largest value seen: they do not change with every value. */
+/** Number of decimals of a quantity, from the largest value seen, so that it does not change with every value. */
 export class Decimals {
   constructor(digits, least = 0) {
     this.digits = digits;
@@ -40,10 +40,10 @@ export class Decimals {
   text(value) { return fixed(value, this.of(value)); }
 }
 
-/** A growth rate is told to this, however quiet it is: a damping ratio of 1e-4. */
+/** Smallest growth rate that is resolved: a damping ratio of 1e-4. */
 export const leastGrowth = (hz) => 2e-4 * Math.PI * hz;
 
-/** Writes text and the exact value behind it; only where it changed, and into the text that is there. */
+/** Writes a text and the exact value behind it, only if it changed, and into the existing text node. */
 export function put(element, text, value) {
   const node = element.firstChild;
   if (node?.nodeType !== Node.TEXT_NODE) element.textContent = text;
@@ -69,12 +69,12 @@ export function colour(name) {
   return colours.get(name);
 }
 
-/** The colours are others now. */
+/** Forgets the cached colours after a change of theme. */
 export const forgetColours = () => colours.clear();
 
 export const modeColour = (id) => colour(`--mode-${id % 7}`);
 
 export const LEVELS = ["ok", "warn", "squeal", "fault"];
 
-/** Whether a state says something of the rig; without inputs, or after a fault, nothing is known. */
+/** Whether a state makes a statement about the rig; without inputs or after a fault nothing is known. */
 export const asserts = (state) => ["ok", "warn", "squeal"].includes(state?.status);

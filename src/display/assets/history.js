@@ -1,10 +1,10 @@
-// The last minutes: ranges of load, speed, friction, growth and margin, of the measured vibration where there is one, and
-// a waterfall of the unstable frequencies with the measured ones.
+// The last minutes: ranges of load, speed, friction coefficient, growth rate, margin and measured vibration, and a
+// waterfall of the unstable and the measured frequencies.
 
 import { NONE, colour, fixed, known, labels, put, time } from "./format.js";
 
 const at = (id) => document.getElementById(id);
-/** `least` is the least range shown of a quantity, so that noise does not fill the plot. */
+/** `least` is the minimum range shown of a quantity, so that noise does not fill the plot. */
 const ROWS = [
   { key: "load", label: "load", unit: "N", paint: "--mode-6", least: 20, range: (bin) => bin.r[0] },
   { key: "speed", label: "speed", unit: "rad/s", paint: "--mode-6", least: 0.5, range: (bin) => bin.r[1] },
@@ -14,10 +14,10 @@ const ROWS = [
 ];
 const MEASURED = { key: "measured", label: "measured", unit: "dB", paint: "--mode-3", least: 20, range: (bin) => bin.v && [bin.v.lo, bin.v.hi] };
 
-/** Without anything for longer than this, and than five times as usual, the lines are broken, s. */
+/** Lines are broken at intervals without data longer than this and than five times the usual spacing, s. */
 const GAP_S = 2;
 
-/** No silence is as long, s. */
+/** A larger difference to the present means that the stamps are from another clock, s. */
 const ANOTHER_CLOCK_S = 86400;
 
 export class History {
@@ -46,14 +46,14 @@ export class History {
     this.draw();
   }
 
-  /** All of it. */
+  /** Loads the complete history. */
   load({ bin_s: binS, bins }) {
     this.binS = binS;
     this.bins = bins;
     this.refresh();
   }
 
-  /** What came since; false where something between is missing. */
+  /** Adds new bins; false if bins in between are missing. */
   add(bins) {
     if (!bins?.length) return true;
     const last = this.bins[this.bins.length - 1];
@@ -74,7 +74,7 @@ export class History {
     holder.classList.toggle("measured", this.measured);
     const rows = this.measured ? [...ROWS, MEASURED] : ROWS;
     this.columns = columns(holder);
-    // Beside one another each column has an axis of its own.
+    // In several columns each plot has its own time axis.
     this.plots = rows.map((row) => this.#row(holder, row, this.columns > 1 && row.key === "margin"));
     this.plots.push(this.#waterfall(holder));
     this.refresh();
@@ -96,7 +96,7 @@ export class History {
     return plot;
   }
 
-  /** `filled` says whether there is anything to label the axes for. */
+  /** `filled` says whether there are data for which to label the axes. */
   #options(element, xAxis, y, filled) {
     const ink = colour("--muted");
     const grid = { stroke: colour("--grid"), width: 1 };
@@ -105,7 +105,7 @@ export class History {
     return {
       width: Math.max(120, element.clientWidth),
       height: Math.max(40, element.clientHeight),
-      // The last time of the axis is as wide as this on either side of its tick.
+      // The last label of the time axis extends this far on both sides of its tick.
       padding: [5, 2.4 * px, xAxis ? 0 : 5, 0],
       pxAlign: 0,
       legend: { show: false },
@@ -133,9 +133,9 @@ export class History {
 
   #span() {
     const last = this.bins.length ? (this.bins[this.bins.length - 1].k + 1) * this.binS : Date.now() / 1000;
-    // Time goes on in silence too, unless the stamps are of another clock.
+    // Time advances in silence too, unless the stamps are from another clock.
     const end = this.now - last < ANOTHER_CLOCK_S ? Math.max(last, this.now) : last;
-    // A young session fills the width; it is never less than a minute.
+    // A short session fills the width, but at least a minute is shown.
     const start = this.live ? Math.max(end - this.length, Math.min(this.#start(), end - 60)) : this.#start();
     return [Math.min(start, end - this.binS), end];
   }
@@ -195,7 +195,7 @@ export class History {
           ctx.fillRect(x, u.valToPos(hz, "y", true) - height / 2, width, height);
         }
       }
-      // What was heard, as dots: small, so that they do not hide what was predicted.
+      // Measured frequencies as small dots, so that they do not hide the predictions.
       ctx.fillStyle = colour("--ink");
       const dot = 2 * devicePixelRatio;
       for (const bin of heard) {
@@ -229,14 +229,14 @@ export class History {
     return marker;
   }
 
-  /** Draws anew if that shows much: where it is in sight, and went on by some pixels. */
+  /** Redraws if the plot is visible and has moved by some pixels. */
   refreshIfDue() {
     const [from, to] = this.#span();
     const each = Math.min(1000, Math.max(500, 2500 * (to - from) / this.plots[0].u.width));
     if (this.visible && !(performance.now() - this.drawnAt < each)) this.refresh();
   }
 
-  /** Draws anew. */
+  /** Redraws. */
   refresh() {
     this.drawnAt = performance.now();
     if (!this.measured && this.bins.some((bin) => bin.v)) {
@@ -248,7 +248,7 @@ export class History {
     if (this.moment !== null) this.mark(this.moment);
   }
 
-  /** The bins of the time shown, one for every other pixel at most. */
+  /** The bins of the time shown, at most one for every second pixel. */
   #seen() {
     const from = this.#span()[0];
     let first = this.bins.findIndex((bin) => (bin.k + 1) * this.binS >= from);
@@ -260,7 +260,7 @@ export class History {
     return merged(bins, each, Math.max(GAP_S / this.binS, 5 * usual));
   }
 
-  /** The moment of a recording that the rest of the page shows. */
+  /** Marks the moment of a recording that the rest of the page shows. */
   mark(seconds) {
     this.moment = seconds;
     for (const { u, marker } of this.plots) {
@@ -279,7 +279,7 @@ export class History {
   }
 }
 
-/** Bins of `each` times the length, as the node merges them; an empty one where `gap` or more are missing. */
+/** Merges bins to `each` times the length, as the node does; an empty one where `gap` or more are missing. */
 function merged(bins, each, gap) {
   const all = [];
   let before = Infinity;
@@ -301,13 +301,13 @@ function merged(bins, each, gap) {
   return all;
 }
 
-/** How many plots stand beside one another. */
+/** Number of plots side by side. */
 function columns(holder) {
   const { display, gridTemplateColumns } = getComputedStyle(holder);
   return display === "grid" ? gridTemplateColumns.split(" ").length : 1;
 }
 
-/** The colour of a growth rate from 0 to 1, further from the panel's with rising growth; paints the scale beside the plot. */
+/** The colour of a growth rate from 0 to 1: contrast increases with growth. Also paints the scale beside the plot. */
 function heatScale() {
   const stops = [0, 1, 2, 3].map((k) => colour(`--heat-${k}`).match(/[0-9a-f]{2}/gi).map((pair) => parseInt(pair, 16)));
   const heat = (share) => {

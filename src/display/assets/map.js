@@ -1,14 +1,15 @@
-// Growth rates and frequencies against the friction coefficient: the present one as a moving cursor, and any other to read off.
+// Growth rates and frequencies over the friction coefficient, with a cursor at the present one and readout of any
+// other.
 
 import { colour, fixed, known, labels, leastGrowth, modeColour, put, signed } from "./format.js";
 
-/** Seven colours; beyond that, dashes tell the modes apart. */
+/** Seven colours; beyond that, dashes distinguish the modes. */
 const DASHES = [undefined, [8, 4], [2, 3]];
-/** From the middle of a dot to the edge of its strip, px. */
+/** Distance from the centre of a dot to the edge of its strip, px. */
 const REACH = 6;
-/** Modes whose values are read off at a time. */
+/** Number of modes that are read off at a time. */
 const MOST_READ = 4;
-/** Friction coefficients that the arrow keys pass over in the range shown. */
+/** Number of steps of the arrow keys over the range shown. */
 const STEPS = 100;
 
 const at = (id) => document.getElementById(id);
@@ -20,9 +21,9 @@ export class StabilityMap {
     this.curves = null;
     this.range = "near";
     put(at("map-readout"), "");
-    /** What is shown of the axes; `null` before the first map. */
+    /** The axis limits shown; `null` before the first map. */
     this.limits = null;
-    /** The friction coefficient that is read off; `null` where none is. */
+    /** The friction coefficient being read off; `null` if none. */
     this.read = null;
     at("map-range").addEventListener("change", (event) => {
       this.range = event.target.value;
@@ -36,7 +37,7 @@ export class StabilityMap {
     new ResizeObserver(() => this.#resize()).observe(plots);
   }
 
-  /** A new map. */
+  /** Shows a new map. */
   show(curves) {
     this.curves = curves;
     const { normal_load_n: load, disc_speed_rad_s: speed, windows } = curves;
@@ -45,7 +46,7 @@ export class StabilityMap {
     this.draw();
   }
 
-  /** Builds the plots anew, in the colours of the day. */
+  /** Rebuilds the plots in the current colours. */
   draw() {
     for (const plot of this.plots) plot.u.destroy();
     this.plots = [];
@@ -61,7 +62,7 @@ export class StabilityMap {
     this.#readAt(this.read);
   }
 
-  /** The modes that grow, or else those that will next; all where that is not known. */
+  /** The unstable modes, else those that will become unstable next; all modes if that is unknown. */
   #focus() {
     const { modes, windows } = this.curves;
     const { fastest, next, mu } = this.state ?? {};
@@ -71,13 +72,13 @@ export class StabilityMap {
     return found.length ? found : modes.map((mode) => mode.id);
   }
 
-  /** The friction coefficients that must be in sight. */
+  /** The friction coefficients that must be visible. */
   #points() {
     const { mu, spread, next } = this.state ?? {};
     return [mu, ...(spread ?? []), next?.mu ?? this.curves.windows[0]?.mu_from].filter(known);
   }
 
-  /** About the present friction coefficient and the nearest end of a window, at the scale of the modes that merge there. */
+  /** A range around the present friction coefficient and the nearest end, scaled to the modes that merge there. */
   #near() {
     const { mu } = this.curves;
     const [first, last] = [mu[0], mu[mu.length - 1]];
@@ -88,7 +89,7 @@ export class StabilityMap {
     const x = [Math.max(first, low - pad), Math.min(last, high + pad)];
     const [frequency, growth] = ["frequency_hz", "growth_rate_per_s"].map((quantity) => this.#span(this.focus, quantity, x));
     const least = leastGrowth(Math.max(frequency[1], 1));
-    // What decays faster than anything grows is of no interest.
+    // Modes that decay faster than any mode grows are not of interest.
     const fastest = Math.max(0, growth[1]);
     return { x, frequency: padded(frequency, 0.15, 0.02 * frequency[1]), growth: padded([Math.max(-fastest, Math.min(0, growth[0])), fastest], 0.1, least) };
   }
@@ -115,7 +116,7 @@ export class StabilityMap {
     return low <= high ? [low, high] : [0, 1];
   }
 
-  /** Whether the near range no longer shows what it should: then it is chosen anew. It does not follow every state. */
+  /** Whether the near range must be chosen again. It does not follow every state. */
   #outgrown() {
     const [low, high] = this.limits.x;
     const margin = 0.03 * (high - low);
@@ -134,7 +135,7 @@ export class StabilityMap {
     const font = `${px}px system-ui, sans-serif`;
     const size = this.#size(element);
     const growth = axis === "growth";
-    // All growth rates at once span decades: their range is compressed about zero.
+    // All growth rates together span decades: their axis is compressed around zero.
     const compressed = growth && this.range === "all";
     const values = (_, ticks) => labels(ticks);
     const decades = (_, axis, low, high) => [0, 1, 2, 3, 4, 5].flatMap((power) => [-(10 ** power), 10 ** power]).concat(0).filter((tick) => tick >= low && tick <= high && Math.abs(tick) !== 1).sort((a, b) => a - b);
@@ -169,7 +170,7 @@ export class StabilityMap {
     return { u, element, spread, line, read, dots, axis };
   }
 
-  /** What lies behind the curves: the windows of instability, and where growth begins. */
+  /** Draws what is behind the curves: the windows of instability, and the line of zero growth. */
   #shade(u, zero) {
     const { ctx } = u;
     const { left, top, width, height } = u.bbox;
@@ -195,14 +196,14 @@ export class StabilityMap {
     ctx.restore();
   }
 
-  /** The number of every mode at the right end of its line, as far as there is room; those in focus first. */
+  /** Labels each mode at the right end of its line if there is room, modes in focus first. */
   #name(u, quantity, growth, font, px) {
     const { ctx } = u;
     const { left, top, width, height } = u.bbox;
     const { mu, modes } = this.curves;
     const end = u.scales.x.max;
     const last = mu.findLastIndex((value) => value <= end);
-    // Of growth rates all others lie together about zero.
+    // The growth rates of all other modes are close to zero.
     const named = growth ? modes.filter((mode) => this.focus.includes(mode.id)) : modes;
     const ends = named
       .map((mode) => ({ id: mode.id, value: quantity(mode)[last], focus: this.focus.includes(mode.id) }))
@@ -215,7 +216,7 @@ export class StabilityMap {
     for (const name of ends) {
       const near = placed.find((other) => Math.abs(other.y - name.y) < room);
       if (!near) placed.push({ ...name, ids: [name.id] });
-      // Modes that merged share a line, and its name.
+      // Merged modes share a line and its label.
       else if (name.focus && Math.abs(near.y - name.y) < 0.5 * room && near.ids.length < 2) near.ids.push(name.id);
     }
     ctx.save();
@@ -244,7 +245,7 @@ export class StabilityMap {
     this.#readAt(this.read);
   }
 
-  /** Moves the cursor to the present conditions, with a dot where each mode is. */
+  /** Moves the cursor to the present conditions, with a dot for each mode. */
   cursor(state) {
     this.state = state;
     if (!this.plots.length) return;
@@ -265,12 +266,12 @@ export class StabilityMap {
     }
   }
 
-  /** A strip as wide as a dot that the cursor carries along; drawn anew where a dot went up or down. */
+  /** A strip as wide as a dot that moves with the cursor; redrawn when a dot moves up or down. */
   #dots({ u, dots, axis }, modes) {
     const ratio = devicePixelRatio;
     const [width, height] = [Math.round(2 * REACH * ratio), Math.round(u.bbox.height * ratio / uPlot.pxRatio)];
     const place = ([id, [hz, sigma]]) => [id, Math.round(u.valToPos(axis === "growth" ? sigma : hz, "y") * ratio) / ratio];
-    // Those in focus above the others.
+    // Modes in focus are drawn above the others.
     const places = [...modes].sort((a, b) => this.focus.includes(a[0]) - this.focus.includes(b[0])).map(place);
     const picture = `${height} ${colour("--panel")} ${places}`;
     if (dots.picture === picture) return;
@@ -308,7 +309,7 @@ export class StabilityMap {
     this.#readAt(to);
   }
 
-  /** Reads the curves at a friction coefficient; `pointed` is where the pointer is. */
+  /** Reads the curves at a friction coefficient; `pointed` is the position of the pointer. */
   #readAt(mu, pointed) {
     const { limits, curves } = this;
     this.read = known(mu) && limits ? Math.min(limits.x[1], Math.max(limits.x[0], mu)) : null;
@@ -327,7 +328,7 @@ export class StabilityMap {
     plots.setAttribute("aria-valuetext", text || "nothing read off");
   }
 
-  /** The values at a friction coefficient in words: of the modes in sight that are nearest to the pointer, or grow fastest. */
+  /** The values at a friction coefficient as text: of the visible modes nearest to the pointer, or growing fastest. */
   #told(mu, pointed) {
     const { mu: grid, modes } = this.curves;
     const after = Math.max(1, grid.findIndex((value) => value >= mu));
@@ -344,7 +345,7 @@ export class StabilityMap {
   }
 }
 
-/** A range with room at both ends, at least so wide. */
+/** A range with padding at both ends and a minimum width. */
 function padded([low, high], share, least = 0) {
   const span = Math.max(high - low, least, 1e-3 * Math.abs(high), 1e-9);
   const middle = 0.5 * (low + high);

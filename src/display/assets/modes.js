@@ -2,11 +2,11 @@
 
 import { Decimals, NONE, fixed, known, leastGrowth, put } from "./format.js";
 
-/** A bound says its order of magnitude. */
+/** An error bound, rounded to its order of magnitude. */
 const bound = (error) => (error === 0 ? "0" : error.toExponential(0).replace("-", "\u2212"));
 
 export class Modes {
-  /** `choose` shows the shape of a mode; `picked` hears that somebody picked one. */
+  /** `choose` shows the shape of a mode; `picked` is called when the user picks one. */
   constructor(about, choose, picked) {
     this.threshold = about.instability_threshold;
     this.body = document.querySelector("#modes tbody");
@@ -16,7 +16,7 @@ export class Modes {
     this.choose = choose;
     this.picked = picked;
     this.decimals = { frequency: new Decimals(6, 1), growth: new Decimals(4, 2) };
-    // A table that gets another size shows the chosen mode still.
+    // After a resize the chosen mode remains visible.
     new ResizeObserver(() => this.#reveal()).observe(this.scroll);
   }
 
@@ -29,7 +29,7 @@ export class Modes {
         this.rows.delete(id);
       }
     }
-    // The scales first: every row of a column has the same digits.
+    // The scales first, so that all rows of a column have the same number of digits.
     for (const [, [hz, growth]] of modes) {
       this.decimals.frequency.of(hz);
       this.decimals.growth.of(growth);
@@ -67,7 +67,7 @@ export class Modes {
     row.addEventListener("click", () => {
       this.picked();
       this.select(id);
-      // On a small screen the picture is elsewhere.
+      // On a small screen the shape is elsewhere on the page.
       document.querySelector(".panel.shape").scrollIntoView({ block: "nearest" });
     });
     const cells = Array.from({ length: 6 }, () => {
@@ -88,7 +88,7 @@ export class Modes {
     button.setAttribute("aria-pressed", String(chosen));
   }
 
-  /** Scrolls the table, and nothing but the table, to the chosen mode. */
+  /** Scrolls the table, and only the table, to the chosen mode. */
   #reveal() {
     const row = this.rows.get(this.chosen)?.row;
     if (!row) return;

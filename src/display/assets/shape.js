@@ -1,12 +1,12 @@
-// A mode in motion: Re(x e^{iφ}) with the phase φ running forward, so that travelling waves travel the right way.
+// A mode in motion: Re(x e^{iφ}) with increasing phase φ, so that travelling waves run in the right direction.
 
 import { next } from "./clock.js";
 import { colour, fixed, known, signed } from "./format.js";
 
 const at = (id) => document.getElementById(id);
-/** Seconds of a period on the screen. */
+/** Duration of a period on the screen, s. */
 const PERIOD = 2.4;
-/** Time between two places of the slider while it plays, ms. */
+/** Interval between updates of the slider while it plays, ms. */
 const SLIDER_EVERY = 150;
 
 /** Displacements at a phase: Re((re + i im) e^{iφ}). */
@@ -15,7 +15,7 @@ export function displaced(re, im, phase) {
   return re.map((value, k) => value * c - im[k] * s);
 }
 
-/** Turns a mode's newer shape so that it goes on from where its older one is: shapes have no phase of their own. */
+/** Rotates the phase of a mode's new shape to match the previous one: the phase of a shape is arbitrary. */
 function keepPhase(newer, older) {
   let [re, im] = [0, 0];
   newer.parts.forEach((part, p) => {
@@ -45,7 +45,7 @@ export class ShapeView {
     this.shape = null;
     this.picture = null;
     this.visible = true;
-    /** Nothing is known of the mode now: its last shape does not move. */
+    /** Whether the motion is stopped because nothing is known about the mode at present. */
     this.stopped = false;
     at("shape-play").addEventListener("click", () => this.#play(!this.playing));
     at("shape-phase").addEventListener("input", (event) => {
@@ -65,7 +65,7 @@ export class ShapeView {
     }).observe(this.stage);
   }
 
-  /** Stands still while nothing is known of the rig. */
+  /** Stops the motion while nothing is known about the rig. */
   still(stopped) {
     if (stopped === this.stopped) return;
     this.stopped = stopped;
@@ -83,7 +83,7 @@ export class ShapeView {
     at("shape-note").textContent = `mode ${shape.id}, ${fixed(shape.frequency_hz, shape.frequency_hz >= 100 ? 1 : 4)} Hz, ${now}`;
   }
 
-  /** What the parts are, in their colours, and how far each moves. */
+  /** The names of the parts in their colours, and how far each moves. */
   #name(parts) {
     const largest = parts.map((part) => {
       const squares = part.re.map((re, k) => re * re + part.im[k] * part.im[k]);
@@ -100,7 +100,7 @@ export class ShapeView {
     }));
   }
 
-  /** What makes it grow faster or slower: the conditions, and stiffness and damping of the contact. */
+  /** Sensitivity of the growth rate to the conditions and to stiffness and damping of the contact. */
   #changes(change) {
     const named = { friction: "μ", load: "load", speed: "speed", contact_stiffness: "stiffness", contact_damping: "damping" };
     const entry = (kind, text) => Object.assign(document.createElement(kind), { textContent: text });
@@ -115,12 +115,12 @@ export class ShapeView {
     at("shape-changes").replaceChildren(...(pairs.length ? [title, ...pairs] : []));
   }
 
-  /** `way` is the sign of the disc's speed. */
+  /** `way` is the sign of the disc speed. */
   async show(shape, way = 1) {
     const spatial = shape.parts.some((part) => part.spatial);
     this.wanted = shape;
     if (spatial) this.three ??= await import("./vendor/three.module.min.js");
-    // Another one was chosen while that loaded.
+    // Another shape was chosen while the library loaded.
     if (this.wanted !== shape) return;
     if (!(this.picture instanceof (spatial ? Space : Sticks))) {
       this.picture?.dispose();
@@ -145,7 +145,7 @@ export class ShapeView {
     at("shape-note").textContent = reason;
   }
 
-  /** The colours changed. */
+  /** Redraws after a change of colours. */
   draw() {
     if (this.shape) this.picture.take(this.shape);
     this.#draw();
@@ -178,7 +178,7 @@ export class ShapeView {
   #turn(phase) {
     this.phase = phase % (2 * Math.PI);
     const now = performance.now();
-    // Moving a slider is work: while it plays that is done now and then.
+    // Updating the slider is costly: while playing it is done now and then.
     if (!this.playing || !(now - this.sliderAt < SLIDER_EVERY)) {
       this.sliderAt = now;
       const degrees = Math.round(this.phase * 180 / Math.PI) % 360;
@@ -189,18 +189,18 @@ export class ShapeView {
   }
 
   #draw() {
-    // Without room, as in a window that is being closed, there is nothing to draw.
+    // Without space, as in a window being closed, there is nothing to draw.
     if (!this.shape || !this.picture || Math.min(...this.size) < 50) return;
     this.picture.draw(this.phase, ...this.size);
   }
 }
 
-/** Numbered degrees of freedom: a stalk each, its range behind it, its phase as a hand below it. */
+/** Numbered degrees of freedom: a stalk each, with its range behind it and its phase as a hand below it. */
 class Sticks {
   constructor(canvas) {
     this.canvas = canvas;
     this.ctx = canvas.getContext("2d");
-    // What stands still has a canvas of its own and is drawn once.
+    // Static elements have their own canvas and are drawn once.
     this.behind = document.createElement("canvas");
     this.behind.setAttribute("aria-hidden", "true");
     canvas.before(this.behind);
@@ -216,7 +216,7 @@ class Sticks {
     this.behind.remove();
   }
 
-  /** Where everything is, and what stands still. */
+  /** Computes the layout and draws the static elements. */
   #lay(width, height) {
     const { shape, paint } = this;
     const ratio = devicePixelRatio;
@@ -279,7 +279,7 @@ class Sticks {
     for (const { part, tone, first } of parts) {
       const heights = displaced(part.re, part.im, phase).map((value) => middle - value * reach);
       ctx.strokeStyle = ctx.fillStyle = tone;
-      // The line through the heads makes the figure.
+      // The line through the heads shows the shape.
       ctx.lineWidth = 1;
       ctx.globalAlpha = 0.35;
       ctx.beginPath();
@@ -314,21 +314,21 @@ class Sticks {
   }
 }
 
-/** The largest displacement, in units of the extent of what is shown. */
+/** The largest displacement, as a fraction of the extent of what is shown. */
 const ENLARGED = 0.15;
 
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const unit = (a) => { const size = Math.hypot(...a) || 1; return a.map((value) => value / size); };
 
-/** Turns vectors so that the pad is above the disc and the radius from the disc's axis to `centre` is the first axis. */
+/** Rotates vectors: the pad above the disc, the radius from the disc's axis to `centre` as first axis. */
 function towards({ axis_point_m: point, axis_direction: axis, normal }, centre) {
   const along = unit(axis);
-  // The disc's plane is seen from the pad's side.
+  // The disc's plane is seen from the side of the pad.
   const up = dot(along, normal) < 0 ? along.map((value) => -value) : along;
   const from = centre.map((value, k) => value - point[k]);
   const away = from.map((value, k) => value - dot(from, along) * along[k]);
-  // About a centre on the axis any direction will do.
+  // For a centre on the axis any direction serves.
   const first = unit(Math.hypot(...away) > 1e-9 ? away : cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
   const second = cross(up, first);
   return (v) => [dot(v, first), dot(v, second), dot(v, up)];
@@ -383,7 +383,7 @@ class Space {
 
   take(shape, way = this.way) {
     const spatial = shape.parts.filter((part) => part.spatial && part.nodes_m.length);
-    // Most shapes are of the rig that stands there already.
+    // Most shapes are of the rig that is already drawn.
     const nodes = JSON.stringify([shape.disc, way, spatial.map((part) => part.nodes_m)]);
     if (nodes !== this.nodes) this.#build(spatial, shape.disc, way);
     [this.nodes, this.way] = [nodes, way];
@@ -396,7 +396,7 @@ class Space {
     this.outline?.color.set(colour("--disc"));
   }
 
-  /** The parts at rest: their nodes, and a net between them; the disc's outline around them where its axis is known. */
+  /** Draws the parts at rest: nodes, connecting lines, and the outline of the disc if its axis is known. */
   #build(spatial, disc, way) {
     const { three, scene } = this;
     this.#clear();
@@ -406,7 +406,7 @@ class Space {
     const extent = Math.max(...high.map((value, axis) => value - low[axis]), 1e-9);
     const centre = low.map((value, axis) => (value + high[axis]) / 2);
     this.turned = disc ? towards(disc, centre) : flat(high.map((value, axis) => value - low[axis]));
-    // In units of the patch, about its middle; sides that touch are drawn a little apart.
+    // In units of the patch, around its centre; parts in contact are drawn slightly apart.
     const apart = (part) => (spatial.length < 2 ? 0 : part.name === "disc" ? -0.06 : 0.06);
     const place = (node) => this.turned(node.map((value, axis) => (value - centre[axis]) / extent));
     this.parts = spatial.map((part) => {
@@ -432,12 +432,12 @@ class Space {
       }
       return { rest, positions, colours, ghost, tone: new three.Color() };
     });
-    // Positive speed turns right-handed about the axis, which may point away from who looks.
+    // Positive speed is right-handed about the axis, which may point away from the viewer.
     const sense = disc && dot(disc.axis_direction, disc.normal) < 0 ? -1 : 1;
     if (disc) this.#outline(place(disc.axis_point_m), spatial.findIndex((part) => part.name === "disc"), sense * way);
   }
 
-  /** The edges of the track that the pad rubs on the disc, fading away from the pad, and the way the disc slides. */
+  /** The edges of the pad's track on the disc, fading with distance from the pad, and the direction of sliding. */
   #outline([ax, ay], k, way) {
     const { three, scene } = this;
     const nodes = this.parts[k < 0 ? 0 : k].rest;
@@ -445,7 +445,7 @@ class Space {
     const angles = nodes.map(([x, y]) => Math.atan2(y - ay, x - ax));
     const z = nodes[0][2];
     const [inner, outer] = [Math.min(...radii), Math.max(...radii)];
-    // Nodes around the whole axis, or around a middle angle on which the first axis of the picture points.
+    // Nodes all around the axis, or around a middle angle along the first axis of the picture.
     const reach = Math.max(...angles.map(Math.abs));
     const ends = Math.min(Math.PI, reach + Math.max(0.7, 2.5 / outer));
     const at = (radius, angle) => [ax + radius * Math.cos(angle), ay + radius * Math.sin(angle), z];
@@ -504,14 +504,14 @@ class Space {
       positions.needsUpdate = true;
       colours.needsUpdate = true;
     }
-    // For tests and for whoever wants the numbers: what is drawn, without its enlargement.
+    // For tests and for users who want the numbers: the displacements shown, without scaling.
     this.canvas.displacements = () => this.parts.map(({ rest, positions }) =>
       rest.flatMap((node, k) => node.map((value, axis) => (positions.array[3 * k + axis] - value) / ENLARGED)));
     renderer.render(this.scene, camera);
   }
 }
 
-/** Lines from each node to its nearest ones: a net without knowing the elements. */
+/** Lines from each node to its nearest ones: a net that needs no element connectivity. */
 function neighbours(nodes) {
   const pairs = new Set();
   const count = nodes.length;

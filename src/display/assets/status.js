@@ -1,11 +1,11 @@
-// Status in words, colour and shape; what squeals next; the gauge of the margin; the numbers.
+// Status as word, colour and shape; the next squeal; the gauge of the margin; the numbers.
 
 import { Decimals, NONE, asserts, fixed, known, leastGrowth, put, signed } from "./format.js";
 
 const WORDS = { ok: "OK", warn: "WARN", squeal: "SQUEAL", fault: "FAULT", waiting: "WAITING", no_data: "NO DATA" };
 const at = (id) => document.getElementById(id);
 
-/** Where inputs are waited for, and what stands in for a rig. */
+/** Where the node expects its inputs, and how to simulate them. */
 function listening(inputs) {
   if (!inputs) return "";
   const { topic, domain, service, start } = inputs;
@@ -26,7 +26,7 @@ export class Status {
     this.#show("none", "");
   }
 
-  /** The status at once, and its message with it. */
+  /** Shows the status immediately, together with its message. */
   level({ status, message }) {
     if (at("status").dataset.level !== status) this.#show(status, message);
   }
@@ -41,13 +41,13 @@ export class Status {
     put(at("reason"), message);
   }
 
-  /** No connection: what is shown is old. */
+  /** Marks the page as outdated while there is no connection. */
   disconnected(gone) {
     const panel = at("status");
     if (panel.classList.contains("stale") === gone) return;
     panel.classList.toggle("stale", gone);
     if (!gone) return;
-    // An old OK must not be taken for a new one. The next state brings its own level.
+    // An old OK must not be mistaken for a new one. The next state sets its own level.
     const before = asserts({ status: panel.dataset.level }) ? `; the last was ${WORDS[panel.dataset.level]}` : "";
     this.#show("no_data", `no connection to the node${before}`);
   }
@@ -71,12 +71,12 @@ export class Status {
     }
   }
 
-  /** `padShare` tells the pad's share of a mode where the prediction does not. */
+  /** `padShare` gives the pad's share of a mode if the prediction does not contain it. */
   numbers(state, age, padShare) {
     const { growth, worst, load, speed } = this.decimals;
     for (const [, [hz]] of state.modes ?? []) growth.of(leastGrowth(hz));
     const fresh = !at("status").classList.contains("stale");
-    // Its numbers change with every state; nobody reads as fast.
+    // The numbers in the message change with every state, faster than anybody can read.
     if (fresh) put(at("reason"), state.message ?? "");
     this.#answer(state, padShare, fresh);
     put(at("margin"), signed(state.margin, 4), state.margin);
@@ -95,7 +95,7 @@ export class Status {
     this.#trend(state);
   }
 
-  /** What squeals, or squeals next: which modes, at what frequency, where, and which part moves. */
+  /** What squeals now or next: the modes, their frequency, the friction coefficient, and the part that moves. */
   #answer(state, padShare, fresh) {
     const { fastest, next, status, mu } = state;
     const told = asserts(state) && (fastest || next);
@@ -130,12 +130,12 @@ export class Status {
     put(element, arrow);
   }
 
-  /** Place on the gauge, %. */
+  /** Position on the gauge, %. */
   #x(margin) {
     return 50 + 47.5 * Math.max(-1, Math.min(1, margin / this.reach));
   }
 
-  /** The scale only grows, in steps: it does not follow the needle about. */
+  /** The scale only grows, in steps, so that it does not follow the needle. */
   #scale(reach) {
     const steps = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100];
     this.reach = steps.find((step) => step >= reach) ?? reach;
