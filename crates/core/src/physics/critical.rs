@@ -162,6 +162,7 @@ fn growth_is_resolved(left: &Spectrum, i: usize, right: &Spectrum, j: usize, ste
     }
 }
 
+/// Position of sample `k` in the interval, as a fraction of its length.
 fn fraction(k: usize) -> f64 {
     k as f64 / (SAMPLES + 1) as f64
 }

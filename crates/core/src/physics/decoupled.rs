@@ -64,6 +64,7 @@ struct Entry {
 }
 
 impl Parts {
+    /// Divides a model; `None` if no coordinate is uncoupled, or all are.
     fn of(model: &Model) -> Option<Self> {
         let terms = || model.stiffness.iter().chain(&model.damping);
         let is_alone = |k: usize| {

@@ -24,6 +24,7 @@ impl Dense {
         Self { values: vec![], left: Mat::new(), right: Mat::new(), memory: MemBuffer::new(StackReq::EMPTY) }
     }
 
+    /// Allocates the workspace for matrices of `dimension`, if it has another size.
     fn fit(&mut self, dimension: usize) {
         if self.right.nrows() != dimension {
             use ComputeEigenvectors::Yes;
@@ -152,11 +153,13 @@ impl<'a> Packed<'a> {
         Self { re: matrix.col_as_slice(packing.re), im, sign: packing.sign }
     }
 
+    /// The vector restricted to some rows.
     pub fn rows(self, rows: impl std::slice::SliceIndex<[f64], Output = [f64]> + Clone) -> Self {
         let im = if self.im.is_empty() { self.im } else { &self.im[rows.clone()] };
         Self { re: &self.re[rows], im, sign: self.sign }
     }
 
+    /// Entry `i`.
     pub fn at(self, i: usize) -> c64 {
         c64::new(self.re[i], if self.im.is_empty() { 0.0 } else { self.sign * self.im[i] })
     }

@@ -221,6 +221,7 @@ struct Search<'a> {
 }
 
 impl Search<'_> {
+    /// Spectrum at the load and speed of `point` and friction coefficient `mu`.
     fn solve(&mut self, point: &OperatingPoint, mu: f64) -> Result<Spectrum, MapError> {
         let solved = self.solver.solve(self.model, &point.with_friction(mu), Vectors::Right);
         solved.map_err(|source| MapError::Solve { mu, source })

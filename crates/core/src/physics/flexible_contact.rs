@@ -80,6 +80,7 @@ impl Model {
         Ok(self)
     }
 
+    /// Adds the contact's stiffness and damping at `μ = 0`.
     fn add_at_rest(&mut self, [stiffness, damping]: [Mat<f64>; 2]) -> Result<(), ModelError> {
         self.add_stiffness("contact stiffness", stiffness, Law::ContactStiffness)?;
         self.add_damping("contact damping", damping, Law::ContactDamping)
@@ -120,6 +121,7 @@ impl Model {
     }
 }
 
+/// A contact with residual flexibility and the model it is added to.
 struct FlexibleContact<'a> {
     pairs: &'a ContactPairs,
     residual: &'a ResidualFlexibility,

@@ -352,6 +352,7 @@ impl Model {
         Ok(())
     }
 
+    /// Checks shape and entries of a term and determines whether its matrix is symmetric.
     fn known(&mut self, term: Term, what: impl Fn() -> String) -> Result<KnownTerm, ModelError> {
         self.parts = OnceLock::new(); // what is known of the model before may not hold with it
         let (rows, columns) = term.matrix.shape();
@@ -536,6 +537,7 @@ impl Model {
         }
     }
 
+    /// Derivative of a custom law by a central difference with a relative step of 1e-6.
     fn custom_derivative(&self, custom: &CustomLaw, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
         let (depends, at, least) = match parameter {
             Parameter::Friction => (custom.depends_on_friction, p.friction_coefficient, 1.0),

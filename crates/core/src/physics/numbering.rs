@@ -218,6 +218,7 @@ impl StabilityMap {
         ids
     }
 
+    /// Whether the frequency of a root lies in the band.
     fn in_band(&self, root: &Root) -> bool {
         self.band_max_hz.is_none_or(|max_hz| root.frequency_hz() <= max_hz)
     }
@@ -235,6 +236,7 @@ fn slope(spectrum: &Spectrum, k: usize) -> c64 {
     if spectrum.undamped { of_square } else { of_square / (2.0 * spectrum.roots[k].lambda) }
 }
 
+/// A root interpolated between two nodes `step` apart, at fraction `share`: by a cubic if `curved`, else linearly.
 fn between(left: &Spectrum, i: usize, right: &Spectrum, j: usize, step: f64, share: f64, curved: bool) -> c64 {
     let (from, to) = (value(left, i), value(right, j));
     let line = from + share * (to - from);
@@ -275,8 +277,8 @@ pub struct Agreement {
     pub solved: usize,
     /// Number of modes compared.
     pub modes: usize,
-    /// Number of charted modes whose identity disagrees: the solved mode of the same identity is neither the nearest
-    /// one nor within the bounds of both.
+    /// Number of charted modes whose identity disagrees: the solved mode of the same identity is missing, or is neither
+    /// the nearest one nor within the bounds of both. A difference in the number of modes counts too.
     pub different: usize,
     /// Number of solved modes with another identity by shape. Modes closer than 1e-3, relative, to another are left
     /// out.

@@ -164,6 +164,7 @@ fn reach(spectrum: &Spectrum) -> [f64; 5] {
 }
 
 impl Group {
+    /// Whether the groups have a root in common.
     fn touches(&self, other: &Self) -> bool {
         let members = |group: &Self| [Some(group.first), group.second];
         members(self).iter().flatten().any(|k| members(other).iter().flatten().any(|l| k == l))
@@ -190,6 +191,7 @@ fn grouped(spectrum: &Spectrum) -> Vec<Group> {
         .collect()
 }
 
+/// Sensitivity of a root of `group`, whose block is `block`.
 fn of_root(spectrum: &Spectrum, root: usize, group: &Group, block: &Block, reach: &[f64; 5]) -> RootSensitivity {
     let z = value(spectrum, root);
     let to_lambda = |slope: Slopes| {
@@ -220,6 +222,7 @@ fn of_root(spectrum: &Spectrum, root: usize, group: &Group, block: &Block, reach
 }
 
 impl Block {
+    /// Mean and discriminant of the block, with derivatives.
     fn pair(&self) -> Pair {
         let [[a, b], [c, e]] = self.t;
         let half = 0.5 * (a - e);

@@ -358,7 +358,7 @@ pub(super) fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
 ///
 /// A backward stable solver returns the exact eigenvalues of a matrix perturbed by `E`; to first order a root then
 /// moves by `κ E`. Where `m` roots approach each other, `κ` grows like the inverse product of the gaps between them.
-/// The error then stays below the `m`-th root of `κ E g₁ … g₍ₘ₋₁₎`: half of the digits are left at a merging point of
+/// The error is then of the order of the `m`-th root of `κ E g₁ … g₍ₘ₋₁₎`: half of the digits are left at a merging point of
 /// two modes, a third where three meet.
 fn bound_errors(raw: &mut [Raw], damped: bool, matrix_norm: f64) {
     let backward_error = ROUNDING * f64::EPSILON * matrix_norm;

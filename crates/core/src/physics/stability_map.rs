@@ -248,6 +248,7 @@ fn carry(from: &Node, to: &Spectrum, source: impl Fn(usize) -> Option<usize>, ne
     ids
 }
 
+/// Identities of the roots of `spectrum`, continued from those of `node` by shape.
 fn continued_ids(node: &Node, spectrum: &Spectrum) -> Vec<Option<u32>> {
     let link = continue_roots(&node.spectrum, spectrum);
     // Roots that continue no root of the map get numbers that no root of the map has.

@@ -83,6 +83,7 @@ fn extrapolated(spectrum: &Spectrum, mu: f64) -> Vec<c64> {
         .collect()
 }
 
+/// `|a - b| / (|a| + |b|)`; 0 if both are zero.
 fn relative_distance(a: c64, b: c64) -> f64 {
     let scale = a.norm() + b.norm();
     let distance = (a - b).norm() / scale;

@@ -182,11 +182,13 @@ impl Work {
     }
 }
 
+/// Result of trying to chart a box: a leaf, or the axis to split along.
 enum Outcome {
     Converged(Leaf),
     Split(usize),
 }
 
+/// State of a build.
 pub(super) struct Builder<'a> {
     pub options: &'a ChartOptions,
     pub sampler: Sampler<'a>,
@@ -202,6 +204,7 @@ impl Builder<'_> {
         largest.map(|(slot, low, high)| Work { slot, low, high, share: self.chart.share(&low, &high), samples: vec![] })
     }
 
+    /// Leaves all pending boxes to dense solves.
     fn give_up(&mut self) {
         let open = self.chart.branches.iter_mut().filter(|branch| matches!(branch, Branch::Pending));
         open.for_each(|branch| *branch = Branch::Dense);

@@ -33,6 +33,7 @@ pub struct Branches<'a> {
 }
 
 impl Branches<'_> {
+    /// Value of a branch: `λ²` of an undamped model, `λ` of a damped one.
     fn z(&self, sample: usize, branch: usize) -> c64 {
         self.samples[sample].z[self.roots[sample][branch]]
     }
@@ -52,6 +53,7 @@ impl Branches<'_> {
         self.samples[sample].has_curvature(self.roots[sample][branch])
     }
 
+    /// Condition number of the root of a branch.
     fn condition(&self, sample: usize, branch: usize) -> f64 {
         self.samples[sample].conditions[self.roots[sample][branch]]
     }
@@ -345,8 +347,11 @@ fn closeness(branches: &Branches<'_>, members: &[usize], k: usize) -> f64 {
     (0..branches.samples.len()).map(gap).fold(f64::INFINITY, f64::min)
 }
 
+/// Expansions of the symmetric functions of a cluster.
 pub struct Expansion {
+    /// Coefficients of each function, real and imaginary part separately for a damped model.
     channels: Vec<Vec<f64>>,
+    /// Error bound of each function.
     errors: Vec<f64>,
     /// Truncation degree: coefficients of higher total degree are not needed.
     degree: usize,

@@ -44,6 +44,7 @@ pub enum Axis {
 }
 
 impl Axis {
+    /// Coordinate of `p` on this axis.
     fn coordinate(self, p: &OperatingPoint) -> f64 {
         match self {
             Self::Friction => p.friction_coefficient,
@@ -53,6 +54,7 @@ impl Axis {
         }
     }
 
+    /// Moves `p` to `coordinate` on this axis.
     fn place(self, p: &mut OperatingPoint, coordinate: f64) {
         match self {
             Self::Friction => p.friction_coefficient = coordinate,
@@ -116,6 +118,7 @@ struct Cluster {
 }
 
 impl Cluster {
+    /// Number of roots.
     fn size(&self) -> usize {
         self.errors.len()
     }
@@ -301,6 +304,7 @@ impl Chart {
         Ok(x)
     }
 
+    /// Index of the leaf that contains the coordinates `x`.
     fn find(&self, x: &[f64; MAX_AXES]) -> Result<usize, NotCharted> {
         let mut at = 0;
         loop {
