@@ -358,8 +358,8 @@ pub(super) fn displacement_scale(stiffness: MatRef<'_, f64>) -> Vec<f64> {
 ///
 /// A backward stable solver returns the exact eigenvalues of a matrix perturbed by `E`; to first order a root then
 /// moves by `κ E`. Where `m` roots approach each other, `κ` grows like the inverse product of the gaps between them.
-/// The error is then of the order of the `m`-th root of `κ E g₁ … g₍ₘ₋₁₎`: half of the digits are left at a merging point of
-/// two modes, a third where three meet.
+/// The error is then of the order of the `m`-th root of `κ E g₁ … g₍ₘ₋₁₎`: half of the digits are left at a merging
+/// point of two modes, a third where three merge.
 fn bound_errors(raw: &mut [Raw], damped: bool, matrix_norm: f64) {
     let backward_error = ROUNDING * f64::EPSILON * matrix_norm;
     // The solver does not resolve smaller gaps, and neither does a condition number computed from its vectors.
