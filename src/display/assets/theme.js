@@ -1,4 +1,4 @@
-// Before the first paint: the colours the reader chose last.
+// Runs before the first paint: applies the theme that the user chose last.
 "use strict";
 (() => {
   const kept = (() => { try { return localStorage.getItem("squealcast-theme"); } catch { return null; } })();

@@ -1,11 +1,11 @@
-// The time line of a recording: scrub, play, pause, speed, jump to events.
+// The time line of a recording: move, play, pause, speed, jump to events.
 
 import { colour, fixed, LEVELS } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 
 export class Timeline {
-  /** `look` is called with the moment to show and returns when it is shown. */
+  /** `look` is called with the moment to show and returns once it is shown. */
   constructor(about, look) {
     [this.start, this.end] = about.span_s;
     this.look = look;
@@ -65,7 +65,7 @@ export class Timeline {
     requestAnimationFrame(step);
   }
 
-  /** One question at a time; the latest moment wins. */
+  /** Requests one moment at a time; the latest one wins. */
   async #fetch() {
     if (this.asking) return;
     this.asking = true;
@@ -87,7 +87,7 @@ export class Timeline {
     at("scrub").setAttribute("aria-valuetext", text);
   }
 
-  /** The gravest level along the whole recording, behind the slider; below it what was measured, a miss in full height. */
+  /** The most severe level over the recording behind the slider; measured squeals below, misses at full height. */
   paint({ bin_s: binS, bins }, measured) {
     const canvas = at("track-levels");
     const width = canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
