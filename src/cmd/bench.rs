@@ -64,7 +64,7 @@ pub struct Options {
     svg: Option<PathBuf>,
 }
 
-/// What `bench --json` writes.
+/// The output of `bench --json`.
 #[derive(Serialize)]
 struct Report {
     machine: String,
@@ -127,7 +127,7 @@ impl Options {
     }
 }
 
-/// Processor, cores and load.
+/// Processor, number of cores and load.
 fn machine() -> String {
     let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
@@ -210,7 +210,7 @@ fn table(report: &Report) -> String {
     text
 }
 
-/// Every extreme, what was done and what came out; differences where it is not as it should be.
+/// Runs all stress cases and prints what was done and what resulted; differences if a result is not as expected.
 fn stress_table() -> anyhow::Result<Outcome> {
     let mut outcome = Outcome::Done;
     for case in stress::cases() {

@@ -1,4 +1,4 @@
-//! The buses a command joins, by option.
+//! Options for the buses that a command joins.
 
 use clap::Args;
 
@@ -30,23 +30,24 @@ pub struct BusOptions {
 }
 
 impl BusOptions {
-    /// A demonstration must not pass for a rig: on this machine only, under shared-memory names of its own.
+    /// The options for `demo`, which must not be mistaken for a rig: visible on this machine only, with its own
+    /// shared-memory names.
     pub fn for_demo(&self) -> Self {
         let shm_prefix = if self.shm_prefix.is_empty() { "demo/".to_owned() } else { self.shm_prefix.clone() };
         Self { loopback: true, shm_prefix, ..self.clone() }
     }
 
-    /// ROS 2 as asked for; `None` where the command is to stay off it.
+    /// Options of ROS 2; `None` if the command does not join it.
     pub fn ros2(&self, args: RosArgs) -> Result<Option<Ros2Options>, Ros2Error> {
         if self.no_ros { Ok(None) } else { Ros2Options::new(self.domain, self.loopback, args).map(Some) }
     }
 
-    /// Shared memory as asked for; `None` where the command is to stay off it.
+    /// Options of shared memory; `None` if the command does not join it.
     pub fn shm(&self) -> Option<ShmOptions> {
         (!self.no_shm).then(|| ShmOptions { service_prefix: self.shm_prefix.clone(), ..Default::default() })
     }
 
-    /// Where a node with these options, and `ros2` of them, listens, and the command that publishes there in place of a rig.
+    /// Where a node with these options and with `ros2` expects its inputs, and the command that simulates them.
     pub fn sources(&self, ros2: Option<&Ros2Options>) -> InputSources {
         let topic = ros2.map(|ros2| {
             let name = ros2.args.node_name(NODE_NAME);

@@ -19,7 +19,7 @@ impl Options {
             FullModelFile::load(path)?.describe()
         } else {
             match Rig::load(&self.rig) {
-                // A system too large to be a rig as it stands.
+                // A system too large for a rig is checked as a full model.
                 Err(RigError::Range { field, .. }) if field == "system.modes" => FullModelFile::load(path)?.describe(),
                 rig => rig?.describe(),
             }

@@ -29,7 +29,7 @@ pub struct Options {
     json: bool,
 }
 
-/// What `critical --json` prints.
+/// The output of `critical --json`.
 #[derive(Serialize)]
 struct Report<'a> {
     critical_friction: Option<f64>,

@@ -11,9 +11,9 @@ use crate::display::server::{About, Server, Source};
 use crate::node::Watch;
 use crate::rig::Rig;
 
-/// Where the page is served unless said otherwise, or on one of the next ports.
+/// Default port of the page; if it is taken, the next ports are tried.
 const DEFAULT_PORT: u16 = 8765;
-/// Ports tried from there on.
+/// Number of ports that are tried.
 const PORTS: u16 = 10;
 
 /// Where to show what is going on.
@@ -62,7 +62,7 @@ pub struct CriteriaOptions {
 }
 
 impl CriteriaOptions {
-    /// What was asked for, else what is usual.
+    /// The criteria given, with defaults for the others.
     pub fn criteria(&self) -> Criteria {
         let usual = Criteria::default();
         Criteria {
@@ -75,10 +75,10 @@ impl CriteriaOptions {
 }
 
 impl DisplayOptions {
-    /// The addresses to try in turn; none where no page is wanted.
+    /// The addresses to try in order; empty without a page.
     ///
     /// # Errors
-    /// An address others can reach without the option that allows it.
+    /// An address reachable by others, without the option that allows it.
     pub fn addresses(&self) -> anyhow::Result<Vec<SocketAddr>> {
         match self.display {
             _ if self.no_display => Ok(vec![]),
@@ -91,10 +91,10 @@ impl DisplayOptions {
     }
 }
 
-/// Serves `source` on the first free one of `addresses` and says where; serves nothing where there are none.
+/// Serves `source` on the first free address of `addresses` and reports it; does nothing without addresses.
 ///
 /// # Errors
-/// None of them is free.
+/// None of the addresses is free.
 pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> anyhow::Result<Option<Server>> {
     let Some(first) = addresses.first() else { return Ok(None) };
     let server = Server::start(addresses, source)
@@ -104,11 +104,11 @@ pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> anyhow::Resul
 }
 
 impl DisplayOptions {
-    /// The page of a node. An address that was asked for must be free; where none was asked for and none of the usual ones
-    /// is free, the node does without.
+    /// Serves the page of a node. An address given by the user must be free. If none of the default addresses is free,
+    /// the node runs without a page.
     ///
     /// # Errors
-    /// The address that was asked for is taken.
+    /// The address given by the user is taken.
     pub fn of_node(&self, rig: &Arc<Rig>, watch: &Watch, about: About) -> anyhow::Result<Option<Server>> {
         match serve(&self.addresses()?, Arc::new(Live::new(rig.clone(), watch.clone(), about))) {
             Err(error) if self.display.is_none() => {

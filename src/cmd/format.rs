@@ -1,4 +1,4 @@
-//! Results as text for people.
+//! Formats results as text.
 
 use std::fmt::Write;
 
@@ -6,7 +6,7 @@ pub use crate::number::significant;
 use crate::physics::{OperatingPoint, StabilityMap, Summary};
 use crate::rig::Rig;
 
-/// The conditions in one line, and what they make of the contact.
+/// The conditions in one line, with the state of the contact.
 fn conditions(rig: &Rig, point: &OperatingPoint) -> String {
     let OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient } = point;
     let mut text = format!(

@@ -35,10 +35,10 @@ pub struct Options {
     progress: ProgressOptions,
 }
 
-/// Relative to the size of a root, what rounding leaves of its growth rate.
+/// Rounding error of a growth rate, relative to the magnitude of its root.
 const ROUNDING: f64 = 1e-12;
 
-/// What `full --json` prints.
+/// The output of `full --json`.
 #[derive(Serialize)]
 struct Report<'a> {
     full_model: &'a str,
@@ -48,7 +48,8 @@ struct Report<'a> {
     disc_speed_rad_s: f64,
     friction_coefficient: f64,
     band_hz: f64,
-    /// Growth rates up to this, either way, were covered at every frequency of the band; null where all were.
+    /// Roots with growth rates between plus and minus this value were found at every frequency of the band; `null` if
+    /// all roots were.
     covered_growth_per_s: f64,
     discs: Vec<DiscReport>,
     roots: Vec<RootReport>,
@@ -140,7 +141,7 @@ fn table(full: &FullModelFile, p: &OperatingPoint, band_hz: f64, found: &FullSpe
     for root in &found.roots {
         let lambda = root.lambda;
         let mark = if lambda.re > full.settings.instability_threshold * lambda.norm() { "  unstable" } else { "" };
-        // A growth rate below the rounding of its root is shown as 0.
+        // A growth rate below the rounding error of its root is shown as 0.
         let growth = if lambda.re.abs() < ROUNDING * lambda.norm() { 0.0 } else { lambda.re };
         text += &format!(
             "{:>12.4}  {:>14}  {:>13}  {:>8.1e}{mark}\n",

@@ -12,7 +12,7 @@ use crate::physics::{OperatingPoint, Solver, Vectors};
 use crate::plot;
 use crate::rig::Rig;
 
-/// Stiffness over more than this factor within twice the least error is called poorly determined.
+/// The stiffness counts as poorly determined if the error stays within twice its minimum over more than this factor.
 const WELL_DETERMINED: f64 = 2.0;
 
 /// Find the contact stiffness that fits measured or computed natural frequencies at rest
@@ -38,7 +38,7 @@ pub struct Options {
     json: bool,
 }
 
-/// What `identify --json` prints; relative errors.
+/// The output of `identify --json`; errors are relative.
 #[derive(Serialize)]
 struct Report<'a> {
     stiffness_factor: f64,
@@ -46,10 +46,10 @@ struct Report<'a> {
     rms_error: f64,
     mean_error: f64,
     largest_error: f64,
-    /// Where the error stays below twice its minimum.
+    /// Range of factors over which the error is at most twice its minimum.
     factor_from: Option<f64>,
     factor_to: Option<f64>,
-    /// Relative change of the frequencies, rms, for a relative change of the stiffness.
+    /// Relative change of the frequencies (rms) per relative change of the stiffness.
     sensitivity: f64,
     frequency_hz: &'a [f64],
     target_hz: &'a [f64],
@@ -104,7 +104,7 @@ impl Options {
     }
 }
 
-/// Natural frequencies without sliding, the stiffness of every contact pair times `factor`.
+/// Natural frequencies without sliding, with the stiffness of every contact pair multiplied by `factor`, Hz.
 fn at_rest_hz(rig: &Rig, normal_load_n: f64, factor: f64) -> anyhow::Result<Vec<f64>> {
     let model = rig.at_rest_with_contact_stiffness_times(factor)?;
     let at_rest = OperatingPoint { normal_load_n, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
@@ -112,7 +112,8 @@ fn at_rest_hz(rig: &Rig, normal_load_n: f64, factor: f64) -> anyhow::Result<Vec<
     Ok(spectrum.modes().iter().map(|root| root.frequency_hz()).collect())
 }
 
-/// The column `frequency_hz`, ascending; separated by `,`, `;` or tabs. Where it is not `,`, it may be the decimal sign.
+/// The column `frequency_hz` in ascending order. Columns are separated by `,`, `;` or tabs; unless it is the separator,
+/// `,` may be the decimal sign.
 fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
     let file = path.display();
     let bytes = input_file::read(path, input_file::TARGETS).with_context(|| format!("{file}: cannot be read"))?;
@@ -130,7 +131,7 @@ fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
         let record = record.with_context(|| file.to_string())?;
         let line = record.position().map_or(0, csv::Position::line);
         let value = record.get(column).unwrap_or_default().trim();
-        // A decimal comma only: `1.234,5` would be one of several things.
+        // A decimal comma without points only: `1.234,5` would be ambiguous.
         let number = if separator == b',' || value.contains('.') { value.to_owned() } else { value.replace(',', ".") };
         match number.parse::<f64>() {
             Ok(hz) if hz.is_finite() && hz > 0.0 => targets.push(hz),
@@ -144,7 +145,7 @@ fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
     Ok(targets)
 }
 
-/// A warning where the frequencies hardly know the stiffness; nothing where they do.
+/// A warning if the frequencies hardly depend on the stiffness; empty otherwise.
 fn poorly(found: &Identified) -> String {
     match found.doubled {
         [Some(from), Some(to)] if to / from <= WELL_DETERMINED => String::new(),

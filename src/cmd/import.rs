@@ -53,7 +53,7 @@ fn decimal(text: &str) -> Result<char, String> {
 }
 
 impl LogArgs {
-    /// As the reader of logs takes them.
+    /// The options of the log reader.
     pub fn options(&self) -> LogOptions {
         LogOptions {
             columns: self.columns.clone(),
@@ -76,7 +76,7 @@ impl Options {
     }
 }
 
-/// Says what was read of a log and what was left out.
+/// Reports what was read from a log and what was skipped.
 pub fn describe(log: &TribometerLog) -> Outcome {
     for column in &log.columns {
         let unit = match column.unit.as_str() {

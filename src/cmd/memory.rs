@@ -1,4 +1,4 @@
-//! How much memory a command may take: what is asked for, or what the machine has to spare.
+//! The memory that a command may use: the amount given, or what the machine has available.
 
 use std::path::Path;
 
@@ -8,10 +8,10 @@ use crate::full_model::FullModelFile;
 use crate::io::memory::{available_bytes, peak_bytes, resident_bytes};
 use crate::reduction::{FullProgress, FullSolver, GIB};
 
-/// What may be taken beside what this process holds now, in bytes; `None` where the system does not say.
+/// Memory that may be used in addition to what this process holds now, bytes; `None` if the system does not report it.
 ///
 /// # Errors
-/// Reading the full model took more than the GiB asked for.
+/// Reading the full model took more than the amount given.
 pub fn room(asked_gib: Option<f64>, full: &Path) -> anyhow::Result<Option<usize>> {
     let Some(gib) = asked_gib else { return Ok(available_bytes()) };
     let peak_gib = peak_bytes().map_or(0.0, |bytes| bytes as f64 / GIB);
@@ -21,10 +21,10 @@ pub fn room(asked_gib: Option<f64>, full: &Path) -> anyhow::Result<Option<usize>
     Ok(Some(((gib * GIB) as usize).saturating_sub(resident_bytes().unwrap_or(0))))
 }
 
-/// What solves `full` itself.
+/// The solver for the full model `full`.
 ///
 /// # Errors
-/// A model that cannot be analysed, or not within `room`.
+/// The model cannot be analysed, or not within `room`.
 pub fn solver<'a>(
     full: &'a FullModelFile,
     room: Option<usize>,

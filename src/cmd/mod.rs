@@ -1,4 +1,4 @@
-//! The commands, one file each; exit codes and output in one place.
+//! The commands, one per file. Exit codes and output are handled here.
 
 mod bench;
 mod buses;
@@ -99,7 +99,7 @@ enum Command {
     Ros2Side(ros2_side::Options),
 }
 
-/// What became of a command that did not fail.
+/// Result of a command that did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Outcome {
     /// Exit code 0.
@@ -156,7 +156,7 @@ pub fn main() -> ExitCode {
     }
 }
 
-/// An error with its causes; a cause that the message before already ends with is not repeated.
+/// The message of an error with those of its causes; a cause with which the previous message ends is not repeated.
 fn failure(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain().map(ToString::to_string).filter(|cause| !cause.is_empty()) {
@@ -189,7 +189,7 @@ struct LoadAndSpeed {
 }
 
 impl Conditions {
-    /// The operating point, within the `limits` of the rig or model called `name`.
+    /// The operating point; an error if it is outside the `limits` of the rig or model called `name`.
     ///
     /// # Errors
     /// A condition outside the limits.
@@ -206,7 +206,8 @@ impl Conditions {
 }
 
 impl LoadAndSpeed {
-    /// The load and speed at which friction coefficients are searched, within the limits of `rig`.
+    /// The load and speed at which friction coefficients are searched; an error if they are outside the limits of
+    /// `rig`.
     ///
     /// # Errors
     /// A condition outside the limits.
@@ -215,7 +216,7 @@ impl LoadAndSpeed {
     }
 }
 
-/// A rig: any text, with the names of the embedded rigs for completion scripts.
+/// Parser for a rig: accepts any text, and offers the names of the embedded rigs to completion scripts.
 #[derive(Clone, Copy, Debug)]
 struct RigName;
 
@@ -257,7 +258,7 @@ fn positive(text: &str) -> Result<f64, String> {
     if value > 0.0 { Ok(value) } else { Err(format!("{value} is not more than 0")) }
 }
 
-/// Writes to standard output, control characters as escapes; a reader that has gone away is no error.
+/// Writes to standard output with control characters escaped. A closed reader is not an error.
 fn print(text: &str) -> anyhow::Result<()> {
     print_bytes(printable(text).as_bytes())
 }
@@ -270,7 +271,7 @@ fn print_bytes(bytes: &[u8]) -> anyhow::Result<()> {
     }
 }
 
-/// Writes a file, whole or not at all; `-` is standard output.
+/// Writes a file completely or not at all; `-` is standard output.
 fn write_file(path: &std::path::Path, bytes: &[u8]) -> anyhow::Result<()> {
     if path == std::path::Path::new("-") {
         return print_bytes(bytes);

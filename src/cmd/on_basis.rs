@@ -1,4 +1,4 @@
-//! Reducing a full model on a parametric basis: what is asked for, by words, and what is being done, in words.
+//! Reduction of a full model on a parametric basis: options and progress messages.
 
 use std::f64::consts::TAU;
 
@@ -11,18 +11,18 @@ use crate::reduction::{
     Counted, FullSolver, GIB, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
 };
 
-/// Largest `|Δλ|/|λ|` where nothing else is asked for.
+/// Default tolerance: largest `|Δλ|/|λ|`.
 pub const TOLERANCE: f64 = 1e-6;
-/// Operating points beside corners and middle at which the error is estimated, for each condition that matters.
+/// Operating points for estimating the error, in addition to corners and centre, for each varying condition.
 const TRAINING: usize = 8;
-/// Operating points held out, for each condition that matters.
+/// Held-out operating points for each varying condition.
 const HELD_OUT: usize = 3;
-/// Operating points of the full model after which it is given up.
+/// Number of operating points at which the full model is solved before the attempt is given up.
 const MOST_SAMPLES: usize = 40;
-/// Vectors after which it is given up: beyond, modes of the parts are as good.
+/// Number of basis vectors at which the attempt is given up: modes of the parts would serve as well.
 const MOST_VECTORS: usize = 500;
 
-/// Ranges as they were asked for.
+/// Ranges of the conditions as given.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Ranges {
     friction_coefficient: Option<[f64; 2]>,
@@ -30,7 +30,7 @@ pub struct Ranges {
     disc_speed_rad_s: Option<[f64; 2]>,
 }
 
-/// `mu=0:1,speed=6:60,load=50:2000`, for clap.
+/// Parses `mu=0:1,speed=6:60,load=50:2000`, for clap.
 pub fn ranges(text: &str) -> Result<Ranges, String> {
     let mut ranges = Ranges::default();
     for item in text.split(',') {
@@ -58,10 +58,10 @@ pub fn ranges(text: &str) -> Result<Ranges, String> {
     Ok(ranges)
 }
 
-/// What is asked of a basis of `full`, which `solver` solves, and the basis.
+/// Builds a parametric basis of `full`, solved by `solver`; returns it with the request it satisfies.
 ///
 /// # Errors
-/// A full model that is no case for it, a tolerance that cannot be held.
+/// The full model is not suitable, or the tolerance cannot be met.
 pub fn basis_of(
     full: &FullModelFile,
     tolerance: f64,
@@ -96,7 +96,7 @@ pub fn basis_of(
     asked.check()?;
     let (load, speed) = full.model.depends_on_load_and_speed();
     let range = asked.without(!load, !speed);
-    // A single value is no range: nothing to train on, and nothing to hold out.
+    // A single value is not a range: there is nothing to train on or to hold out.
     let matters = range.widths();
     if matters == 0 {
         bail!(
@@ -119,7 +119,7 @@ pub fn basis_of(
     let basis = parametric_basis(&full.model, solver, &request, &mut |step| tell(steps, step))?;
     let vectors = &basis.projected.basis;
     solver.held_elsewhere(size_of::<f64>() * vectors.nrows() * vectors.ncols());
-    // What does not matter holds over all of the range that was asked for.
+    // For conditions on which the model does not depend, the basis is valid over the whole given range.
     Ok((ParametricRequest { range: asked, ..request }, basis))
 }
 

@@ -10,13 +10,13 @@ use crate::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use crate::io::shm::{ShmOptions, ShmOutput, ShmSensitivity, ShmSource, ShmVibrationSource};
 use crate::wire::schema::Topic;
 
-/// Readers are awaited until no further one has come for so long.
+/// Time without a new reader after which waiting for readers ends.
 const SETTLED: Duration = Duration::from_millis(500);
 
-/// Readers of a topic that rig or node hears over ROS 2 which are the replay's own: one for reliable publishers and one for others.
+/// Number of the replay's own readers of a topic on ROS 2: a reliable and a best-effort one.
 const OWN_READERS: usize = 2;
 
-/// What a recording is played to.
+/// The buses to which a recording is played.
 pub struct Player {
     shm: Option<Shm>,
     ros2: Option<(Ros2Source, Ros2)>,
@@ -33,7 +33,7 @@ impl Player {
     /// Joins the buses.
     ///
     /// # Errors
-    /// A bus that cannot be joined; no bus.
+    /// A bus cannot be joined, or none was requested.
     pub fn join(shm: Option<ShmOptions>, ros2: Option<Ros2Options>) -> anyhow::Result<Self> {
         ensure!(shm.is_some() || ros2.is_some(), "nothing to play to: both --no-shm and --no-ros are given");
         let ports = |shm| {
@@ -47,7 +47,7 @@ impl Player {
         let shm = shm.as_ref().map(ports).transpose();
         let ros2 = ros2.map(|mut ros2| {
             let source = Ros2Source::start(&ros2, |_| {})?;
-            // The node's own name stays free for a node that listens.
+            // The default node name remains free for a node that receives the messages.
             ros2.args = ros2.args.renamed("squealcast_replay");
             anyhow::Ok((source, Ros2::start(&ros2, Parameters::none(), |_| {}, |_| {})?))
         });
@@ -57,7 +57,7 @@ impl Player {
         })
     }
 
-    /// How many readers a topic has on the buses joined.
+    /// Number of readers of a topic on all buses joined.
     fn readers(&self, topic: Topic) -> usize {
         let shm = self.shm.as_ref().map_or(0, |shm| match topic {
             Topic::OperatingPoint => shm.inputs.readers(),
@@ -66,7 +66,7 @@ impl Player {
             Topic::Sensitivity => shm.sensitivities.readers(),
             Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0, // no shared-memory form
         });
-        // Rig and node hear each other here.
+        // The replay's rig and node receive each other's messages.
         let ros2 = self.ros2.as_ref().map_or(0, |(rig, node)| match topic {
             Topic::OperatingPoint => rig.readers().saturating_sub(OWN_READERS),
             Topic::Vibration => rig.vibration_readers().saturating_sub(OWN_READERS),
@@ -76,8 +76,9 @@ impl Player {
         shm + ros2
     }
 
-    /// Waits until one of `topics` has a reader and no further one has come for half a second, so that none of them loses the
-    /// first messages; whether there is one. Waits for the first no longer than `limit`, and for none once `stopped`.
+    /// Waits until one of `topics` has a reader and no new one has appeared for half a second, so that no reader misses
+    /// the first messages. Returns whether there is a reader. The first reader is awaited for at most `limit`, and not
+    /// after `stopped`.
     pub fn wait_for_readers(&self, topics: &[Topic], limit: Duration, stopped: &AtomicBool) -> bool {
         let started = Instant::now();
         let (mut known, mut changed) = (0, started);
@@ -100,7 +101,7 @@ impl Player {
     /// Publishes a message.
     ///
     /// # Errors
-    /// A bus refuses it.
+    /// A bus refuses the message.
     pub fn publish(&self, payload: &Payload) -> anyhow::Result<()> {
         if let Some(shm) = &self.shm {
             match payload {
@@ -108,7 +109,7 @@ impl Player {
                 Payload::Prediction(message) => drop(shm.predictions.publish(message)?),
                 Payload::Vibration(message) => drop(shm.vibrations.publish(message)?),
                 Payload::Sensitivity(message) => drop(shm.sensitivities.publish(message)?),
-                // No shared-memory form.
+                // These have no shared-memory form.
                 Payload::SessionEvent(_) | Payload::RigInfo(_) | Payload::Diagnostics(_) => {}
             }
         }

@@ -19,7 +19,7 @@ pub struct Options {
     json: bool,
 }
 
-/// What `predict --json` prints; NaN is null.
+/// The output of `predict --json`; NaN becomes `null`.
 #[derive(Serialize)]
 struct Report<'a> {
     rig: &'a str,
@@ -79,7 +79,7 @@ impl Options {
     }
 }
 
-/// The modes at `point`, numbered by the map that a session uses there.
+/// The modes at `point`, with identities from the map that a session uses there.
 fn predict(rig: &Rig, point: &OperatingPoint) -> anyhow::Result<Summary> {
     let mut solver = Solver::new(rig.model.dimension());
     let spectrum = solver.solve(&rig.model, point, Vectors::Right)?;

@@ -98,7 +98,7 @@ impl Options {
     }
 }
 
-/// The chart of a rig, kept for the next time.
+/// The chart of a rig, stored on disk for later runs.
 fn chart(rig: &Rig) -> anyhow::Result<Chart> {
     let kept = ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);
     let threads = std::thread::available_parallelism().map_or(1, usize::from);

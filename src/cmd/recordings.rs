@@ -28,10 +28,10 @@ pub struct TopicOptions {
 }
 
 impl TopicOptions {
-    /// Opens a recording, and says what of it cannot be read.
+    /// Opens a recording and reports what cannot be read.
     ///
     /// # Errors
-    /// No recording, or none with these topics.
+    /// There is no recording, or it lacks the requested topics.
     pub fn open(&self, path: &Path) -> anyhow::Result<Recording> {
         let recording = Recording::open_with(path, ReadOptions { topics: self.read_topics.clone() })?;
         for damage in recording.damage() {
@@ -45,10 +45,10 @@ impl TopicOptions {
 }
 
 impl Recordings {
-    /// All of them, at least one.
+    /// All recordings, at least one.
     ///
     /// # Errors
-    /// A path without a recording.
+    /// A path contains no recording.
     pub fn paths(&self) -> anyhow::Result<Vec<PathBuf>> {
         let mut paths = vec![];
         for path in &self.recordings {
@@ -57,19 +57,19 @@ impl Recordings {
         Ok(paths)
     }
 
-    /// Opens one of [`Recordings::paths`], and says what of it cannot be read.
+    /// Opens one of [`Recordings::paths`] and reports what cannot be read.
     ///
     /// # Errors
-    /// No recording, or none with the topics asked for.
+    /// There is no recording, or it lacks the requested topics.
     pub fn open(&self, path: &Path) -> anyhow::Result<Recording> {
         self.topics.open(path)
     }
 
-    /// The one recording, where a command takes only one: of a folder that holds several the last by name, which of
+    /// The recording for a command that takes only one. Of a folder with several it is the last by name, which for
     /// sessions is the latest.
     ///
     /// # Errors
-    /// As [`Recordings::paths`]; several paths.
+    /// As [`Recordings::paths`]; several paths were given.
     pub fn only(&self) -> anyhow::Result<(PathBuf, Recording)> {
         if self.recordings.len() > 1 {
             let [first, ..] = &self.recordings[..] else { unreachable!("more than one") };
@@ -86,7 +86,7 @@ impl Recordings {
     }
 }
 
-/// What to do with a recording that holds no predictions.
+/// The error for a recording without predictions, with advice.
 pub fn without_predictions(path: &Path, recording: &Recording) -> anyhow::Error {
     let path = path.display();
     match recording.topics().name_of(Topic::OperatingPoint) {

@@ -26,7 +26,7 @@ impl Options {
     }
 }
 
-/// What became of a file, in words.
+/// The result of repairing a file, as text.
 pub fn describe(recovery: &Recovery) -> String {
     let original = recovery.original.display();
     match &recovery.outcome {

@@ -18,7 +18,7 @@ use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullSolver, GIB, Kept, Progress, Residual, Wanted};
 use crate::rig::{Rig, RigFile, SideResidual, between_patches};
 
-/// The cut-off of the modes kept, relative to the band, where `--cutoff-hz` has no value.
+/// Default cut-off of the modes kept, relative to the band, if `--cutoff-hz` has no value.
 const CUTOFF: f64 = 2.5;
 
 /// Reduce a full model to a rig file the node can run
@@ -64,11 +64,11 @@ pub struct Options {
     progress: ProgressOptions,
 }
 
-/// How many modes of each part.
+/// Number of modes to keep of each part.
 #[derive(Clone, Debug)]
 struct ModeCounts(Vec<usize>);
 
-/// `80+80`, or `80` before a rigid disc, for clap.
+/// Parses `80+80`, or `80` for a pad on a rigid disc, for clap.
 fn mode_counts(text: &str) -> Result<ModeCounts, String> {
     let counts: Result<Vec<usize>, String> = text
         .split('+')
@@ -143,7 +143,7 @@ impl Options {
         self.finish(steps, &full, None, kept.join("; "), &make)
     }
 
-    /// The name of the rig file, which can be written and is not what is read.
+    /// The name of the rig file; an error if it cannot be written or is the input.
     fn output_file(&self) -> anyhow::Result<String> {
         let output = self.output.display();
         let folder = self.output.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -158,7 +158,7 @@ impl Options {
         Ok(file.to_string_lossy().into_owned())
     }
 
-    /// Compares what is left with the full model, and writes the files of the rig with what was found.
+    /// Compares the reduced rig with the full model and writes its files, including the errors found.
     fn finish(
         &self,
         mut steps: Steps,
@@ -197,7 +197,7 @@ impl Options {
                         }
                         (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?;
                     }
-                    // The rig is kept: it took long to make, and `verify --against` can compare it again.
+                    // The rig is kept: it took long to compute, and `verify --against` can repeat the comparison.
                     Err(error) => {
                         steps.say(&format!("not compared with the full model: {error:#}"));
                         outcome = Outcome::Differences;
@@ -209,7 +209,7 @@ impl Options {
         // The rig file, which is the first, names the others.
         let folder = self.output.parent().unwrap_or(Path::new(""));
         write_together(files.iter().rev().map(|file| (folder.join(&file.name), &file.bytes[..])))?;
-        // The rig file no longer names them; what cannot be removed harms nobody.
+        // The new rig file does not name these files. One that cannot be removed does no harm.
         replaced.into_iter().for_each(|path| drop(std::fs::remove_file(path)));
         steps.say(&format!("{} written", self.output.display()));
         drop(steps);
@@ -217,7 +217,7 @@ impl Options {
         Ok(outcome)
     }
 
-    /// Which modes of each part.
+    /// Which modes to keep of each part.
     fn wanted(&self, full: &FullModelFile) -> anyhow::Result<Vec<Wanted>> {
         let parts = full.geometry.len();
         if let Some(ModeCounts(counts)) = &self.modes {
@@ -234,7 +234,7 @@ impl Options {
     }
 }
 
-/// The residual of both sides between the contact pairs of `full`, taken from the sides.
+/// Residual flexibility and inertia of pad and disc between the contact pairs of `full`. They are moved out of `sides`.
 fn between_pairs(
     file: &str,
     full: &FullModelFile,
@@ -259,7 +259,7 @@ fn between_pairs(
     Ok(Some(between_patches(file, patches, [&pad.nodes_m, &disc.nodes_m], &known)?))
 }
 
-/// What was kept of each part, for the head of the rig file.
+/// Comments for the head of the rig file: what was kept of each part.
 fn remarks(names: &[&str], kept: &[Kept]) -> Vec<String> {
     let mut lines = vec![];
     for (name, kept) in names.iter().zip(kept) {
@@ -273,7 +273,7 @@ fn remarks(names: &[&str], kept: &[Kept]) -> Vec<String> {
     lines
 }
 
-/// What a part is doing, in words.
+/// Reports the progress of one part.
 pub fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
     match what {
         Progress::Analysing => steps.say(&format!("{name}: ordering and analysing")),
@@ -295,8 +295,8 @@ pub fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
     }
 }
 
-/// Archives and matrices that the rig file at `path` names now, as this command names them, and neither `files` nor another
-/// rig file beside it do.
+/// Files named by the existing rig file at `path` that this command created and that are no longer needed: neither
+/// `files` nor another rig file in the folder names them.
 fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
     let text = input_file::read_text(path, input_file::TOML).unwrap_or_default();
     let Some(stem) = path.file_stem() else { return vec![] };
@@ -321,7 +321,7 @@ fn replaced(path: &Path, files: &[RigFile]) -> Vec<PathBuf> {
     let mut found = vec![];
     let table = text.parse::<toml::Table>().unwrap_or_default();
     strings(&table.into(), &mut |text| found.extend(named(text)));
-    // A copy of the rig file may go on naming them.
+    // A copy of the rig file may still name them.
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let others = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let others = others.filter(|other| other.extension().is_some_and(|kind| kind == "toml"));

@@ -62,7 +62,7 @@ pub struct Options {
     buses: BusOptions,
 }
 
-/// Between two rounds of a recording that is played again and again, in recorded time.
+/// Recorded time between two rounds of a repeated recording.
 const BETWEEN_ROUNDS_NS: u64 = 10_000_000;
 
 /// The names of all topics, for clap.
@@ -75,7 +75,7 @@ impl Options {
         if self.verify { self.verify_all() } else { self.play(ros_args) }
     }
 
-    /// Verifies all recordings; one that cannot be does not keep the others.
+    /// Verifies all recordings; one that cannot be verified does not prevent the others.
     fn verify_all(&self) -> anyhow::Result<Outcome> {
         let paths = self.recordings.paths()?;
         if let [path] = &paths[..] {
@@ -142,7 +142,7 @@ impl Options {
         Ok(Outcome::Done)
     }
 
-    /// Whether the messages of a topic are to be played.
+    /// Whether the messages of a topic are played.
     fn wants(&self, topic: Topic) -> bool {
         self.topics.is_empty() || self.topics.iter().any(|wanted| wanted == topic.name())
     }
@@ -157,7 +157,7 @@ impl Options {
             return;
         }
         note!("waiting up to {} s for a reader; --wait 0 plays at once", self.wait);
-        // What is too long for a duration never ends.
+        // A time that exceeds `Duration` means no limit.
         let limit = Duration::try_from_secs_f64(self.wait).unwrap_or(Duration::MAX);
         if !player.wait_for_readers(&topics, limit, stopped) && !stopped.load(Ordering::Relaxed) {
             note!("no reader within {} s: playing all the same", self.wait);
@@ -223,7 +223,7 @@ impl Options {
             }
             let nothing = played.load(Ordering::Relaxed) == 0;
             ensure!(!nothing, "nothing to play: no such messages in that part of the recording");
-            // A node takes stamps that run backward for a fault: a round begins where the one before has ended.
+            // A node treats stamps that run backward as a fault, so each round continues where the previous one ended.
             let length_ns = stamps.length_ns().unwrap_or(last_ns.saturating_sub(first_ns));
             shift_ns = shift_ns.saturating_add_unsigned(length_ns.saturating_add(BETWEEN_ROUNDS_NS));
             round_start_ns = pacer.next_round(start_ns, last_ns, BETWEEN_ROUNDS_NS);
@@ -247,10 +247,10 @@ impl Span {
     }
 }
 
-/// What is around the table of what is played.
+/// Title, keys and footer of the live table of a replay.
 fn frame(path: &Path, recording: &Recording, played: &Arc<AtomicU64>, stopped: &Arc<AtomicBool>) -> live::Frame {
     let file = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-    // A recording that was imported carries no rig: then every damping below zero grows.
+    // Imported recordings contain no rig: every mode with negative damping then counts as unstable.
     let rig = recorded_rig(recording).ok();
     let title = rig.as_ref().map_or_else(|| file.clone(), |rig| format!("{}, {file}", rig.name));
     let (played, stopped) = (played.clone(), stopped.clone());
@@ -263,7 +263,7 @@ fn frame(path: &Path, recording: &Recording, played: &Arc<AtomicU64>, stopped: &
     }
 }
 
-/// The rig a recording carries.
+/// The rig contained in a recording.
 pub fn recorded_rig(recording: &Recording) -> anyhow::Result<Rig> {
     let hash = recording.session_metadata("rig_content_hash");
     let hash = hash.context("the recording names no rig; say which with --rig")?;

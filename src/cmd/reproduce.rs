@@ -49,7 +49,7 @@ impl Options {
         let of_tribometer = self.tribometer()?;
         of_tribometer.iter().try_for_each(|item| self.write(item))?;
         items.extend(of_tribometer);
-        // Last: where the page is, all of it is.
+        // Written last: if the page exists, everything it shows exists.
         self.file("index.html", &index(&items))?;
         Ok(Outcome::Done)
     }
@@ -69,7 +69,7 @@ impl Options {
             full.keep_modes(&vec![most; names.len()], true, room(self.memory_gib, &toml)?, &mut |part, what| {
                 tell(&mut steps, part, names[part], what);
             })?;
-        // Vectors of the whole parts are not needed any more.
+        // The modes on all coordinates of the parts are no longer needed.
         let modes = PartModes::new(&full, &kept)?;
         drop(kept);
         steps.say("ordering and analysing");

@@ -58,7 +58,7 @@ pub struct NodeOptions {
     threshold: ThresholdOption,
 }
 
-/// The longest the recorder may take to finish its files, so that a signal ends the program within 2 s.
+/// Time limit for the recorder to finish its files, so that a signal ends the program within 2 s.
 const FINISH_WITHIN: Duration = Duration::from_millis(1500);
 
 impl Options {
@@ -69,11 +69,11 @@ impl Options {
     }
 }
 
-/// Where a node's inputs come from.
+/// Source of a node's inputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Listening {
     ToTheBuses,
-    /// Inputs come from this process alone.
+    /// Inputs come from this process only.
     ToNobody,
 }
 
@@ -89,7 +89,7 @@ pub fn serve(
     if let Some(known) = &rig.reduction {
         note!("{}", known.told());
     }
-    // Before the recording begins, so that it is finished whenever a signal comes.
+    // Before the recording begins, so that it is always finished when a signal arrives.
     let stop = sender.clone();
     signals::on_stop(move || drop(stop.send(Incoming::Stop)))?;
     let mut initial = Settings::for_rig(rig);
@@ -104,7 +104,7 @@ pub fn serve(
         inputs: inputs.clone(),
         ..About::new(rig, "live", options.threshold.db())
     };
-    // Before the recording: an address that is taken leaves none behind.
+    // Before the recording begins: if the address is taken, no recording is left behind.
     let display = options.display.of_node(rig, &watch, about)?;
     let mut outputs = Outputs::default();
     let shortcut = Shortcut::new(sender.clone());
@@ -142,7 +142,7 @@ pub fn serve(
             input: Box::new(hear(listening, &sender, lost, Incoming::Input)),
             vibration: Box::new(hear(listening, &sender, lost, Incoming::Vibration)),
             parameter: Box::new(move |name, value| {
-                // Not waited for: this is the thread that hears the bus.
+                // Does not block, because it runs on the thread that receives from the bus.
                 if changes.try_send(Incoming::Parameter { name: name.to_owned(), value }).is_err() {
                     note!("parameter {name} = {value} came into a full queue and has no effect");
                 }
@@ -153,7 +153,7 @@ pub fn serve(
         outputs.ros2 = Some(started.context("ROS 2; --no-ros stays off it")?);
     }
 
-    // Last of what can fail: no start that fails leaves a recording.
+    // The last step that can fail, so that a failed start leaves no recording.
     let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
     outputs.recorder = recorder.as_ref().map(Recorder::handle);
     let shown = live::show(frame(rig, inputs, display.as_ref(), sender.clone()), watch.clone(), options.plain);
@@ -162,7 +162,7 @@ pub fn serve(
     let kept = if options.no_chart_cache { None } else { kept() };
     let node = if options.no_chart { node } else { node.with_chart(kept, sender) };
     let outputs = node.run(&receiver);
-    // The recording first: whoever shows the session may be held up by a reader that does not read.
+    // The recording first: the view may be blocked by a reader that does not read.
     let outcome = recorder.map_or(Ok(Outcome::Done), finish);
     shown.stop();
     drop(display);
@@ -170,8 +170,8 @@ pub fn serve(
     outcome
 }
 
-/// What is around the table of a node for `rig`, which listens to `inputs` or else to a simulator. The table covers what
-/// was written before it, so that it names the page again.
+/// Title, keys and footer of the live table of a node for `rig`. `inputs` is `None` with a simulator. The title names
+/// the page again, because the table covers earlier output.
 fn frame(rig: &Rig, inputs: Option<InputSources>, display: Option<&Server>, node: Sender<Incoming>) -> live::Frame {
     let name = if inputs.is_some() { "squealcast" } else { "squealcast (simulated)" };
     let page = display.map(|display| format!("http://{}/", display.address()));
@@ -197,7 +197,7 @@ fn frame(rig: &Rig, inputs: Option<InputSources>, display: Option<&Server>, node
     }
 }
 
-/// Hands what is heard to the node without waiting for it; what does not fit is lost, and counted.
+/// Passes received messages to the node without blocking; messages that do not fit are lost and counted.
 fn hear<M>(
     listening: Listening,
     sender: &Sender<Incoming>,

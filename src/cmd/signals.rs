@@ -1,4 +1,4 @@
-//! SIGINT, SIGTERM and SIGHUP end a command cleanly; asked again, it ends at once.
+//! SIGINT, SIGTERM and SIGHUP end a command cleanly; a second signal ends it at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -7,10 +7,11 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// A second signal this soon belongs to the first: a Ctrl-C reaches a launcher's whole process group, and the launcher sends its own.
+/// A second signal within this time belongs to the same request: a Ctrl-C reaches a launcher's whole process group, and
+/// the launcher then sends its own signal.
 const SAME_REQUEST: Duration = Duration::from_secs(2);
 
-/// Sleeps until a moment, or until `stopped`, which is looked at ten times a second.
+/// Sleeps until `moment` or until `stopped` is set, which is checked ten times a second.
 pub fn wait_until(moment: Instant, stopped: &AtomicBool) {
     while !stopped.load(Ordering::Relaxed) {
         let left = moment.saturating_duration_since(Instant::now());
@@ -21,11 +22,11 @@ pub fn wait_until(moment: Instant, stopped: &AtomicBool) {
     }
 }
 
-/// Calls `stop` once at the first signal. The next is ignored if it comes within [`SAME_REQUEST`]; any other ends the process. SIGHUP
-/// is not heard where it was ignored when the process began (`nohup`).
+/// Calls `stop` once at the first signal. A second signal within [`SAME_REQUEST`] is ignored; any later one ends the
+/// process. SIGHUP is ignored if it was ignored when the process started (`nohup`).
 ///
 /// # Errors
-/// Signals cannot be listened to.
+/// Signal handlers cannot be installed.
 pub fn on_stop(stop: impl FnOnce() + Send + 'static) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
@@ -53,33 +54,33 @@ pub fn on_stop(stop: impl FnOnce() + Send + 'static) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Waits for any of some signals.
+/// Waits for any of several signals.
 async fn any(signals: &mut [Signal]) {
     std::future::poll_fn(|context| {
-        // Each is asked, so that each wakes this.
+        // All are polled, so that each of them can wake this future.
         let came: Vec<bool> = signals.iter_mut().map(|signal| signal.poll_recv(context).is_ready()).collect();
         if came.contains(&true) { std::task::Poll::Ready(()) } else { std::task::Poll::Pending }
     })
     .await;
 }
 
-/// Whether the process was started with a signal ignored.
+/// Whether a signal was ignored when the process started.
 fn ignored_from_the_beginning(kind: SignalKind) -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     ignores(&status, kind.as_raw_value())
 }
 
-/// What `/proc/PID/status` says of a signal: bit `n - 1` of a hexadecimal mask is signal `n`.
+/// Whether a text of `/proc/PID/status` marks a signal as ignored: bit `n - 1` of a hexadecimal mask is signal `n`.
 fn ignores(status: &str, signal: i32) -> bool {
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let mask = mask.and_then(|digits| u64::from_str_radix(digits.trim(), 16).ok());
     mask.is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
 }
 
-/// Makes a write beyond the limit of file sizes (`ulimit -f`) an error like that of a full disk, instead of the end of the process.
+/// Makes a write beyond the file size limit (`ulimit -f`) fail like one on a full disk, instead of ending the process.
 ///
 /// # Errors
-/// The signal cannot be handled.
+/// The signal handler cannot be installed.
 pub fn survive_file_size_limit() -> std::io::Result<()> {
     signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::new(AtomicBool::new(false)))?;
     Ok(())

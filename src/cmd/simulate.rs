@@ -58,10 +58,10 @@ fn tone(text: &str) -> Result<Tone, String> {
     Ok(Tone { above_mu: finite(mu)?, frequency_hz: positive(hz)? })
 }
 
-/// Time between two measurements of the vibration, s.
+/// Interval between measurements of the vibration, s.
 const VIBRATION_EVERY_S: f64 = 0.05;
 
-/// A simulated rig that measures.
+/// A simulated rig with its measurements.
 pub struct Measuring {
     simulator: Simulator,
     tone: Option<Tone>,
@@ -69,17 +69,17 @@ pub struct Measuring {
 }
 
 impl Measuring {
-    /// The conditions every `period`, and the vibration now and then where that is wanted.
+    /// A rig that measures the operating point every `period` and, if requested, the vibration.
     pub fn new(simulator: Simulator, vibration: VibrationOption, period: Duration) -> Self {
         Self { simulator, tone: vibration.tone, period_s: period.as_secs_f64() }
     }
 
-    /// When a measurement is due, s since the start.
+    /// Time of a measurement, s since the start.
     pub fn time_s(&self, seq: u32) -> f64 {
         self.period_s * f64::from(seq)
     }
 
-    /// What is measured then, as messages.
+    /// The messages of a measurement.
     pub fn measure(&mut self, seq: u32, stamp_ns: i64) -> (OperatingPoint, Option<Vibration>) {
         let time_s = self.time_s(seq);
         let header = Header { stamp: Time::from_ns(stamp_ns), frame_id: simulator::FRAME_ID.to_owned() };
@@ -101,10 +101,10 @@ impl Measuring {
     }
 }
 
-/// The highest rate of measurements, 1/s.
+/// Highest rate of measurements, 1/s.
 const MAX_RATE_HZ: f64 = 1e5;
 
-/// A rate of measurements in 1/s, for clap.
+/// Parses a rate of measurements in 1/s, for clap.
 pub fn rate_hz(text: &str) -> Result<f64, String> {
     let rate = finite(text)?;
     if rate > 0.0 && rate <= MAX_RATE_HZ {
@@ -114,7 +114,7 @@ pub fn rate_hz(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Time between measurements at a [`rate_hz`].
+/// Time between measurements at a rate in 1/s.
 pub fn period(rate_hz: f64) -> Duration {
     Duration::from_secs_f64(1.0 / rate_hz)
 }
@@ -136,7 +136,7 @@ impl Options {
                 let vibration = vibration.map(|vibration| Measured::at_its_stamp(Quantity::Vibration(vibration)));
                 vibration.into_iter().chain([Measured::at_its_stamp(Quantity::Conditions(conditions))])
             });
-            // A simulator is not asked twice: nothing is known ahead.
+            // A simulation cannot be run twice, so no inputs are known in advance.
             let predicted = offline::record(&rig, None, std::iter::empty(), measured, directory)?;
             note!("{}", predicted.directory.display());
             return Ok(Outcome::Done);

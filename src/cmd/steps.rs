@@ -1,5 +1,5 @@
-//! Progress of long work, on standard error: bars with the time left on a terminal, plain lines elsewhere, nothing
-//! with `--quiet`.
+//! Progress of long computations on standard error: bars with the remaining time on a terminal, plain lines elsewhere,
+//! nothing with `--quiet`.
 
 use std::io::{IsTerminal, Write};
 
@@ -11,7 +11,7 @@ use crate::io::memory::resident_bytes;
 use crate::reduction::{FullProgress, GIB};
 use crate::terminal::printable;
 
-/// A plain line is written each time such a fraction of a step is done.
+/// A plain line is written each time one of this many parts of a step is done.
 const PLAIN_PARTS: usize = 4;
 
 /// How much a command says about its progress.
@@ -23,7 +23,7 @@ pub struct ProgressOptions {
 }
 
 impl ProgressOptions {
-    /// Progress of `tasks` tasks that run side by side; the time counts from now.
+    /// Progress of `tasks` simultaneous tasks; time is measured from now.
     pub fn steps(self, tasks: usize) -> Steps {
         let shown = match (self.quiet, std::io::stderr().is_terminal()) {
             (true, _) => Shown::Nothing,
@@ -41,7 +41,7 @@ enum Shown {
     Nothing,
 }
 
-/// The step a task is at.
+/// The current step of a task.
 struct Step {
     what: String,
     done: usize,
@@ -49,7 +49,7 @@ struct Step {
     bar: ProgressBar,
 }
 
-/// The progress of some tasks that run side by side.
+/// Progress of several simultaneous tasks.
 pub struct Steps {
     shown: Shown,
     started_ns: u64,
@@ -61,7 +61,7 @@ impl Steps {
         Self { shown, started_ns: monotonic_ns(), tasks: (0..tasks).map(|_| None).collect() }
     }
 
-    /// A line that stays. That it cannot be written is no error: nothing depends on it.
+    /// Writes a permanent line. Errors are ignored, because nothing depends on it.
     pub fn say(&mut self, text: &str) {
         let seconds = monotonic_ns().saturating_sub(self.started_ns) as f64 / 1e9;
         let memory = resident_bytes().map_or("      ?".to_owned(), |bytes| format!("{:7.2}", bytes as f64 / GIB));
@@ -73,7 +73,7 @@ impl Steps {
         }
     }
 
-    /// `task` has done `done` of `of` parts of the step `what`.
+    /// Reports that `task` has done `done` of `of` parts of the step `what`.
     pub fn at(&mut self, task: usize, what: &str, done: usize, of: usize) {
         let part = |done: usize, of: usize| done * PLAIN_PARTS / of.max(1);
         if self.tasks[task].as_ref().is_some_and(|before| before.what != what || before.of != of) {
@@ -93,14 +93,14 @@ impl Steps {
         }
     }
 
-    /// `task` has ended its step.
+    /// Reports that `task` has finished its step.
     pub fn done(&mut self, task: usize) {
         if let Some(step) = self.tasks[task].take() {
             step.bar.finish_and_clear();
         }
     }
 
-    /// The progress of the solution of a full model for the purpose `what`, as the first task.
+    /// Reports the progress of solving a full model for the purpose `what`, as the first task.
     pub fn full(&mut self, what: &str, step: FullProgress) {
         let hz = |omega: f64| omega / std::f64::consts::TAU;
         match step {
@@ -122,7 +122,7 @@ impl Steps {
     }
 }
 
-/// The bar of a step: what is done, how much of it, for how long, and the time left.
+/// The progress bar of a step: name, progress, elapsed and remaining time.
 fn styled(what: &str, of: usize) -> ProgressBar {
     let style = ProgressStyle::with_template("{msg} [{bar:24}] {pos}/{len}, {elapsed}, {eta} left");
     let style = style.map_or_else(|_| ProgressStyle::default_bar(), |style| style.progress_chars("#>."));
@@ -143,7 +143,7 @@ mod tests {
 
     use super::*;
 
-    /// A sink that another place reads.
+    /// A writer whose output is read elsewhere.
     struct Sink(Sender<String>);
 
     impl Write for Sink {

@@ -36,7 +36,7 @@ struct Range {
     step: f64,
 }
 
-/// The most steps of a sweep.
+/// Largest number of steps of a sweep.
 const MAX_STEPS: f64 = 1e6;
 
 impl std::str::FromStr for Range {
@@ -58,7 +58,7 @@ impl std::str::FromStr for Range {
 }
 
 impl Range {
-    /// Each value by itself, so that rounding does not add up.
+    /// Each value is computed on its own, so that rounding errors do not accumulate.
     fn values(self) -> impl Iterator<Item = f64> {
         let count = ((self.to - self.from) / self.step + 1e-9).floor() as usize;
         (0..=count).map(move |k| self.from + k as f64 * self.step)
@@ -99,21 +99,22 @@ impl Options {
 /// A mode at a friction coefficient.
 type Swept = (f64, Mode);
 
-/// How far outside a window of instability its end is drawn.
+/// Distance from a window at which the stable side of its end is drawn.
 const BESIDE: f64 = 1e-6;
 
-/// What was swept.
+/// Result of a sweep.
 struct Sweep {
     modes: Vec<Swept>,
-    /// The modes just outside the windows, where growth has not begun: without them a coarse line rises too early.
+    /// The modes just outside the windows, where they are still stable. Without them a coarse line would rise too
+    /// early.
     beside_ends: Vec<Swept>,
     windows: Vec<Window>,
 }
 
-/// Every mode of the band at every friction coefficient of the range, and the windows of instability if asked for.
+/// All modes of the band at every friction coefficient of the range, and the windows of instability if requested.
 fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<Sweep> {
     let mut solver = Solver::new(rig.model.dimension());
-    // At least over what a session searches, so that modes are numbered as there.
+    // At least the range that a session searches, so that identities are the same.
     let searched = map_options(rig);
     let (mu_min, mu_max) = (range.from.min(searched.mu_min), range.to.max(searched.mu_max));
     let followed = MapOptions { mu_min, mu_max, windows, ..searched };
@@ -124,7 +125,8 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
         let summary = Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold);
         Ok(summary.modes.into_iter().map(|mode| (mu, mode)).collect())
     };
-    // One thread for a solve, many solves at once: each condition by itself is the same wherever it is solved.
+    // Each solve uses one thread and many run at once: the result at one friction coefficient does not depend on the
+    // others.
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let share = values.len().div_ceil(threads).max(1);
     let sweep_part = |part: &[f64]| {
@@ -188,7 +190,7 @@ mod tests {
         let Sweep { modes, beside_ends, windows } = sweep(&rig, &rig.reference, range, true).unwrap();
         assert!(!windows.is_empty());
         for window in &windows {
-            // What is drawn between the last step before the window and its end: no growth worth a pixel.
+            // Check between the last step before a window and its beginning: no visible growth is drawn there.
             let last = |swept: &&Swept| swept.0 < window.mu_from;
             let grows = |swept: &Swept| swept.1.root.growth_rate_per_s() / swept.1.root.lambda.norm();
             let before: Vec<&Swept> = beside_ends.iter().filter(last).collect();

@@ -10,9 +10,9 @@ use crate::certificate::{Against, Verified, WindowEnds, verify_against};
 use crate::full_model::FullModelFile;
 use crate::rig::Rig;
 
-/// Relative error of an eigenvalue that is agreement where nothing else is known.
+/// Default tolerance: relative error of an eigenvalue up to which rig and full model agree.
 const TOLERANCE: f64 = 0.01;
-/// Difference of an end of a window of instability that is agreement, unless more is allowed.
+/// Default difference up to which window ends of rig and full model agree.
 const FRICTION_TOLERANCE: f64 = 0.003;
 
 /// Compare a reduced rig with the full model it stands for

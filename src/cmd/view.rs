@@ -29,10 +29,10 @@ pub struct Options {
     display: DisplayOptions,
 }
 
-/// Reads a recording for people, with its own rig or the one given; `criteria` say what squeal is in a measured vibration.
+/// Reads a recording for display, with its own rig or the one given. `criteria` define squeal in a measured vibration.
 ///
 /// # Errors
-/// No prediction in it, or no rig.
+/// The recording contains no prediction or no rig.
 pub fn read(path: &Path, recording: &Recording, rig: Option<&str>, criteria: Criteria) -> anyhow::Result<Recorded> {
     if recording.topics().name_of(Topic::Prediction).is_none() {
         return Err(without_predictions(path, recording));
@@ -57,7 +57,7 @@ impl Options {
         let recorded = read(&path, &recording, self.rig.as_deref(), self.criteria.criteria())?;
         let (stop, stopped) = bounded::<()>(1);
         signals::on_stop(move || {
-            // Nobody waits any more: it has stopped.
+            // The receiver may have gone: the command has then stopped already.
             let _ = stop.send(());
         })?;
         let server = display::serve(&addresses, Arc::new(recorded))?;

@@ -1,4 +1,4 @@
-//! What `run`, `demo` and `replay` show: a live table on a terminal, log lines when piped.
+//! The view of `run`, `demo` and `replay`: a live table on a terminal, log lines otherwise.
 
 mod view;
 
@@ -17,38 +17,38 @@ use crate::node::{Snapshot, Watch};
 use crate::notes::Hold;
 use view::View;
 
-/// Time between two looks.
+/// Interval between updates of the table.
 const EVERY: Duration = Duration::from_millis(100);
-/// Time between log lines while the status stays.
+/// Interval between log lines while the status does not change.
 const LOG_EVERY: Duration = Duration::from_secs(5);
-/// Rows that Page Up and Page Down scroll by.
+/// Number of rows that Page Up and Page Down scroll.
 const PAGE_ROWS: isize = 10;
 
-/// What of the view is not in its [`Watch`].
+/// Contents of the view that are not in its [`Watch`].
 pub struct Frame {
-    /// Name of what is shown, and whether it is simulated; then where the page is. What does not fit is left out.
+    /// The name of what is shown, whether it is simulated, and the address of the page. What does not fit is omitted.
     pub title: Vec<String>,
-    /// A mode whose damping ratio is below the negative of this grows.
+    /// A mode is unstable if its damping ratio is below the negative of this value.
     pub instability_threshold: f64,
-    /// What is listened to; `None` where nothing is waited for.
+    /// Where inputs are expected; `None` if no inputs are awaited.
     pub inputs: Option<InputSources>,
     /// The last line.
     pub foot: Box<dyn Fn(&Snapshot) -> Vec<String> + Send>,
-    /// A key asks for the end.
+    /// Called when a key requests the end.
     pub quit: Box<dyn Fn() + Send>,
 }
 
-/// A view that runs beside the node.
+/// A view that runs on its own thread.
 pub struct Shown {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<()>,
 }
 
 impl Shown {
-    /// Ends the view and gives the terminal back.
+    /// Ends the view and restores the terminal.
     pub fn stop(self) {
         self.stop.store(true, Ordering::Relaxed);
-        // Writing to a terminal or a pipe that nobody reads does not end: it is not waited for longer than this.
+        // Writing to a terminal or pipe that nobody reads may never return, so the waiting time is limited.
         let deadline = Instant::now() + 3 * EVERY;
         while !self.thread.is_finished() && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(5));
@@ -56,8 +56,8 @@ impl Shown {
     }
 }
 
-/// Shows what `watch` sees until stopped; the keys q, Esc and Ctrl-C quit, arrows and page keys scroll. Where the terminal
-/// refuses, log lines.
+/// Shows what `watch` contains until stopped. The keys q, Esc and Ctrl-C quit; arrow and page keys scroll. Log lines
+/// are written if the terminal cannot be used.
 pub fn show(around: Frame, watch: Watch, plain: bool) -> Shown {
     let stop = Arc::new(AtomicBool::new(false));
     let stopped = stop.clone();
@@ -83,7 +83,7 @@ pub fn show(around: Frame, watch: Watch, plain: bool) -> Shown {
                     (around.quit)();
                     break false;
                 }
-                // The terminal is gone or no terminal: the node is not.
+                // The terminal is gone or was not one; the node continues.
                 Ok(Asked::Nothing | Asked::Scroll(_)) | Err(_) => break true,
             }
         };
@@ -96,15 +96,15 @@ pub fn show(around: Frame, watch: Watch, plain: bool) -> Shown {
     Shown { stop, thread }
 }
 
-/// What a key asks for.
+/// The request of a key.
 enum Asked {
     Nothing,
     Quit,
-    /// Down by so many rows.
+    /// Scroll down by this number of rows.
     Scroll(isize),
 }
 
-/// Waits for a key for one look's time.
+/// Waits for a key for the time between two updates.
 fn asked() -> std::io::Result<Asked> {
     if !event::poll(EVERY)? {
         return Ok(Asked::Nothing);
@@ -124,12 +124,12 @@ fn asked() -> std::io::Result<Asked> {
     })
 }
 
-/// A line whenever the status changes, and now and then.
+/// Writes a log line whenever the status changes, and at regular intervals.
 fn log(around: &Frame, watch: &Watch, stopped: &AtomicBool) {
     let mut last: Option<(Status, Instant)> = None;
     let mut stopping = false;
     let mut problem = None;
-    // A last look after the end: a short session says something too.
+    // One more line after the end, so that a short session is logged too.
     while !std::mem::replace(&mut stopping, stopped.load(Ordering::Relaxed)) {
         if !stopping {
             std::thread::sleep(EVERY);
@@ -141,20 +141,20 @@ fn log(around: &Frame, watch: &Watch, stopped: &AtomicBool) {
         }
         let said = snapshot.assessment();
         let again = match said.status {
-            // It is said once, unless something else came between.
+            // Logged once, unless the status changes in between.
             Status::Waiting | Status::NoData => Duration::MAX,
             Status::Ok | Status::Warn | Status::Squeal | Status::Fault => LOG_EVERY,
         };
         let due = last.is_none_or(|(status, at)| status != said.status || at.elapsed() >= again);
         if due {
             last = Some((said.status, Instant::now()));
-            // Nobody reading is no reason to end a node.
+            // A closed reader does not end the node.
             let _ = super::print(&format!("{}\n", line(&said, &snapshot, around.inputs.as_ref())));
         }
     }
 }
 
-/// The status in one line: when, under which conditions, what is predicted.
+/// The status in one line: time, conditions and prediction.
 fn line(said: &Assessment, snapshot: &Snapshot, inputs: Option<&InputSources>) -> String {
     let waits = said.status == Status::Waiting;
     let prediction = snapshot.prediction.as_ref().filter(|_| !waits);

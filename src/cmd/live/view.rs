@@ -1,4 +1,4 @@
-//! The live table as it is drawn: what is said first, then the modes, the fastest growing first.
+//! Draws the live table: the assessment first, then the modes in descending order of growth rate.
 
 use ratatui::layout::{Constraint, Layout};
 use ratatui::style::{Color, Modifier, Style, Stylize};
@@ -11,21 +11,21 @@ use crate::node::status::{Assessment, Status};
 use crate::number::{above_error, significant};
 use crate::wire::Mode;
 
-/// Rows that the table of modes keeps, its border and its header included, however much there is to say above it.
+/// Number of rows reserved for the table of modes, including border and header, however long the text above it is.
 const LEAST_TABLE: u16 = 5;
 
-/// One look.
+/// The content of one update.
 pub struct View<'a> {
     pub around: &'a Frame,
     pub snapshot: &'a Snapshot,
     /// The latest line for standard error.
     pub note: Option<&'a str>,
-    /// The first of the modes that scroll.
+    /// Index of the first scrolling mode shown.
     pub first_row: usize,
 }
 
 impl View<'_> {
-    /// Draws it; the first row that could be shown.
+    /// Draws the view; returns the first row that could be shown.
     pub fn draw(&self, frame: &mut ratatui::Frame<'_>) -> usize {
         let area = frame.area();
         let inner = usize::from(area.width.saturating_sub(2));
@@ -51,7 +51,7 @@ impl View<'_> {
         first_row
     }
 
-    /// What is said first, in lines of at most `width` characters; no number is cut in two.
+    /// The assessment in lines of at most `width` characters; numbers are not split.
     fn head(&self, said: &Assessment, width: usize) -> Vec<Line<'static>> {
         let badge = format!(" {} ", said.status.name());
         let style = Style::new().fg(colour(said.status)).add_modifier(Modifier::BOLD | Modifier::REVERSED);
@@ -94,7 +94,7 @@ impl View<'_> {
         lines
     }
 
-    /// The modes, those that grow always in sight; and the first row that could be shown.
+    /// The table of modes, in which unstable modes are always visible, and the first row that could be shown.
     fn table(&self, status: Status, width: u16, height: u16) -> (Table<'static>, usize) {
         let modes =
             self.snapshot.prediction.as_ref().filter(|_| status.is_known()).map_or(&[][..], |found| &found.modes);
@@ -102,7 +102,7 @@ impl View<'_> {
         let modes = by_growth(modes);
         let growing = modes.iter().take_while(|mode| grows(mode)).count();
         let room = usize::from(height.saturating_sub(3));
-        // Where not even those that grow have room, they scroll.
+        // If there is not enough space for all unstable modes, they scroll too.
         let fixed = if growing < room { growing } else { 0 };
         let (fixed, scrolled) = modes.split_at(fixed);
         let room = room - fixed.len();
@@ -134,7 +134,7 @@ impl View<'_> {
     }
 }
 
-/// Colours that people who cannot tell red from green can tell apart; the name of the status is there without any.
+/// Colours that can be told apart with red-green blindness; the name of the status is always shown too.
 fn colour(status: Status) -> Color {
     match status {
         Status::Ok => Color::Cyan,
@@ -149,13 +149,13 @@ fn colour(status: Status) -> Color {
 struct Column {
     title: &'static str,
     width: u16,
-    /// Its text for a mode, which grows or does not.
+    /// The text for a mode; the flag says whether the mode is unstable.
     text: fn(&Mode, bool) -> String,
 }
 
-/// The columns, in the order of their importance: where there is no room the last are left out.
+/// The columns in order of importance: if space is short, the last are omitted.
 static COLUMNS: [Column; 7] = [
-    // A mark, so that those that grow are known without colour.
+    // Unstable modes have a mark, so that they are recognised without colour.
     Column { title: "mode", width: 6, text: |mode, grows| format!("{}{}", if grows { "! " } else { "" }, mode.id) },
     Column { title: "frequency Hz", width: 12, text: |mode, _| significant(mode.frequency_hz, 7) },
     Column {
@@ -176,7 +176,7 @@ static COLUMNS: [Column; 7] = [
     Column { title: "+- 1/s", width: 8, text: |mode, _| error(mode.growth_rate_error_per_s) },
 ];
 
-/// The bound of an error says its order of magnitude.
+/// An error bound, rounded to its order of magnitude.
 fn error(bound: f64) -> String {
     match bound {
         0.0 => "0".to_owned(),
@@ -185,12 +185,12 @@ fn error(bound: f64) -> String {
     }
 }
 
-/// A share to a thousandth.
+/// A share, rounded to a thousandth.
 fn share(value: f64) -> String {
     if value.is_finite() { format!("{value:.3}") } else { "-".to_owned() }
 }
 
-/// The columns that fit into `width`, whole.
+/// The columns that fit into `width` completely.
 fn columns(width: u16) -> &'static [Column] {
     let mut used = 0;
     let fits = |column: &&Column| {
@@ -201,12 +201,13 @@ fn columns(width: u16) -> &'static [Column] {
     &COLUMNS[..count.max(1)]
 }
 
-/// Whether a growth rate is within the bound of its own error.
+/// Whether a growth rate is within its own error bound.
 fn is_noise(mode: &Mode) -> bool {
     mode.growth_rate_per_s.abs() <= mode.growth_rate_error_per_s
 }
 
-/// The modes by growth rate, the fastest first; what is rounding noise counts as 0, and equals ascend in frequency.
+/// The modes in descending order of growth rate. Growth rates within their error bound count as 0; equal ones are in
+/// ascending order of frequency.
 fn by_growth(modes: &[Mode]) -> Vec<&Mode> {
     let growth = |mode: &Mode| if is_noise(mode) { 0.0 } else { mode.growth_rate_per_s };
     let mut sorted: Vec<&Mode> = modes.iter().collect();
@@ -214,13 +215,14 @@ fn by_growth(modes: &[Mode]) -> Vec<&Mode> {
     sorted
 }
 
-/// A text in lines of at most `width` characters, the first of them after `used` characters, cut between words.
+/// Splits a text between words into lines of at most `width` characters; the first line starts after `used` characters.
 fn wrapped(text: &str, used: usize, width: usize) -> Vec<String> {
     let words: Vec<String> = text.split_whitespace().map(str::to_owned).collect();
     packed(&words, " ", used, width)
 }
 
-/// Items in lines of at most `width` characters, the first of them after `used` characters; none is cut.
+/// Distributes items over lines of at most `width` characters without splitting any; the first line starts after `used`
+/// characters.
 fn packed(items: &[String], gap: &str, used: usize, width: usize) -> Vec<String> {
     let mut lines: Vec<String> = vec![];
     for item in items {
@@ -235,7 +237,7 @@ fn packed(items: &[String], gap: &str, used: usize, width: usize) -> Vec<String>
     lines
 }
 
-/// How many of `items` fit into `width` characters, one after another.
+/// Number of `items` that fit into `width` characters one after another.
 fn fitting(items: &[String], gap: &str, width: usize) -> usize {
     let mut used = 0;
     let fits = |item: &&String| {
@@ -256,7 +258,7 @@ pub mod tests {
     use crate::node::status::InputSources;
     use crate::wire::{Header, OperatingPoint, Prediction, Time, level};
 
-    /// What a node shows at each status: 57 modes, of which the two that grow fastest are the 2nd and the 16th.
+    /// What a node shows at each status: 57 modes, of which the 2nd and the 16th grow fastest.
     pub fn snapshot(status: Status) -> Snapshot {
         let watch = Watch::default();
         let header = Header { stamp: Time { sec: 1_700_000_000, nanosec: 250_000_000 }, ..Header::default() };
@@ -346,7 +348,7 @@ pub mod tests {
         }
     }
 
-    /// The lines of the terminal, what has which colour, and the first row.
+    /// The lines of the terminal, the buffer with colours, and the first row.
     fn drawn(status: Status, width: u16, height: u16, first_row: usize) -> (Vec<String>, Buffer, usize) {
         let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a terminal in memory");
         let (around, snapshot) = (frame(), snapshot(status));
