@@ -132,11 +132,11 @@ impl Node {
             match entry.message {
                 Recorded::Known(Payload::OperatingPoint(input)) if input.seq < FIRST_OVER_ROS => inputs.push(input.seq),
                 Recorded::Known(Payload::OperatingPoint(input)) => over_ros2.push(input.seq),
-                Recorded::Known(Payload::Prediction(answer)) if answer.input_seq < FIRST_OVER_ROS => {
-                    // The note of a silence is no answer to an input.
-                    if !answer.reason.starts_with("stale") {
-                        answers.push(answer.input_seq);
-                    }
+                // The note of a silence is no answer to an input.
+                Recorded::Known(Payload::Prediction(answer))
+                    if answer.input_seq < FIRST_OVER_ROS && !answer.reason.starts_with("stale") =>
+                {
+                    answers.push(answer.input_seq);
                 }
                 Recorded::Known(Payload::Diagnostics(array)) => {
                     states.extend(array.status.into_iter().find(|status| status.name.ends_with("predictions")));

@@ -278,6 +278,9 @@ fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
     }
 }
 
+/// What a channel was found to be: one of our topics, another that is not read, or one that cannot be read.
+type Judgement = Result<Option<Topic>, Unread>;
+
 /// Iterator over the readable messages of a [`Recording`].
 #[derive(Debug)]
 pub struct Messages<'a> {
@@ -286,7 +289,7 @@ pub struct Messages<'a> {
     batches: Receiver<Batch>,
     raw: VecDeque<RawMessage>,
     /// What each channel was found to be. Comparing its fields for every message would take most of the time.
-    judged: Vec<(Arc<Channel>, Result<Option<Topic>, Unread>)>,
+    judged: Vec<(Arc<Channel>, Judgement)>,
     /// Number of messages that could not be decoded, and the error of the first.
     undecoded: Option<(u64, String)>,
     damage: Vec<FileDamage>,

@@ -53,6 +53,9 @@ pub struct RosArgs {
     sources: Vec<ParameterSource>,
 }
 
+/// Parameters by name.
+type Values = Vec<(String, f64)>;
+
 impl RosArgs {
     /// Separates the ROS arguments from a command line: those between each `--ros-args` and the next `--` or the end.
     /// Returns them and the remaining arguments, which are for the program itself.
@@ -139,7 +142,7 @@ impl RosArgs {
         declared: &[(&str, f64)],
         namespace: &str,
         node: &str,
-    ) -> Result<(Vec<(String, f64)>, Vec<String>), RosArgsError> {
+    ) -> Result<(Values, Vec<String>), RosArgsError> {
         let mut values: Vec<(String, f64)> = declared.iter().map(|&(name, value)| (name.to_owned(), value)).collect();
         let mut ignored = Vec::new();
         let mut set = |name: String, value: String| {

@@ -24,6 +24,9 @@ const LOG_EVERY: Duration = Duration::from_secs(5);
 /// Number of rows that Page Up and Page Down scroll.
 const PAGE_ROWS: isize = 10;
 
+/// The sentences of the last line.
+pub type Foot = Box<dyn Fn(&Snapshot) -> Vec<String> + Send>;
+
 /// Contents of the view that are not in its [`Watch`].
 pub struct Frame {
     /// The name of what is shown, whether it is simulated, and the address of the page. What does not fit is omitted.
@@ -33,7 +36,7 @@ pub struct Frame {
     /// Where inputs are expected; `None` if no inputs are awaited.
     pub inputs: Option<InputSources>,
     /// The last line.
-    pub foot: Box<dyn Fn(&Snapshot) -> Vec<String> + Send>,
+    pub foot: Foot,
     /// Called when a key requests the end.
     pub quit: Box<dyn Fn() + Send>,
 }

@@ -47,12 +47,15 @@ const START_WITHIN: Duration = Duration::from_secs(10);
 /// Bytes kept of the end of its standard error.
 const MAX_LAST_WORDS: usize = 500;
 
+/// Takes the name and the value of a parameter.
+type ParameterSink = Box<dyn FnMut(&str, f64) + Send>;
+
 /// Callbacks for what the ROS 2 side receives. They run on a thread that must not block.
 pub struct Sinks {
     pub input: Box<dyn FnMut(Heard<OperatingPoint>) + Send>,
     pub vibration: Box<dyn FnMut(Heard<Vibration>) + Send>,
     /// A peer set a parameter.
-    pub parameter: Box<dyn FnMut(&str, f64) + Send>,
+    pub parameter: ParameterSink,
     /// The ROS 2 side failed, and why; it is being restarted.
     pub fell: Box<dyn FnMut(&str) + Send>,
 }
