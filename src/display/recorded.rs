@@ -35,7 +35,7 @@ const MAPS: usize = 8;
 /// One prediction with its input.
 #[derive(Clone, Debug)]
 pub struct Moment {
-    /// Time according to the stamps; see [`TimeLine`].
+    /// Time according to the stamps; see `TimeLine`.
     pub time_ns: i64,
     pub input: Option<OperatingPoint>,
     pub prediction: Prediction,

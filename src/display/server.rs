@@ -1,7 +1,7 @@
 //! Serves a [`Source`] to browsers: HTTP/1.1, GET only, with one stream of states.
 //!
 //! Runs on its own thread. A state is encoded once for all pages, at most 30 times a second. A page that reads too
-//! slowly misses states. [`connections`] limits what clients can use. No request changes anything.
+//! slowly misses states. `connections` limits what clients can use. No request changes anything.
 
 use std::convert::Infallible;
 use std::io;

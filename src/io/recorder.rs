@@ -137,7 +137,7 @@ pub struct Status {
     pub longest_stall: Duration,
     /// The latest error, even if recording has resumed since.
     pub last_error: Option<String>,
-    /// Files cut short by a failure; [`recover`](super::recover) finishes them.
+    /// Files cut short by a failure; `recover` finishes them.
     pub interrupted: Vec<PathBuf>,
     /// Interrupted recordings in the record directory: those that were repaired, and the errors of those that were not.
     pub recovered: Vec<Recovery>,
