@@ -348,6 +348,8 @@ fn at_size_the_first_20_frequencies_are_those_of_calculix() {
 fn the_full_tribometer_is_solved() {
     let folder = tempfile::tempdir().unwrap();
     let path = text(&tribometer(folder.path(), 5000));
+    let with_limits = std::fs::read_to_string(&path).unwrap() + "\n[limits]\nfriction_coefficient = [-1.0, 1.0]\n";
+    std::fs::write(&path, with_limits).unwrap();
     let started = std::time::Instant::now();
     let at_rest = program::json(["full", &path, "--mu", "0", "--band-hz", "5000", "--json"]);
     eprintln!("solved in {:.1} s", started.elapsed().as_secs_f64());

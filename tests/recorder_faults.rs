@@ -262,11 +262,14 @@ fn a_disk_that_is_full_at_the_start_is_recorded_to_when_it_is_not() {
     until("the inputs to be lost", || (recorder.status().dropped() == 10).then_some(()));
     disk.0.store(1 << 30, Ordering::SeqCst);
     until("a recording", || (recorder.status().state == State::Recording).then_some(()));
+    // The answer to an input that is lost: nothing could verify it.
+    recorder.record(prediction(9, T0 + 9));
     (10..20).for_each(|seq| assert!(recorder.record(point(seq, T0 + seq))));
     let finished = recorder.finish(LIMIT).unwrap();
     let entries = read(&finished.directory);
     assert_eq!(sequence_numbers(&entries), (10..20).collect::<Vec<_>>());
-    assert_eq!(finished.status.dropped(), 10, "settings and rig are not lost");
+    assert_eq!(finished.status.dropped(), 11, "settings and rig are not lost");
+    assert!(!entries.iter().any(|entry| matches!(known(entry), Some(Payload::Prediction(_)))));
     let first: Vec<_> = entries.iter().take(2).map(|entry| known(entry).cloned().unwrap()).collect();
     assert_eq!(first, [rig_info().payload, setting("warn_margin", 0.2, 2).payload]);
 

@@ -181,6 +181,11 @@ impl Worker {
                 self.resume();
             }
         }
+        if self.file.is_some() && self.begins && topic == Topic::Prediction {
+            // Its input came before the file could be written: without it the prediction cannot be verified.
+            self.shared.dropped_failed.fetch_add(1, Relaxed);
+            return;
+        }
         if self.file.is_some() && std::mem::take(&mut self.begins) {
             self.repeat(message.log_time_ns);
         }
