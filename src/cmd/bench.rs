@@ -11,46 +11,46 @@ use crate::bench::{HeldOut, Kind, Offline, Plan, Route, measure};
 use crate::physics::stress;
 use crate::plot;
 
-/// Measure run time against error of every route to a prediction, on synthetic rigs
+/// Measure run time and error of every route to a prediction, on synthetic rigs
 #[derive(Debug, Args)]
 pub struct Options {
-    /// Numbers of modes; 490 takes minutes more
+    /// Numbers of modes; 490 takes minutes longer
     #[arg(long, value_name = "N,N", value_delimiter = ',', default_value = "20,80,160,490", value_parser = clap::value_parser!(u16).range(4..=2000))]
     modes: Vec<u16>,
-    /// What the rigs are like
+    /// Kind of rigs
     #[arg(long, value_enum, default_value = "undamped")]
     rig: Kind,
-    /// Conditions: friction 0 to 1, 50 to 2000 N, 1 to 60 rad/s, one in ten within 1e-6 of a merging point
+    /// Number of conditions: friction 0 to 1, 50 to 2000 N, 1 to 60 rad/s, one in ten within 1e-6 of a merging point
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u32).range(1..))]
     conditions: u32,
-    /// Modes of each condition that are compared with roots to thirty digits
+    /// Modes of each condition that are compared with roots computed to thirty digits
     #[arg(long, value_name = "N", default_value_t = 2)]
     compared: usize,
-    /// Random conditions at which every root of the chart is held against a dense solve, and each bound against the error
+    /// Random conditions at which every root of the chart, with its error bound, is compared with a dense solve
     #[arg(long, value_name = "N", default_value_t = 0)]
     held_out: usize,
     /// Contact pairs of the rigs
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(1..))]
     pairs: u16,
-    /// The same seed gives the same rigs and conditions; rigs are drawn from it on until one has merging points
+    /// Seed of rigs and conditions; rigs are drawn from it until one has merging points
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Modes up to this frequency are charted and compared
     #[arg(long, value_name = "HZ", default_value_t = 5000.0, value_parser = positive)]
     band_max_hz: f64,
-    /// Relative error of the squared eigenvalues that is asked of charts
+    /// Relative tolerance of charts for squared eigenvalues
     #[arg(long, default_value_t = 1e-8, value_parser = positive)]
     tolerance: f64,
-    /// What a chart does not hold by then is solved
+    /// Time limit for building a chart; conditions it does not cover by then are solved
     #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
     chart_limit_s: f64,
-    /// Threads that build charts; single answers are always of one thread
+    /// Threads that build charts; a single prediction always uses one thread
     #[arg(long, value_name = "N", default_value_t = 2, value_parser = clap::value_parser!(u16).range(1..))]
     threads: u16,
-    /// A Python with scipy, whose LAPACK solves the same matrices in turn
+    /// A Python with scipy, whose LAPACK solves the same matrices for comparison
     #[arg(long, value_name = "PYTHON")]
     lapack: Option<PathBuf>,
-    /// Put the numerics to extremes instead, and say what came out
+    /// Run extreme cases instead, and print their results
     #[arg(long)]
     stress: bool,
     /// Write the results as JSON to this file

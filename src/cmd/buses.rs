@@ -12,19 +12,19 @@ use crate::wire::topic;
 /// Which buses to join, and how
 #[derive(Clone, Debug, Args)]
 pub struct BusOptions {
-    /// Stay off ROS 2
+    /// Do not join ROS 2
     #[arg(long)]
     no_ros: bool,
-    /// Stay off shared memory
+    /// Do not join shared memory
     #[arg(long)]
     no_shm: bool,
     /// ROS 2 domain, 0 to 232 [default: ROS_DOMAIN_ID, else 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=232))]
     domain: Option<u16>,
-    /// Announce on 127.0.0.1 only, and hear nothing but the loopback interface
+    /// Announce on 127.0.0.1 only, and receive through the loopback interface only
     #[arg(long)]
     loopback: bool,
-    /// Put this before the names of the shared-memory services
+    /// Prefix of the names of the shared-memory services
     #[arg(long, value_name = "PREFIX", default_value = "")]
     shm_prefix: String,
 }

@@ -4,7 +4,7 @@ use super::{Outcome, RigName, print};
 use crate::full_model::FullModelFile;
 use crate::rig::{Rig, RigError};
 
-/// Validate a rig file or a full model and say what it holds
+/// Validate a rig file or a full model and describe its content
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, full model, or the name of an embedded rig

@@ -10,7 +10,7 @@ use crate::plot;
 use crate::rig::Rig;
 use crate::session::map_options;
 
-/// Find every window of instability in the friction coefficient, its ends to 1e-10
+/// Find every window of instability in the friction coefficient, its ends to within 1e-10
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
@@ -21,7 +21,7 @@ pub struct Options {
     mu_max: Option<f64>,
     #[command(flatten)]
     load_and_speed: LoadAndSpeed,
-    /// Draw growth rates and frequencies over the friction coefficient into this file, windows shaded
+    /// Draw growth rates and frequencies over the friction coefficient into this file, with shaded windows
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
     /// Print JSON

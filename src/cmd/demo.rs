@@ -14,7 +14,7 @@ use crate::node::{self, Incoming};
 use crate::rig::{EMBEDDED, Rig};
 use crate::simulator::{Profile, Simulator};
 
-/// Run the node with a simulated rig: what to try first. It takes no other inputs and is visible on this machine only
+/// Run the node with a simulated rig, to try it out. It takes no other inputs and is visible on this machine only
 #[derive(Debug, Args)]
 #[command(after_help = super::ROS_ARGS_HELP)]
 pub struct Options {

@@ -25,7 +25,7 @@ pub struct DisplayOptions {
     /// Serve no page
     #[arg(long, conflicts_with = "display")]
     no_display: bool,
-    /// Let --display name an address that other machines can reach; anybody there can look
+    /// Let --display name an address that other machines can reach; everybody there can see the page
     #[arg(long, requires = "display")]
     display_anywhere: bool,
 }
@@ -33,7 +33,7 @@ pub struct DisplayOptions {
 /// From which level on a measured vibration counts as squeal.
 #[derive(Clone, Copy, Debug, Args)]
 pub struct ThresholdOption {
-    /// A vibration measured at this level or above is squeal [default: 70]
+    /// A vibration at or above this level counts as squeal [default: 70]
     #[arg(long, value_name = "DB", value_parser = finite, allow_negative_numbers = true)]
     vibration_threshold: Option<f64>,
 }
@@ -50,13 +50,13 @@ impl ThresholdOption {
 pub struct CriteriaOptions {
     #[command(flatten)]
     threshold: ThresholdOption,
-    /// A measured squeal lasts at least this many seconds [default: 0.1]
+    /// Minimum duration of a measured squeal in seconds [default: 0.1]
     #[arg(long, value_name = "S", value_parser = not_negative)]
     vibration_duration: Option<f64>,
-    /// A prediction counts this many seconds before its onset and after its end [default: 0.5]
+    /// A prediction also counts this many seconds before its onset and after its end [default: 0.5]
     #[arg(long, value_name = "S", value_parser = not_negative)]
     time_tolerance: Option<f64>,
-    /// A measured frequency is a predicted one within this share of it [default: 0.05]
+    /// Largest relative difference between a measured and a predicted frequency that match [default: 0.05]
     #[arg(long, value_name = "SHARE", value_parser = not_negative)]
     frequency_tolerance: Option<f64>,
 }

@@ -15,7 +15,7 @@ use crate::reduction::{FullSpectrum, FullVectors};
 
 /// Find the complex eigenvalues of a full model under one set of conditions
 ///
-/// Every root of the band, as far as discs around shifts on the imaginary axis cover it; each with its residual.
+/// Finds every root of the band within discs around shifts on the imaginary axis, each with its residual.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Full model (TOML)
@@ -25,7 +25,7 @@ pub struct Options {
     /// Highest frequency in Hz [default: the model's band, else 5000]
     #[arg(long, value_name = "HZ", value_parser = positive)]
     band_hz: Option<f64>,
-    /// Memory that may be used [default: what the machine has to spare]
+    /// Memory that may be used [default: what is available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Print JSON

@@ -30,7 +30,7 @@ pub struct Options {
     /// Normal load in N [default: the rig's reference]
     #[arg(long, value_name = "N", value_parser = positive)]
     load: Option<f64>,
-    /// Draw the error over the stiffness into this file
+    /// Draw the error over the stiffness factor into this file
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
     /// Print JSON

@@ -6,7 +6,7 @@ use super::Outcome;
 use crate::io::import::{ImportOptions, import};
 use crate::io::tribometer_log::{Field, LogOptions, TribometerLog};
 
-/// Make a recording of a tribometer's log
+/// Convert a tribometer log to a recording
 #[derive(Debug, Args)]
 pub struct Options {
     /// Delimited text with named columns, units in their names
@@ -16,7 +16,7 @@ pub struct Options {
     output: PathBuf,
     #[command(flatten)]
     log: LogArgs,
-    /// Replace a recording of that name
+    /// Replace an existing recording
     #[arg(long)]
     overwrite: bool,
 }
@@ -28,10 +28,10 @@ pub struct LogArgs {
     /// friction_force_n
     #[arg(long = "column", value_name = "QUANTITY=NAME", value_parser = column)]
     columns: Vec<(Field, String)>,
-    /// The decimal sign, instead of finding out
+    /// The decimal sign, instead of detecting it
     #[arg(long, value_name = ", or .", value_parser = decimal)]
     decimal: Option<char>,
-    /// Leave bad lines out instead of refusing the log
+    /// Skip invalid lines instead of refusing the log
     #[arg(long)]
     skip_bad_lines: bool,
 }

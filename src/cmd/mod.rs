@@ -117,7 +117,7 @@ pub fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    let cli = Cli::parse_from(args); // leaves with code 2 on wrong usage
+    let cli = Cli::parse_from(args); // exits with code 2 on wrong usage
     if let Err(error) = signals::survive_file_size_limit() {
         note!("a file that grows beyond its limit will end this: {error}");
     }

@@ -17,8 +17,8 @@ use crate::physics::Chart;
 use crate::rig::Rig;
 use crate::wire::schema::Topic;
 
-/// Predict recorded conditions as fast as possible: bags with operating points, and tribometers' logs. Each becomes a
-/// recording with predictions by the rig's own settings, in its own time
+/// Predict recorded conditions as fast as possible, from recordings with operating points and from tribometer logs. For
+/// each, a recording with predictions is written, with the rig's own settings and the original stamps
 #[derive(Debug, Args)]
 pub struct Options {
     #[command(flatten)]
@@ -26,10 +26,10 @@ pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(long, value_name = "RIG")]
     rig: String,
-    /// Directory to write the recordings into, each into one of its own; it is made where it is missing
+    /// Directory for the recordings, each in its own subdirectory; created if missing
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Chart the rig first, or take the chart that is kept: then each prediction takes microseconds, which pays for long
+    /// Build the chart of the rig first, or load a stored one. Predictions then take microseconds, which pays for long
     /// recordings
     #[arg(long)]
     chart: bool,

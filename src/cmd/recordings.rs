@@ -11,7 +11,7 @@ use crate::wire::schema::Topic;
 /// Which recordings to read, and how
 #[derive(Clone, Debug, Args)]
 pub struct Recordings {
-    /// Recordings: files, directories of the files of one, or folders that hold several
+    /// Recordings: files, directories with the files of one recording, or folders with several
     #[arg(value_name = "RECORDING", required = true)]
     recordings: Vec<PathBuf>,
     #[command(flatten)]
@@ -21,8 +21,8 @@ pub struct Recordings {
 /// Which topics of a recording to read
 #[derive(Clone, Debug, Args)]
 pub struct TopicOptions {
-    /// Read this recorded topic in place of the node's own of its type, such as /brake1/operating_point in place of
-    /// /rig/operating_point; once for each topic
+    /// Read this recorded topic instead of the node's own topic of the same type, such as /brake1/operating_point
+    /// instead of /rig/operating_point; may be repeated
     #[arg(long = "read-topic", value_name = "TOPIC")]
     read_topics: Vec<String>,
 }

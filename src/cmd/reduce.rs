@@ -23,19 +23,19 @@ const CUTOFF: f64 = 2.5;
 
 /// Reduce a full model to a rig file the node can run
 ///
-/// On a basis of the full model's own vectors over a range of conditions, so that every root in the band that grows, or
-/// decays by less than 20 1/s, is within a tolerance; or, with --modes or --cutoff-hz, on the lowest modes of pad and disc,
-/// their contact interface free, and what the modes left out still do at the contact. What is left is compared with the
-/// full model at held-out operating points, which the rig file then says. The
-/// arrays are written beside the rig file under names with their hash, the rig file last.
+/// By default the basis consists of the full model's own vectors over a range of conditions: every root in the band
+/// that grows, or decays by less than 20 1/s, is within a tolerance. With --modes or --cutoff-hz it consists of the
+/// lowest free-interface modes of pad and disc, with the residual flexibility of the truncated modes. The rig is
+/// compared with the full model at held-out operating points, and the rig file contains the result. The arrays are
+/// written beside the rig file under names with their hash, and the rig file last.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Full model
     full: PathBuf,
-    /// Largest relative error of a root on the basis, over the range [default: 1e-6]
+    /// Largest relative error of a root on the basis within the range [default: 1e-6]
     #[arg(long, value_name = "ERROR", value_parser = positive, conflicts_with = "of_modes")]
     tolerance: Option<f64>,
-    /// Conditions the basis holds for [default: those of [search] and [chart]]
+    /// Range of conditions for which the basis is valid [default: those of [search] and [chart]]
     #[arg(long, value_name = "mu=A:B,speed=A:B,load=A:B", value_parser = ranges,
           conflicts_with = "of_modes")]
     range: Option<Ranges>,
@@ -48,13 +48,13 @@ pub struct Options {
     /// Omit residual flexibility: the static response of truncated modes at the contact
     #[arg(long, requires = "of_modes")]
     no_residual: bool,
-    /// Keep residual flexibility between this model's contact pairs only: a twelfth of the size, no other patches
+    /// Store residual flexibility between this model's contact pairs only: a twelfth of the size, but no other patches
     #[arg(long, conflicts_with = "no_residual", requires = "of_modes")]
     compact: bool,
-    /// Held-out operating points at which the rig is compared with the full model; 0 leaves the comparison out
+    /// Held-out operating points at which the rig is compared with the full model; 0 omits the comparison
     #[arg(long, value_name = "N", default_value_t = 3)]
     points: usize,
-    /// Memory that may be used [default: what the machine has to spare]
+    /// Memory that may be used [default: what is available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Rig file to write

@@ -27,23 +27,23 @@ use crate::wire::{Time, event_kind};
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,
-    /// Predict again as fast as possible and compare with what was recorded; exit code 3 where it differs
+    /// Predict again as fast as possible and compare with the recorded predictions; exit code 3 if they differ
     #[arg(long)]
     verify: bool,
     /// With --verify: predict with this rig instead of the recorded one
     #[arg(long, value_name = "RIG", requires = "verify")]
     rig: Option<String>,
-    /// With --verify: chart the rig anew instead of taking the chart that is kept
+    /// With --verify: build the chart anew instead of loading a stored one
     #[arg(long, requires = "verify")]
     no_chart_cache: bool,
-    /// Seconds to wait for a reader before playing, and until no further one has come for half a second; 0 plays at once
+    /// Seconds to wait for a first reader; after it, playing begins once no new one appears for half a second; 0 plays
+    /// at once
     #[arg(long, value_name = "S", value_parser = not_negative, default_value = "5")]
     wait: f64,
     /// Playback speed; 2 plays twice as fast
     #[arg(long, value_name = "R", value_parser = positive, default_value = "1")]
     rate: f64,
-    /// Begin again at the end, until stopped. Stamps go on: from the second round on they are later by the length of the
-    /// rounds before
+    /// Start again at the end, until stopped. Stamps keep increasing: each round adds the length of the previous ones
     #[arg(long = "loop")]
     repeat: bool,
     /// Recorded seconds to skip at the start
@@ -55,7 +55,7 @@ pub struct Options {
     /// Topics to play [default: all of the node's]
     #[arg(long, value_name = "TOPIC", num_args = 1.., value_parser = topics())]
     topics: Vec<String>,
-    /// Print log lines instead of a live table, on a terminal too
+    /// Print log lines instead of a live table, even on a terminal
     #[arg(long)]
     plain: bool,
     #[command(flatten)]

@@ -9,16 +9,15 @@ use super::recordings::Recordings;
 use super::{Outcome, print, view, write_file};
 use crate::display::report::{Origin, report};
 
-/// Write a report of each recording: one HTML file that needs nothing else, and the events as CSV
+/// Write a report of each recording: one self-contained HTML file, and the events as CSV
 #[derive(Debug, Args)]
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,
-    /// Directory to write into; it is made where it is missing. Of several recordings each gets a directory in it, of its
-    /// own name
+    /// Directory for the report, created if missing. With several recordings, each gets a subdirectory of its own name
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Maps of this rig instead of the recorded one
+    /// Use this rig for stability maps instead of the recorded one
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
     #[command(flatten)]

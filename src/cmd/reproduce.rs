@@ -16,16 +16,16 @@ use crate::io::whole_file::remove_begun;
 use crate::reduction::Wanted;
 use crate::reproduce::{Heard, Item, MODES, PartModes, Study, index, nine_dof};
 
-/// Make the paper's tables and figures again: CSV, SVG and one page beside the paper's numbers
+/// Reproduce the paper's tables and figures: CSV, SVG and one page that compares them with the paper's numbers
 ///
-/// Those of its nine-degree-of-freedom models in a second, those of its tribometer, on a full model of this project, in some
-/// minutes. The full model is written into the folder, too.
+/// The results of its nine-degree-of-freedom models take a second. Those of its tribometer, with a full model of this
+/// project, take some minutes. The full model is written to the folder too.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Degrees of freedom of the tribometer, at least; the paper's model has 904968
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = clap::value_parser!(u32).range(5_000..=4_000_000))]
     dof: u32,
-    /// Memory that may be used [default: what the machine has to spare]
+    /// Memory that may be used [default: what is available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Folder to write into

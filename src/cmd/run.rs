@@ -43,13 +43,13 @@ pub struct NodeOptions {
     /// Record the session into a new directory in this one
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
-    /// Solve every condition anew instead of charting the rig in the background
+    /// Solve for every condition instead of building a chart in the background
     #[arg(long)]
     no_chart: bool,
-    /// Neither use nor keep a chart on disk
+    /// Neither load nor store a chart on disk
     #[arg(long)]
     no_chart_cache: bool,
-    /// Print log lines instead of a live table, on a terminal too
+    /// Print log lines instead of a live table, even on a terminal
     #[arg(long)]
     plain: bool,
     #[command(flatten)]

@@ -33,7 +33,7 @@ pub struct Options {
     /// Stop after this many seconds [default: never; with --record after one round of the profile]
     #[arg(long, value_name = "S", value_parser = not_negative)]
     duration: Option<f64>,
-    /// Publish nothing; predict with --rig as fast as possible and record the session into this directory
+    /// Publish nothing; predict with --rig as fast as possible and record the session in this directory
     #[arg(long, value_name = "DIR", requires = "rig")]
     record: Option<PathBuf>,
     /// Rig file, or the name of an embedded rig, for --record
@@ -48,7 +48,7 @@ pub struct Options {
 /// Whether the simulated rig measures its vibration.
 #[derive(Clone, Copy, Debug, Args)]
 pub struct VibrationOption {
-    /// Measure the vibration too, 20 times a second: 95 dB at HZ while friction is above MU, else noise of 50 dB
+    /// Also measure the vibration, 20 times a second: 95 dB at HZ while friction is above MU, else noise of 50 dB
     #[arg(long = "vibration", value_name = "MU:HZ", value_parser = tone)]
     pub tone: Option<Tone>,
 }

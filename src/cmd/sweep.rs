@@ -9,7 +9,7 @@ use crate::plot::{self, Point};
 use crate::rig::Rig;
 use crate::session::map_options;
 
-/// Sweep the friction coefficient, modes followed through crossings and mergings
+/// Sweep the friction coefficient, following modes through crossings and merging points
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig

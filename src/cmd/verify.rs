@@ -15,11 +15,11 @@ const TOLERANCE: f64 = 0.01;
 /// Default difference up to which window ends of rig and full model agree.
 const FRICTION_TOLERANCE: f64 = 0.003;
 
-/// Compare a reduced rig with the full model it stands for
+/// Compare a reduced rig with its full model
 ///
-/// Frequencies and growth rates at operating points drawn from the rig's chart, windows of instability at its reference
-/// and at the corners of that range. Exit code 3 where an unstable mode is missed or invented, or an error exceeds the
-/// tolerance.
+/// Compares frequencies and growth rates at operating points drawn from the rig's chart range, and windows of
+/// instability at its reference and at the corners of that range. Exit code 3 if an unstable mode is missed or
+/// invented, or if an error exceeds the tolerance.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
@@ -31,19 +31,19 @@ pub struct Options {
     /// Held-out operating points
     #[arg(long, value_name = "N", default_value_t = 10)]
     points: usize,
-    /// Which points are drawn; `reduce` compares at those of 1
+    /// Seed of the points; `reduce` uses seed 1
     #[arg(long, value_name = "SEED", default_value_t = 2)]
     seed: u64,
-    /// Largest relative error of an eigenvalue that is agreement [default: what the rig's basis was made for, else 0.01]
+    /// Largest relative error of an eigenvalue [default: the tolerance of the rig's basis, else 0.01]
     #[arg(long, value_name = "R", value_parser = positive)]
     tolerance: Option<f64>,
     /// Highest frequency in Hz [default: the rig's band, else the full model's, else 5000]
     #[arg(long, value_name = "HZ", value_parser = positive)]
     band_hz: Option<f64>,
-    /// Compare roots only: the windows of a large damped model take long
+    /// Compare roots only, since the windows of a large damped model take long
     #[arg(long)]
     no_windows: bool,
-    /// Memory that may be used [default: what the machine has to spare]
+    /// Memory that may be used [default: what is available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Print JSON

@@ -15,12 +15,12 @@ use crate::io::recording::Recording;
 use crate::rig::Rig;
 use crate::wire::schema::Topic;
 
-/// Open a recording in the page, with a time line
+/// Show a recording on the page, with a time line
 #[derive(Debug, Args)]
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,
-    /// Maps and shapes of this rig instead of the recorded one
+    /// Use this rig for maps and shapes instead of the recorded one
     #[arg(long, value_name = "RIG")]
     rig: Option<String>,
     #[command(flatten)]
