@@ -1,4 +1,12 @@
 //! Predicts friction-induced instability of a pad-on-disc tribometer from its operating conditions.
+//!
+//! - [`rig`] reads rig files; [`full_model`] reads the finite-element models that [`reduction`] reduces to rigs.
+//! - [`physics`] computes roots, stability maps, window ends and charts.
+//! - [`session`] turns inputs and session events into predictions, as a pure step; [`settings`] are its parameters.
+//! - [`node`] runs a session on the buses, clocks and files of [`io`], with the messages of [`wire`].
+//! - [`display`] shows a node or a recording; [`cmd`] contains the commands.
+//!
+//! `ARCHITECTURE.md` describes the layers and their invariants.
 
 /// Writes a line to standard error through [`notes::line`].
 macro_rules! note {

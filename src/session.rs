@@ -402,7 +402,7 @@ impl Session {
         let traces = self.traces.at(&self.rig.model, point);
         let (scratch, charted) = (&mut self.scratch, &mut self.charted);
         let Ok(answer) = catch_unwind(AssertUnwindSafe(|| chart.evaluate(point, traces, scratch, charted))) else {
-            self.chart = None; // solved from here on, in a replay as well
+            self.chart = None; // solve from here on; a replay does the same
             return false;
         };
         let Ok(all) = answer else { return false };
@@ -450,7 +450,7 @@ impl Session {
     fn judge(&mut self, friction_margin: Option<f64>) -> u8 {
         let (summary, reason) = (&self.summary, &mut self.prediction.reason);
         let mut because = |text: std::fmt::Arguments<'_>| {
-            let _ = reason.write_fmt(text); // a String takes everything
+            let _ = reason.write_fmt(text); // writing to a String cannot fail
         };
         let Settings { squeal_damping_ratio: begins, squeal_hysteresis, warn_margin, .. } = self.settings;
         let ends = begins + squeal_hysteresis;
@@ -546,7 +546,7 @@ fn publish_modes(modes: &[Mode], order: &mut Vec<usize>, out: &mut Vec<wire::Mod
         let growth = |k: &usize| modes[*k].root.lambda.re;
         order.sort_unstable_by(|a, b| growth(b).total_cmp(&growth(a)).then(a.cmp(b)));
         order.truncate(MAX_MODES);
-        order.sort_unstable(); // they ascend in frequency
+        order.sort_unstable(); // modes are in ascending frequency
     }
     out.clear();
     out.extend(order.iter().map(|&k| {

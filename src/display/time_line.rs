@@ -20,7 +20,7 @@ impl TimeLine {
     /// elapsed log time is used instead.
     pub fn stamped(&mut self, stamp: Time, log_ns: i64) -> i64 {
         if stamp == Time::default() {
-            return self.unstamped(log_ns); // nobody has set it
+            return self.unstamped(log_ns); // the stamp is not set
         }
         let stamp_ns = stamp.as_ns();
         let mut place = stamp_ns.saturating_add(self.shift_ns);

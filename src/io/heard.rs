@@ -59,7 +59,7 @@ impl Counts {
             missed: self.missed + others.missed,
             malformed: self.malformed + others.malformed,
             failures: self.failures + others.failures,
-            incompatible: others.incompatible, // who is known now
+            incompatible: others.incompatible, // not a count: the peers known now
         }
     }
 }

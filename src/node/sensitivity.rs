@@ -83,7 +83,7 @@ pub fn answer(
         let Change::SquareRoot { partner, pair } = root.change else { continue };
         let (first_id, second_id) = (id(root.root).min(id(partner)), id(root.root).max(id(partner)));
         if message.pairs.iter().any(|pair| pair.first_id == first_id) {
-            continue; // told by its other mode
+            continue; // listed with the other mode of the pair
         }
         message.pairs.push(PairSensitivity {
             first_id,

@@ -202,7 +202,7 @@ fn growing(fastest: Option<UnstableMode>, unstable: u32) -> String {
     let (hz, growth) = (significant(mode.frequency_hz, 5), significant(mode.growth_rate_per_s, 3));
     let mut text = format!("mode {} at {hz} Hz grows by {growth} 1/s", mode.id);
     if unstable > 1 {
-        let _ = write!(text, ", the fastest of {unstable}"); // a String takes everything
+        let _ = write!(text, ", the fastest of {unstable}"); // writing to a String cannot fail
     }
     text
 }

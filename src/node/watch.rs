@@ -139,7 +139,7 @@ pub struct VibrationSample {
 }
 
 impl VibrationSample {
-    /// The sample of a vibration heard at `time_ns`.
+    /// The sample of a vibration received at `time_ns`.
     pub fn new(time_ns: i64, vibration: &Vibration) -> Self {
         Self { time_ns, frequency_hz: vibration.frequency_hz, level_db: vibration.level_db }
     }

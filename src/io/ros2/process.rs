@@ -366,7 +366,7 @@ impl Supervisor {
                 Err(error) => return Ok(Some(End::Fell(error.to_string()))),
             }
             if timeouts == 0 {
-                patience = MAX_TIMEOUTS; // the first frame says that it has joined
+                patience = MAX_TIMEOUTS; // any frame means that it has joined
             }
             if timeouts >= patience {
                 let seconds = (patience * READ_TIMEOUT).as_secs();
