@@ -5,11 +5,11 @@
 //! as `/dev/zero`) or exceeds its limit is refused before it is read. Sizes that a file *claims* are checked against
 //! the bytes present before memory is allocated for them. The readers use at most this much memory:
 //!
-//! | file | ceiling | memory of its reader, at most |
+//! | file | size limit | memory of its reader, at most |
 //! |---|---|---|
 //! | rig file, full model, profile (TOML) | [`TOML`] | about 100 times the file; 80 levels of nesting |
 //! | ROS parameter file (YAML) | [`PARAMETERS`] | 64 levels of nesting, no aliases |
-//! | modes and residuals of a rig (`.npz`) | [`RIG_PART`] | its arrays: 64 MiB or 100 times the file, whichever is more, and 1 GiB |
+//! | modes and residuals of a rig (`.npz`) | [`RIG_PART`] | max(64 MiB, 100 times the file), up to 1 GiB |
 //! | modes of a rig (`.unv`, `.uff`) | [`RIG_PART`] | about 10 times the file; lines of 64 KiB |
 //! | matrices of a rig (Matrix Market) | [`RIG_PART`] | about 16 times the file |
 //! | matrices, nodes and rows of a full model | [`FULL_MODEL_PART`] | about 20 times the file; lines of 1 MiB |

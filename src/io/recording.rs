@@ -278,7 +278,7 @@ fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
     }
 }
 
-/// What a channel was found to be: one of our topics, another that is not read, or one that cannot be read.
+/// How a channel is treated: as one of the node's topics, as another program's topic (ignored), or as unreadable.
 type Judgement = Result<Option<Topic>, Unread>;
 
 /// Iterator over the readable messages of a [`Recording`].

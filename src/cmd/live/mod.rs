@@ -24,7 +24,7 @@ const LOG_EVERY: Duration = Duration::from_secs(5);
 /// Number of rows that Page Up and Page Down scroll.
 const PAGE_ROWS: isize = 10;
 
-/// The sentences of the last line.
+/// Returns the items of the last line.
 pub type Foot = Box<dyn Fn(&Snapshot) -> Vec<String> + Send>;
 
 /// Contents of the view that are not in its [`Watch`].

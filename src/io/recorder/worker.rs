@@ -182,7 +182,7 @@ impl Worker {
             }
         }
         if self.file.is_some() && self.begins && topic == Topic::Prediction {
-            // Its input came before the file could be written: without it the prediction cannot be verified.
+            // Its input is not in this file, and without it the prediction cannot be verified.
             self.shared.dropped_failed.fetch_add(1, Relaxed);
             return;
         }

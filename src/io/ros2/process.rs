@@ -47,7 +47,7 @@ const START_WITHIN: Duration = Duration::from_secs(10);
 /// Bytes kept of the end of its standard error.
 const MAX_LAST_WORDS: usize = 500;
 
-/// Takes the name and the value of a parameter.
+/// Called with the name and the value of a parameter.
 type ParameterSink = Box<dyn FnMut(&str, f64) + Send>;
 
 /// Callbacks for what the ROS 2 side receives. They run on a thread that must not block.
