@@ -27,6 +27,9 @@ from scipy.spatial.transform import Rotation
 
 TAU = 2 * np.pi
 
+# Negative friction coefficients stand for sliding in the other direction.
+LIMITS = "[limits]\nfriction_coefficient = [-10.0, 10.0]\n"
+
 
 # --- roots ------------------------------------------------------------------------------------------------------------
 
@@ -143,7 +146,7 @@ class Modal:
     def write(self, folder, write_pad, modes=""):
         write_pad(folder / f"{self.name}-pad.npz", omega_rad_s=self.pad.omega, phi=self.pad.phi,
                   nodes_m=self.pad.nodes, damping_ratio=self.pad.zeta)  # fmt: skip
-        text = f"name = '{self.name}'\n[pad]\nmodal = '{self.name}-pad.npz'\n{modes}"
+        text = f"name = '{self.name}'\n{LIMITS}[pad]\nmodal = '{self.name}-pad.npz'\n{modes}"
         if self.disc is not None:
             # Fortran order here, C order above; the damping ratios in the rig file, which counts modes upwards in
             # frequency, whatever their order in the archive.
@@ -302,7 +305,7 @@ def symmetric(rng, n, low, high):
 def write_system(folder, name, mass, damping, stiffness, reference, modes=None):
     """`damping`, `stiffness`: lists of matrix, scale as text, symmetry to write."""
     text = f"name = '{name}'\n[reference]\nnormal_load_n = {reference[0]!r}\ndisc_speed_rad_s = {reference[1]!r}\n"
-    text += f"friction_coefficient = {reference[2]!r}\n[system]\nmass = '{name}-m.mtx'\n"
+    text += f"friction_coefficient = {reference[2]!r}\n{LIMITS}[system]\nmass = '{name}-m.mtx'\n"
     text += "" if modes is None else f"modes = {modes}\n"
     mmwrite(folder / f"{name}-m.mtx", scipy.sparse.csr_array(mass), symmetry="symmetric", precision=17)
     for key, terms in (("stiffness", stiffness), ("damping", damping)):
