@@ -182,7 +182,7 @@ fn a_full_disk_stops_nobody_and_is_told() {
     let wait = |wanted: fn(&State) -> bool, seq: &mut u64| {
         let deadline = Instant::now() + LIMIT;
         while !wanted(&recorder.status().state) {
-            assert!(recorder.record(prediction(*seq, T0 + *seq * 1000)));
+            assert!(recorder.record(point(*seq, T0 + *seq * 1000)));
             *seq += 1;
             std::thread::sleep(Duration::from_micros(200));
             assert!(Instant::now() < deadline, "{:?}", recorder.status());
@@ -194,7 +194,7 @@ fn a_full_disk_stops_nobody_and_is_told() {
     let State::Failed(reason) = &status.state else { panic!() };
     assert!(reason.contains("No space left on device"), "{reason}");
     for _ in 0..50 {
-        recorder.record(prediction(seq, T0 + seq * 1000));
+        recorder.record(point(seq, T0 + seq * 1000));
         seq += 1;
     }
 
@@ -203,7 +203,7 @@ fn a_full_disk_stops_nobody_and_is_told() {
     wait(|state| *state == State::Recording, &mut seq);
     let resumed = seq;
     while seq < resumed + 100 {
-        recorder.record(prediction(seq, T0 + seq * 1000));
+        recorder.record(point(seq, T0 + seq * 1000));
         seq += 1;
     }
     let finished = recorder.finish(LIMIT).unwrap();
@@ -226,7 +226,7 @@ fn a_full_disk_stops_nobody_and_is_told() {
     disk.0.store(30_000, Ordering::SeqCst);
     let recorder = Recorder::start(config).unwrap();
     for seq in 0..5000 {
-        recorder.record(prediction(seq, T0 + seq * 1000));
+        recorder.record(point(seq, T0 + seq * 1000));
     }
     let error = recorder.finish(LIMIT).unwrap_err();
     assert!(matches!(error, RecorderError::Failed { .. }), "{error}");
