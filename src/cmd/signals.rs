@@ -1,4 +1,4 @@
-//! SIGINT, SIGTERM and SIGHUP end a command cleanly; a second signal ends it at once.
+//! SIGINT, SIGTERM and SIGHUP end a command cleanly. A second signal within 2 s is ignored; any later one ends it at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
