@@ -11,14 +11,14 @@ use std::time::{Duration, Instant};
 
 use bus::{answer, into, next, point, shm, wait_until};
 use crossbeam_channel::{Receiver, Sender, unbounded};
-use squealcast::io::clock;
-use squealcast::io::heard::Heard;
-use squealcast::io::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource};
+use squealcast::bus::heard::Heard;
+use squealcast::bus::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource};
 use squealcast::node::{Incoming, Node, Outputs, Shortcut, Watch, session_chart};
 use squealcast::physics::synthetic::{Synthetic, rig};
 use squealcast::physics::{Chart, ContactLaw};
 use squealcast::rig::Rig;
-use squealcast::settings::Settings;
+use squealcast::session::settings::Settings;
+use squealcast::system::clock;
 use squealcast::wire::{OperatingPoint, Prediction};
 
 /// Conditions sent at 1 kHz before the other of the two takes its turn.

@@ -1,5 +1,5 @@
 //! The command line: everything is in the library.
 
 fn main() -> std::process::ExitCode {
-    squealcast::cmd::main()
+    squealcast::commands::main()
 }

@@ -4,7 +4,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
-use crate::input_file;
+use crate::files::input_file;
 use crate::physics::OperatingPoint;
 
 /// The `frame_id` of simulated measurements, by which recordings and displays recognise them.

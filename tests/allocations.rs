@@ -8,8 +8,8 @@ use squealcast::node::session_chart;
 use squealcast::physics::synthetic::{Synthetic, rig};
 use squealcast::physics::{ContactLaw, Solver};
 use squealcast::rig::Rig;
+use squealcast::session::settings::Settings;
 use squealcast::session::{Event, Session, map_options};
-use squealcast::settings::Settings;
 use squealcast::wire::shm::{Form, PredictionForm};
 use squealcast::wire::{self, Header, OperatingPoint, Time};
 

@@ -12,10 +12,12 @@ use std::time::{Duration, Instant};
 use bus::{PATIENCE, answer, into, next, point, shm, wait_until};
 use crossbeam_channel::unbounded;
 use domain::Domain;
-use squealcast::io::heard::{Bus, Heard};
-use squealcast::io::ros_args::RosArgs;
-use squealcast::io::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
-use squealcast::io::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, ShmVibrationInput, ShmVibrationSource};
+use squealcast::bus::heard::{Bus, Heard};
+use squealcast::bus::ros_args::RosArgs;
+use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
+use squealcast::bus::shm::{
+    ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, ShmVibrationInput, ShmVibrationSource,
+};
 use squealcast::wire::shm::{Form, OperatingPointForm};
 use squealcast::wire::{OperatingPoint, Prediction, RigInfo, Vibration};
 

@@ -14,8 +14,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use program::{PATIENCE, measuring, npz_bytes};
-use squealcast::io::message::Payload;
-use squealcast::io::recording::{Recorded, Recording};
+use squealcast::recording::message::Payload;
+use squealcast::recording::reader::{Recorded, Recording};
 use squealcast::wire::{OperatingPoint, Prediction};
 
 /// What measures time, or keeps the processors busy, does so alone.

@@ -18,18 +18,14 @@ use std::{
 
 use program::{Running, command, files_below, text, until};
 use records::*;
-use squealcast::{
-    io::{
-        bag::{self, FileSummary},
-        chart_file::ChartFile,
-        import::{ImportOptions, import},
-        recorder::{Recorder, State},
-        recover::recover,
-        whole_file::{write_together, write_whole},
-    },
-    node::{chart_hash, session_chart},
-    rig::Rig,
-};
+use squealcast::files::chart_file::ChartFile;
+use squealcast::files::whole_file::{write_together, write_whole};
+use squealcast::import::{ImportOptions, import};
+use squealcast::node::{chart_hash, session_chart};
+use squealcast::recording::bag::{self, FileSummary};
+use squealcast::recording::recorder::{Recorder, State};
+use squealcast::recording::recover::recover;
+use squealcast::rig::Rig;
 use tempfile::TempDir;
 
 fn now_ns() -> u64 {

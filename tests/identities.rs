@@ -7,8 +7,8 @@ use squealcast::node::{session_chart, session_map};
 use squealcast::physics::numbering::compare;
 use squealcast::physics::{MapOptions, Solver};
 use squealcast::rig::{EMBEDDED, Rig};
+use squealcast::session::settings::Settings;
 use squealcast::session::{Event, Session, chart_options, map_options};
-use squealcast::settings::Settings;
 use squealcast::wire::{Header, OperatingPoint, Prediction, Time};
 
 /// Every embedded rig but the one whose chart takes long.

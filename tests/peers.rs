@@ -22,12 +22,12 @@ use crossbeam_channel::{Receiver, unbounded};
 use domain::Domain;
 use program::{PATIENCE, cache_folder, promised, until as wait_until};
 use serde_json::Value;
-use squealcast::io::heard::Heard;
-use squealcast::io::message::Payload;
-use squealcast::io::recording::{Recorded, Recording};
-use squealcast::io::ros_args::RosArgs;
-use squealcast::io::ros2::{Ros2Options, Ros2Source};
-use squealcast::io::shm::{ShmOptions, ShmSink, ShmSource, ShmVibrationSource};
+use squealcast::bus::heard::Heard;
+use squealcast::bus::ros_args::RosArgs;
+use squealcast::bus::ros2::{Ros2Options, Ros2Source};
+use squealcast::bus::shm::{ShmOptions, ShmSink, ShmSource, ShmVibrationSource};
+use squealcast::recording::message::Payload;
+use squealcast::recording::reader::{Recorded, Recording};
 use squealcast::wire::{Header, OperatingPoint, Prediction, RigInfo, Sensitivity, Time, Vibration};
 use tempfile::TempDir;
 

@@ -12,16 +12,13 @@ use std::{
 
 use proptest::prelude::*;
 use records::*;
-use squealcast::{
-    io::{
-        import::{ImportOptions, import},
-        message::{Message, Payload},
-        recorder::{Recorder, RecorderConfig, State},
-        recording::{Entry, ReadOptions, Recorded, Recording},
-        recover::{Outcome, recover},
-    },
-    wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, SessionEvent, Time, schema::Topic},
-};
+use squealcast::import::{ImportOptions, import};
+use squealcast::recording::message::{Message, Payload};
+use squealcast::recording::reader::{Entry, ReadOptions, Recorded, Recording};
+use squealcast::recording::recorder::{Recorder, RecorderConfig, State};
+use squealcast::recording::recover::{Outcome, recover};
+use squealcast::wire::schema::Topic;
+use squealcast::wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, SessionEvent, Time};
 use tempfile::TempDir;
 
 fn others() -> Vec<Message> {

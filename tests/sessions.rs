@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use program::{Running, command, files_below, folder, launch, promised, run, text, until, write};
-use squealcast::io::message::Payload;
-use squealcast::io::recording::{Recorded, Recording};
+use squealcast::recording::message::Payload;
+use squealcast::recording::reader::{Recorded, Recording};
 use squealcast::wire::event_kind;
 use tempfile::TempDir;
 

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use domain::Domain;
 use ros2_client::{Context, Name, Node, NodeName, NodeOptions, QosProfile, ServiceMapping, ServiceTypeName};
 use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
-use squealcast::io::ros_args::RosArgs;
-use squealcast::io::ros2::{Parameters, Ros2, Ros2Options};
+use squealcast::bus::ros_args::RosArgs;
+use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 

@@ -189,7 +189,7 @@ mod tests {
                 assert!(against >= 3.0, "theme {theme}: mode {k} has a contrast of {against:.2} against the panel");
             }
         }
-        for (mode, drawn) in modes.iter().zip(crate::plot::COLOURS) {
+        for (mode, drawn) in modes.iter().zip(crate::figures::plot::COLOURS) {
             assert_eq!(mode[0], [drawn.0, drawn.1, drawn.2], "figures have the colours of the page");
         }
     }

@@ -10,10 +10,10 @@ use super::history::History;
 use super::server::{About, Source};
 use super::shape::shape;
 use super::state::{CountersShown, Shown, State, spread, trend_per_s};
-use crate::io::clock;
 use crate::node::{Sample, VibrationSample, Watch};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
+use crate::system::clock;
 
 /// Length of a bin of the history, ns.
 const BIN_NS: i64 = 200_000_000;

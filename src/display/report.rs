@@ -6,9 +6,9 @@ use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
 use super::events::{Event, EventKind, EventMoment, Events, iso, seconds};
 use super::recorded::Recorded;
-use crate::html::{escaped, facts, figure, page, section};
+use crate::figures::html::{escaped, facts, figure, page, section};
+use crate::figures::plot;
 use crate::node::status::Status;
-use crate::plot;
 use crate::wire::{SessionEvent, event_kind};
 
 /// Number of stability maps drawn.

@@ -7,7 +7,7 @@ use anyhow::Context;
 
 use super::{write_deck, write_mesh, write_symmetric};
 use crate::fem::tribometer::{CONTACT_STIFFNESS_N_PER_M, Part, Tribometer};
-use crate::io::whole_file::write_whole;
+use crate::files::whole_file::write_whole;
 
 /// Upper end of the band: includes the paper's first 18 modes, which reach 3256 Hz, with a margin.
 const BAND_HZ: f64 = 4000.0;

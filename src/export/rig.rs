@@ -11,12 +11,12 @@ use npyz::zip::DateTime;
 use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
-use crate::certificate::Certificate;
+use crate::full_model::certificate::Certificate;
 use crate::full_model::{FullModelFile, PartGeometry};
-use crate::hex::hex;
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullPart, Kept, Residual};
 use crate::rig::RigFile;
+use crate::text::hex::hex;
 
 /// Name of the rig in a rig file called `file`: the file name without its extension.
 pub(super) fn rig_name(file: &str) -> String {

@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
-use crate::hex::hex;
-use crate::input_file;
+use crate::files::input_file;
 use crate::rig::RigError;
+use crate::text::hex::hex;
 
 /// Size of the read buffer, bytes.
 const CHUNK: usize = 1 << 20;

@@ -4,6 +4,7 @@
 //! `[[contact_patch]]` (`part`), or `[system]` as in rig files of kind 3. Matrices are read line by line into 16 bytes
 //! per listed entry (`entries`). The contents of the files are not kept, only their hashes (`files`).
 
+pub mod certificate;
 mod coordinates;
 mod entries;
 mod files;
@@ -14,7 +15,7 @@ mod tables;
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-use crate::input_file;
+use crate::files::input_file;
 use crate::physics::ContactLaw;
 use crate::reduction::{
     FullContact, FullModel, FullPart, Kept, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,

@@ -10,12 +10,12 @@ use sha2::{Digest, Sha256};
 
 use super::Incoming;
 use super::sensitivity::{self, Question};
-use crate::hex::hex;
-use crate::io::chart_file::ChartFile;
+use crate::files::chart_file::ChartFile;
 use crate::physics::chart::build::{ChartOptions, build, resume};
 use crate::physics::{Chart, Ends, OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
 use crate::session::{chart_options, map_options};
+use crate::text::hex::hex;
 
 /// Interval between saves of an unfinished chart.
 const SAVE_EVERY: Duration = Duration::from_secs(20);

@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
-use crate::io::clock::Reading;
-use crate::io::heard::Counts;
-use crate::io::message::{Message, Payload};
-use crate::io::recorder::RecorderHandle;
-use crate::io::ros2::NODE_NAME;
-use crate::io::ros2::process::{Health, Ros2Process};
-use crate::io::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
+use crate::bus::heard::Counts;
+use crate::bus::ros2::NODE_NAME;
+use crate::bus::ros2::process::{Health, Ros2Process};
+use crate::bus::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
+use crate::recording::message::{Message, Payload};
+use crate::recording::recorder::RecorderHandle;
+use crate::system::clock::Reading;
 use crate::wire::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
 
 /// The buses and the recorder of a node; each is optional.

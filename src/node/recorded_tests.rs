@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::*;
-use crate::io::recorder::{QUEUE_MESSAGES, Recorder, RecorderConfig};
-use crate::io::recording::{Recorded, Recording};
+use crate::recording::reader::{Recorded, Recording};
+use crate::recording::recorder::{QUEUE_MESSAGES, Recorder, RecorderConfig};
 
 /// Longer than any step takes on any machine.
 const PATIENCE: Duration = Duration::from_secs(120);

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use crossbeam_channel::Sender;
 
 use super::{Incoming, Node};
-use crate::io::heard::Heard;
+use crate::bus::heard::Heard;
 use crate::wire;
 
 /// Holds the node while it runs; whoever has the lock may use it.

@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use super::Outputs;
 use super::status::{Inputs, Status};
-use crate::io::heard::{Bus, Counts};
-use crate::io::recorder::State;
+use crate::bus::heard::{Bus, Counts};
 use crate::physics::Chart;
+use crate::recording::recorder::State;
 use crate::rig::Rig;
 use crate::session::Counters;
 use crate::wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};

@@ -6,8 +6,8 @@ use std::fmt::Write;
 use serde::Serialize;
 
 use super::watch::{UnstableMode, fastest_modes};
-use crate::number::significant;
 use crate::physics::{Ends, OperatingPoint as Point, StabilityMap};
+use crate::text::number::significant;
 use crate::wire::{OperatingPoint, Prediction, level};
 
 /// The status of a node.

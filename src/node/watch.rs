@@ -6,9 +6,9 @@ use std::time::Instant;
 use serde::Serialize;
 
 use super::status::{Assessment, Inputs, Status};
-use crate::io::clock;
 use crate::physics::{Ends, NextWindow, StabilityMap};
 use crate::session::Counters;
+use crate::system::clock;
 use crate::wire::{OperatingPoint, Prediction, Vibration};
 
 /// The state of a node as displays show it.

@@ -30,8 +30,8 @@ pub mod uff;
 
 use faer::Mat;
 
-use crate::certificate::Certificate;
-use crate::input_file;
+use crate::files::input_file;
+use crate::full_model::certificate::Certificate;
 use crate::physics::{ContactPairs, ContactState, Model, OperatingPoint, ResidualFlexibility};
 
 pub use embedded::{EMBEDDED, Embedded};

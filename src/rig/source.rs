@@ -3,7 +3,7 @@
 use sha2::{Digest, Sha256};
 
 use super::{RigError, RigFile};
-use crate::hex::hex;
+use crate::text::hex::hex;
 
 /// Access to the files that a rig file refers to.
 pub struct Source<'a> {

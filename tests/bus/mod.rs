@@ -6,8 +6,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender};
-use squealcast::io::heard::Heard;
-use squealcast::io::shm::ShmOptions;
+use squealcast::bus::heard::Heard;
+use squealcast::bus::shm::ShmOptions;
 use squealcast::wire::{Header, Mode, OperatingPoint, Prediction, Time, level};
 
 pub const PATIENCE: Duration = Duration::from_secs(60);

@@ -1,18 +1,19 @@
 //! Every reader of bytes from outside, as a function that must return for any bytes: with a value or an error, never a panic,
-//! and within the ceilings of `squealcast::input_file`.
+//! and within the ceilings of `squealcast::files::input_file`.
 
 #![allow(dead_code)] // the seeds are used in one of the two programs only
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use squealcast::bus::params_file;
 use squealcast::full_model::FullModelFile;
-use squealcast::io::message::Payload;
-use squealcast::io::recording::Recording;
-use squealcast::io::recover::recover;
-use squealcast::io::{params_file, tribometer_log};
+use squealcast::import::tribometer_log;
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::{Chart, OperatingPoint, Traces};
+use squealcast::recording::message::Payload;
+use squealcast::recording::reader::Recording;
+use squealcast::recording::recover::recover;
 use squealcast::rig::{Rig, RigFile, matrix_market, npz, scale, uff};
 use squealcast::simulator::Profile;
 use squealcast::wire::schema::Topic;

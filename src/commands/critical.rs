@@ -1,0 +1,89 @@
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::{LoadAndSpeed, Outcome, RigName, format, not_negative, print, write_file};
+use crate::display::curves::Curves;
+use crate::figures::plot;
+use crate::physics::{MapOptions, Solver, StabilityMap, Window};
+use crate::rig::Rig;
+use crate::session::map_options;
+
+/// Find every window of instability in the friction coefficient, its ends to within 1e-10
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
+    rig: String,
+    /// Search friction coefficients from 0 to this [default: the rig's mu_max]
+    #[arg(long, value_name = "MU", value_parser = not_negative)]
+    mu_max: Option<f64>,
+    #[command(flatten)]
+    load_and_speed: LoadAndSpeed,
+    /// Draw growth rates and frequencies over the friction coefficient into this file, with shaded windows
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The output of `critical --json`.
+#[derive(Serialize)]
+struct Report<'a> {
+    critical_friction: Option<f64>,
+    windows: Vec<WindowReport<'a>>,
+    /// Windows narrower than this may have been missed.
+    narrowest_window: f64,
+    complete: bool,
+}
+
+#[derive(Serialize)]
+struct WindowReport<'a> {
+    mode_ids: &'a [u32],
+    mu_from: f64,
+    mu_to: Option<f64>,
+    frequency_hz: f64,
+    kind: &'static str,
+}
+
+impl<'a> From<&'a Window> for WindowReport<'a> {
+    fn from(window: &'a Window) -> Self {
+        Self {
+            mode_ids: &window.mode_ids,
+            mu_from: window.mu_from,
+            mu_to: window.mu_to,
+            frequency_hz: window.frequency_hz,
+            kind: window.kind.name(),
+        }
+    }
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let rig = Rig::load(&self.rig)?;
+        let point = self.load_and_speed.point(&rig)?;
+        let mu_max = self.mu_max.unwrap_or(rig.mu_max);
+        let options = MapOptions { mu_max, ..map_options(&rig) };
+        let mut solver = Solver::new(rig.model.dimension());
+        let map = StabilityMap::build(&rig.model, &mut solver, &point, &options)?;
+        if let Some(path) = &self.svg {
+            let title = format!("{}, {} N, {} rad/s", rig.name, point.normal_load_n, point.disc_speed_rad_s);
+            let curves = Curves::new(&map, rig.band_max_hz);
+            write_file(path, plot::map(&title, &curves, mu_max, map.critical_friction())?.as_bytes())?;
+        }
+        if self.json {
+            let report = Report {
+                critical_friction: map.critical_friction(),
+                windows: map.windows.iter().map(WindowReport::from).collect(),
+                narrowest_window: map.resolution,
+                complete: map.complete,
+            };
+            print(&(serde_json::to_string(&report)? + "\n"))?;
+        } else {
+            print(&format::windows(&rig, &map, mu_max))?;
+        }
+        Ok(Outcome::Done)
+    }
+}

@@ -1,0 +1,70 @@
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use clap::Args;
+
+use super::buses::BusOptions;
+use super::run::{Listening, NodeOptions, serve};
+use super::simulate::{Measuring, VibrationOption, period, rate_hz};
+use super::{Outcome, not_negative};
+use crate::bus::heard::{Bus, Heard};
+use crate::bus::ros_args::RosArgs;
+use crate::node::{self, Incoming};
+use crate::rig::{EMBEDDED, Rig};
+use crate::simulator::{Profile, Simulator};
+use crate::system::clock;
+
+/// Run the node with a simulated rig, to try it out. It takes no other inputs and is visible on this machine only
+#[derive(Debug, Args)]
+#[command(after_help = super::ROS_ARGS_HELP)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    #[arg(default_value = EMBEDDED[0].name, value_parser = super::RigName, hide_possible_values = true)]
+    rig: String,
+    /// Measurements per second
+    #[arg(long, value_name = "HZ", value_parser = rate_hz, default_value = "100")]
+    rate: f64,
+    /// Seed of the noise
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Stop after this many seconds
+    #[arg(long, value_name = "S", value_parser = not_negative)]
+    duration: Option<f64>,
+    #[command(flatten)]
+    vibration: VibrationOption,
+    #[command(flatten)]
+    buses: BusOptions,
+    #[command(flatten)]
+    shown: NodeOptions,
+}
+
+impl Options {
+    pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
+        let rig = Arc::new(Rig::load(&self.rig)?);
+        let (sender, receiver) = node::channel();
+        let period = period(self.rate);
+        let mut measuring = Measuring::new(Simulator::new(Profile::demo(), self.seed), self.vibration, period);
+        let (measurements, duration) = (sender.clone(), self.duration);
+        std::thread::spawn(move || {
+            let started = Instant::now();
+            for seq in 0u32.. {
+                let time_s = measuring.time_s(seq);
+                if duration.is_some_and(|duration| time_s >= duration) {
+                    let _ = measurements.send(Incoming::Stop);
+                    return;
+                }
+                let due = started + Duration::from_secs_f64(time_s);
+                std::thread::sleep(due.saturating_duration_since(Instant::now()));
+                let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
+                let conditions = Incoming::Input(Heard::now(Bus::Simulator, conditions));
+                let vibration = vibration.map(|heard| Incoming::Vibration(Heard::now(Bus::Simulator, heard)));
+                for heard in std::iter::once(conditions).chain(vibration) {
+                    if measurements.send(heard).is_err() {
+                        return;
+                    }
+                }
+            }
+        });
+        serve(&rig, &self.buses.for_demo(), &self.shown, ros_args, Listening::ToNobody, (sender, receiver))
+    }
+}

@@ -1,0 +1,196 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, anyhow, bail};
+use clap::Args;
+use serde::Serialize;
+
+use super::{Outcome, RigName, positive, print, write_file};
+use crate::figures::plot;
+use crate::files::input_file;
+use crate::import::tribometer_log::decode_text;
+use crate::physics::identification::{IdentificationError, Identified, identify};
+use crate::physics::{OperatingPoint, Solver, Vectors};
+use crate::rig::Rig;
+
+/// The stiffness counts as poorly determined if the error stays within twice its minimum over more than this factor.
+const WELL_DETERMINED: f64 = 2.0;
+
+/// Find the contact stiffness that fits measured or computed natural frequencies at rest
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
+    rig: String,
+    /// CSV file with a column `frequency_hz`: the natural frequencies of the rig at rest
+    #[arg(long, value_name = "FREQ.csv")]
+    targets: PathBuf,
+    /// Fit this many of the lowest frequencies [default: all of them]
+    #[arg(long, value_name = "COUNT")]
+    first: Option<usize>,
+    /// Normal load in N [default: the rig's reference]
+    #[arg(long, value_name = "N", value_parser = positive)]
+    load: Option<f64>,
+    /// Draw the error over the stiffness factor into this file
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// The output of `identify --json`; errors are relative.
+#[derive(Serialize)]
+struct Report<'a> {
+    stiffness_factor: f64,
+    stiffness_n_per_m: [f64; 2],
+    rms_error: f64,
+    mean_error: f64,
+    largest_error: f64,
+    /// Range of factors over which the error is at most twice its minimum.
+    factor_from: Option<f64>,
+    factor_to: Option<f64>,
+    /// Relative change of the frequencies (rms) per relative change of the stiffness.
+    sensitivity: f64,
+    frequency_hz: &'a [f64],
+    target_hz: &'a [f64],
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let rig = Rig::load(&self.rig)?;
+        let mut targets = read_targets(&self.targets)?;
+        if let Some(first) = self.first {
+            if first == 0 || first > targets.len() {
+                let file = self.targets.display();
+                bail!("--first is {first}, expected 1 to the {} frequencies of {file}", targets.len());
+            }
+            targets.truncate(first);
+        }
+        let load = self.load.unwrap_or(rig.reference.normal_load_n);
+        let present = rig.contact_stiffness_n_per_m();
+        let Some(low) = present.iter().copied().reduce(f64::min).filter(|low| *low > 0.0) else {
+            bail!("{}: has no contact stiffness above 0 to start from", rig.name);
+        };
+        let high = present.iter().copied().fold(low, f64::max);
+        let found = identify(&targets, &mut |factor| at_rest_hz(&rig, load, factor)).map_err(|error| match error {
+            IdentificationError::Model(error) => error,
+            other => anyhow!("{} and {}: {other}", rig.name, self.targets.display()),
+        })?;
+        if let Some(path) = &self.svg {
+            let title = format!("{}, first {} natural frequencies", rig.name, targets.len());
+            let stiffness = if low == high { Some(low) } else { None };
+            write_file(path, plot::identification(&title, &found, stiffness)?.as_bytes())?;
+        }
+        let factor = found.best.factor;
+        let stiffness = [low, high].map(|k| factor * k);
+        if self.json {
+            let report = Report {
+                stiffness_factor: factor,
+                stiffness_n_per_m: stiffness,
+                rms_error: found.best.rms_error,
+                mean_error: found.best.mean_error,
+                largest_error: found.best.largest_error,
+                factor_from: found.doubled[0],
+                factor_to: found.doubled[1],
+                sensitivity: found.sensitivity,
+                frequency_hz: &found.best.frequencies_hz,
+                target_hz: &targets,
+            };
+            print(&(serde_json::to_string(&report)? + "\n"))?;
+        } else {
+            print(&text(&found, &targets, [low, high]))?;
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+/// Natural frequencies without sliding, with the stiffness of every contact pair multiplied by `factor`, Hz.
+fn at_rest_hz(rig: &Rig, normal_load_n: f64, factor: f64) -> anyhow::Result<Vec<f64>> {
+    let model = rig.at_rest_with_contact_stiffness_times(factor)?;
+    let at_rest = OperatingPoint { normal_load_n, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
+    let spectrum = Solver::new(model.dimension()).solve(&model, &at_rest, Vectors::Right)?;
+    Ok(spectrum.modes().iter().map(|root| root.frequency_hz()).collect())
+}
+
+/// The column `frequency_hz` in ascending order. Columns are separated by `,`, `;` or tabs; unless it is the separator,
+/// `,` may be the decimal sign.
+fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
+    let file = path.display();
+    let bytes = input_file::read(path, input_file::TARGETS).with_context(|| format!("{file}: cannot be read"))?;
+    let text = decode_text(&bytes);
+    let header = text.lines().next().unwrap_or_default();
+    let separator = [b';', b'\t'].into_iter().find(|&s| header.contains(char::from(s))).unwrap_or(b',');
+    let mut reader = csv::ReaderBuilder::new().delimiter(separator).from_reader(text.as_bytes());
+    let headers = reader.headers().with_context(|| format!("{file}: no header"))?;
+    let column = headers
+        .iter()
+        .position(|name| name.trim() == "frequency_hz")
+        .ok_or_else(|| anyhow!("{file}: its columns are `{}`, expected `frequency_hz`", headers.as_slice()))?;
+    let mut targets = vec![];
+    for record in reader.records() {
+        let record = record.with_context(|| file.to_string())?;
+        let line = record.position().map_or(0, csv::Position::line);
+        let value = record.get(column).unwrap_or_default().trim();
+        // A decimal comma without points only: `1.234,5` would be ambiguous.
+        let number = if separator == b',' || value.contains('.') { value.to_owned() } else { value.replace(',', ".") };
+        match number.parse::<f64>() {
+            Ok(hz) if hz.is_finite() && hz > 0.0 => targets.push(hz),
+            _ => bail!("{file}, line {line}: frequency_hz is `{value}`, expected a number above 0"),
+        }
+    }
+    if targets.is_empty() {
+        bail!("{file}: no frequencies, expected at least one");
+    }
+    targets.sort_by(f64::total_cmp);
+    Ok(targets)
+}
+
+/// A warning if the frequencies hardly depend on the stiffness; empty otherwise.
+fn poorly(found: &Identified) -> String {
+    match found.doubled {
+        [Some(from), Some(to)] if to / from <= WELL_DETERMINED => String::new(),
+        [Some(from), Some(to)] => format!(
+            "\npoorly determined: stiffness over a factor of {:.1} fits within twice the error; frequencies that the contact \
+             moves more are needed",
+            to / from
+        ),
+        _ => "\npoorly determined: the frequencies do not bound the stiffness; frequencies that the contact moves more are needed"
+            .to_owned(),
+    }
+}
+
+fn text(found: &Identified, targets: &[f64], [low, high]: [f64; 2]) -> String {
+    let best = &found.best;
+    let stiffness = |factor: f64| {
+        let [low, high] = [low, high].map(|k| factor * k);
+        if low == high { format!("{low:.6e} N/m") } else { format!("{low:.6e} to {high:.6e} N/m") }
+    };
+    let end = |end: Option<f64>| end.map_or("beyond the search".to_owned(), &stiffness);
+    let percent = |error: f64| format!("{:.4} %", 100.0 * error);
+    let mut text = format!(
+        "contact stiffness  {} a pair, {:.6} times the rig's\n\
+         error              mean {}, rms {}, largest {}, of {} frequencies\n\
+         determined         the rms error stays below twice that from {} to {}\n\
+         sensitivity        1 % more stiffness moves the frequencies by {:.4} % (rms){}\n\n\
+         {:>4}  {:>14}  {:>14}  {:>10}\n",
+        stiffness(best.factor),
+        best.factor,
+        percent(best.mean_error),
+        percent(best.rms_error),
+        percent(best.largest_error),
+        targets.len(),
+        end(found.doubled[0]),
+        end(found.doubled[1]),
+        found.sensitivity,
+        poorly(found),
+        "mode",
+        "target, Hz",
+        "rig, Hz",
+        "error, %",
+    );
+    for (index, (hz, target)) in best.frequencies_hz.iter().zip(targets).enumerate() {
+        let error = 100.0 * (hz / target - 1.0);
+        text += &format!("{:>4}  {target:>14.4}  {hz:>14.4}  {error:>10.4}\n", index + 1);
+    }
+    text
+}

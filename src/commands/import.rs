@@ -1,0 +1,98 @@
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::Outcome;
+use crate::import::tribometer_log::{Field, LogOptions, TribometerLog};
+use crate::import::{ImportOptions, import};
+
+/// Convert a tribometer log to a recording
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Delimited text with named columns, units in their names
+    session: PathBuf,
+    /// The recording to write
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    #[command(flatten)]
+    log: LogArgs,
+    /// Replace an existing recording
+    #[arg(long)]
+    overwrite: bool,
+}
+
+/// How a tribometer's log is read
+#[derive(Clone, Debug, Args)]
+pub struct LogArgs {
+    /// Take a quantity from a column by its name: time_s, normal_load_n, disc_speed_rad_s, friction_coefficient or
+    /// friction_force_n
+    #[arg(long = "column", value_name = "QUANTITY=NAME", value_parser = column)]
+    columns: Vec<(Field, String)>,
+    /// The decimal sign, instead of detecting it
+    #[arg(long, value_name = ", or .", value_parser = decimal)]
+    decimal: Option<char>,
+    /// Skip invalid lines instead of refusing the log
+    #[arg(long)]
+    skip_bad_lines: bool,
+}
+
+fn column(text: &str) -> Result<(Field, String), String> {
+    let (quantity, name) = text.split_once('=').ok_or("expected QUANTITY=NAME")?;
+    let known: Vec<&str> = Field::ALL.iter().map(|field| field.name()).collect();
+    let field = Field::from_name(quantity)
+        .ok_or_else(|| format!("no quantity `{quantity}`; there are {}", known.join(", ")))?;
+    Ok((field, name.to_owned()))
+}
+
+fn decimal(text: &str) -> Result<char, String> {
+    match text {
+        "," => Ok(','),
+        "." => Ok('.'),
+        _ => Err("expected , or .".to_owned()),
+    }
+}
+
+impl LogArgs {
+    /// The options of the log reader.
+    pub fn options(&self) -> LogOptions {
+        LogOptions {
+            columns: self.columns.clone(),
+            decimal: self.decimal,
+            skip_bad_lines: self.skip_bad_lines,
+            ..Default::default()
+        }
+    }
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let options = ImportOptions { log: self.log.options(), overwrite: self.overwrite };
+        let imported = import(&self.session, &self.output, &options)?;
+        let outcome = describe(&imported.log);
+        let path = imported.path.display();
+        note!("{path}: {} operating points", imported.messages);
+        note!("to predict them: squealcast predict-log {path} --rig RIG -o DIR");
+        Ok(outcome)
+    }
+}
+
+/// Reports what was read from a log and what was skipped.
+pub fn describe(log: &TribometerLog) -> Outcome {
+    for column in &log.columns {
+        let unit = match column.unit.as_str() {
+            "" | "-" | "1" => String::new(),
+            unit => format!(" in {unit}"),
+        };
+        note!("{} from column {:?}{unit}", column.field, column.header);
+    }
+    if !log.left_out.is_empty() {
+        let names: Vec<String> = log.left_out.iter().map(|name| format!("{name:?}")).collect();
+        note!("left out: {}", names.join(", "));
+    }
+    if log.skipped == 0 {
+        return Outcome::Done;
+    }
+    let first = log.first_skipped.as_ref().map(|error| format!(", the first: {error}")).unwrap_or_default();
+    note!("{} {} left out{first}", log.skipped, if log.skipped == 1 { "line" } else { "lines" });
+    Outcome::Differences
+}

@@ -1,0 +1,188 @@
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, ensure};
+use clap::Args;
+
+use super::buses::BusOptions;
+use super::{Outcome, finite, not_negative, positive, signals};
+use crate::bus::ros_args::RosArgs;
+use crate::bus::ros2::Ros2Source;
+use crate::bus::shm::{ShmSource, ShmVibrationSource};
+use crate::offline::{self, Measured, Quantity};
+use crate::rig::Rig;
+use crate::simulator::{self, Peak, Profile, Simulator, Tone};
+use crate::system::clock;
+use crate::wire::{Header, OperatingPoint, Time, Vibration};
+
+/// Publish simulated conditions, or record a simulated session
+#[derive(Debug, Args)]
+#[command(after_help = super::ROS_ARGS_HELP)]
+pub struct Options {
+    /// Profile of load, speed and friction coefficient, TOML [default: the paper's test, then a ramp from 0 to 1]
+    #[arg(long, value_name = "FILE")]
+    profile: Option<PathBuf>,
+    /// Seed of the noise
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Measurements per second
+    #[arg(long, value_name = "HZ", value_parser = rate_hz, default_value = "100")]
+    rate: f64,
+    /// Stop after this many seconds [default: never; with --record after one round of the profile]
+    #[arg(long, value_name = "S", value_parser = not_negative)]
+    duration: Option<f64>,
+    /// Publish nothing; predict with --rig as fast as possible and record the session in this directory
+    #[arg(long, value_name = "DIR", requires = "rig")]
+    record: Option<PathBuf>,
+    /// Rig file, or the name of an embedded rig, for --record
+    #[arg(long, value_name = "RIG", requires = "record")]
+    rig: Option<String>,
+    #[command(flatten)]
+    vibration: VibrationOption,
+    #[command(flatten)]
+    buses: BusOptions,
+}
+
+/// Whether the simulated rig measures its vibration.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct VibrationOption {
+    /// Also measure the vibration, 20 times a second: 95 dB at HZ while friction is above MU, else noise of 50 dB
+    #[arg(long = "vibration", value_name = "MU:HZ", value_parser = tone)]
+    pub tone: Option<Tone>,
+}
+
+fn tone(text: &str) -> Result<Tone, String> {
+    let (mu, hz) = text.split_once(':').ok_or("not a friction coefficient and a frequency, such as 0.36:1500")?;
+    Ok(Tone { above_mu: finite(mu)?, frequency_hz: positive(hz)? })
+}
+
+/// Interval between measurements of the vibration, s.
+const VIBRATION_EVERY_S: f64 = 0.05;
+
+/// A simulated rig with its measurements.
+pub struct Measuring {
+    simulator: Simulator,
+    tone: Option<Tone>,
+    period_s: f64,
+}
+
+impl Measuring {
+    /// A rig that measures the operating point every `period` and, if requested, the vibration.
+    pub fn new(simulator: Simulator, vibration: VibrationOption, period: Duration) -> Self {
+        Self { simulator, tone: vibration.tone, period_s: period.as_secs_f64() }
+    }
+
+    /// Time of a measurement, s since the start.
+    pub fn time_s(&self, seq: u32) -> f64 {
+        self.period_s * f64::from(seq)
+    }
+
+    /// The messages of a measurement.
+    pub fn measure(&mut self, seq: u32, stamp_ns: i64) -> (OperatingPoint, Option<Vibration>) {
+        let time_s = self.time_s(seq);
+        let header = Header { stamp: Time::from_ns(stamp_ns), frame_id: simulator::FRAME_ID.to_owned() };
+        let every = (VIBRATION_EVERY_S / self.period_s).round().max(1.0) as u32;
+        let tone = self.tone.filter(|_| seq.is_multiple_of(every));
+        let vibration = tone.map(|tone| {
+            let Peak { frequency_hz, level_db } = self.simulator.measure_vibration(tone, time_s);
+            Vibration { header: header.clone(), frequency_hz, level_db }
+        });
+        let point = self.simulator.measure(time_s);
+        let point = OperatingPoint {
+            header,
+            seq: seq.into(),
+            normal_load_n: point.normal_load_n,
+            disc_speed_rad_s: point.disc_speed_rad_s,
+            friction_coefficient: point.friction_coefficient,
+        };
+        (point, vibration)
+    }
+}
+
+/// Highest rate of measurements, 1/s.
+const MAX_RATE_HZ: f64 = 1e5;
+
+/// Parses a rate of measurements in 1/s, for clap.
+pub fn rate_hz(text: &str) -> Result<f64, String> {
+    let rate = finite(text)?;
+    if rate > 0.0 && rate <= MAX_RATE_HZ {
+        Ok(rate)
+    } else {
+        Err(format!("{rate} is not more than 0 up to {MAX_RATE_HZ}"))
+    }
+}
+
+/// Time between measurements at a rate in 1/s.
+pub fn period(rate_hz: f64) -> Duration {
+    Duration::from_secs_f64(1.0 / rate_hz)
+}
+
+impl Options {
+    pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
+        let profile = self.profile.as_deref().map(Profile::load).transpose()?.unwrap_or_else(Profile::paper);
+        let period = period(self.rate);
+        if let (Some(directory), Some(rig)) = (&self.record, &self.rig) {
+            let rig = Arc::new(Rig::load(rig)?);
+            let duration_s = self.duration.unwrap_or(profile.duration_s());
+            let mut measuring = Measuring::new(Simulator::new(profile, self.seed), self.vibration, period);
+            let measured = (0u32..).map_while(|seq| {
+                let time_s = measuring.time_s(seq);
+                let stamp_ns = offline::START_NS + (time_s * 1e9).round() as i64;
+                (time_s < duration_s).then(|| measuring.measure(seq, stamp_ns))
+            });
+            let measured = measured.flat_map(|(conditions, vibration)| {
+                let vibration = vibration.map(|vibration| Measured::at_its_stamp(Quantity::Vibration(vibration)));
+                vibration.into_iter().chain([Measured::at_its_stamp(Quantity::Conditions(conditions))])
+            });
+            // A simulation cannot be run twice, so no inputs are known in advance.
+            let predicted = offline::record(&rig, None, std::iter::empty(), measured, directory)?;
+            note!("{}", predicted.directory.display());
+            return Ok(Outcome::Done);
+        }
+        self.publish(profile, period, ros_args)
+    }
+
+    fn publish(&self, profile: Profile, period: Duration, ros_args: RosArgs) -> anyhow::Result<Outcome> {
+        let measures = self.vibration.tone.is_some();
+        let shm = self.buses.shm().map(|shm| {
+            let vibration = measures.then(|| ShmVibrationSource::new(&shm)).transpose()?;
+            anyhow::Ok((ShmSource::new(&shm)?, vibration))
+        });
+        let shm = shm.transpose();
+        let shm = shm.context("shared memory; --no-shm stays off it")?;
+        let ros2 = self.buses.ros2(ros_args)?.map(|ros2| Ros2Source::start(&ros2, |_| {})).transpose();
+        let ros2 = ros2.context("ROS 2; --no-ros stays off it")?;
+        ensure!(shm.is_some() || ros2.is_some(), "nothing to publish to: both --no-shm and --no-ros are given");
+        let stopped = Arc::new(AtomicBool::new(false));
+        let stop = stopped.clone();
+        signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;
+        let mut measuring = Measuring::new(Simulator::new(profile, self.seed), self.vibration, period);
+        let started = Instant::now();
+        for seq in 0u32.. {
+            let time_s = measuring.time_s(seq);
+            if self.duration.is_some_and(|duration| time_s >= duration) {
+                break;
+            }
+            signals::wait_until(started + Duration::from_secs_f64(time_s), &stopped);
+            if stopped.load(Ordering::Relaxed) {
+                break;
+            }
+            let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
+            if let Some((shm, shm_vibration)) = &shm {
+                shm.publish(&conditions)?;
+                if let (Some(shm), Some(vibration)) = (shm_vibration, &vibration) {
+                    shm.publish(vibration)?;
+                }
+            }
+            if let Some(ros2) = &ros2 {
+                ros2.publish(&conditions)?;
+                if let Some(vibration) = &vibration {
+                    ros2.publish_vibration(vibration)?;
+                }
+            }
+        }
+        Ok(Outcome::Done)
+    }
+}

@@ -1,0 +1,4 @@
+//! Figures as SVG and self-contained HTML pages.
+
+pub mod html;
+pub mod plot;

@@ -1,0 +1,5 @@
+//! Files as such: read under a size limit, written whole or not at all; charts on disk.
+
+pub mod chart_file;
+pub mod input_file;
+pub mod whole_file;

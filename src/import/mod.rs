@@ -1,0 +1,123 @@
+//! Converts a tribometer log to a recording of operating points.
+
+pub mod tribometer_log;
+
+use std::{
+    collections::BTreeMap,
+    io,
+    path::{Path, PathBuf},
+};
+
+use mcap::records::Metadata;
+use sha2::{Digest, Sha256};
+
+use crate::files::input_file;
+use crate::recording::mcap_file::{RecordingFile, WriteError};
+use crate::recording::message::Payload;
+use crate::text::hex::hex;
+use crate::wire::{Header, OperatingPoint, Time, schema::Topic};
+use tribometer_log::{LogError, LogOptions, Sample, TribometerLog};
+
+/// Name of the metadata record that describes the origin of the recording. Its keys: `source`, `source_sha256`,
+/// `squealcast_version`, `skipped_lines`, and for each quantity the column it was read from.
+pub const METADATA_NAME: &str = "squealcast_import";
+
+/// Options of an import.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ImportOptions {
+    pub log: LogOptions,
+    /// Replace an existing recording.
+    pub overwrite: bool,
+}
+
+/// Why an import failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ImportError {
+    #[error("{}: {source}", .path.display())]
+    Read { path: PathBuf, source: io::Error },
+    #[error("{}: {source}", .path.display())]
+    Log { path: PathBuf, source: LogError },
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    #[error("{}: line values cannot be encoded: {reason}", .path.display())]
+    Encode { path: PathBuf, reason: String },
+}
+
+/// Result of an import.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Imported {
+    pub path: PathBuf,
+    pub messages: u64,
+    /// First and last stamp, ns.
+    pub span_ns: Option<(u64, u64)>,
+    /// The parsed log.
+    pub log: TribometerLog,
+}
+
+/// Writes the operating points (`/rig/operating_point`) of the log `input` to the recording `output`, completely or not
+/// at all.
+///
+/// # Errors
+///
+/// The log cannot be read or is invalid, or the output exists or cannot be written.
+pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Imported, ImportError> {
+    let (bytes, log) = read_log(input, &options.log)?;
+    if output.exists() && !options.overwrite {
+        return Err(WriteError::Exists { path: output.to_owned() }.into());
+    }
+    let mut file = RecordingFile::create_whole(output)?;
+    if let Err(error) = write(&mut file, input, &bytes, &log) {
+        file.abandon();
+        return Err(error);
+    }
+    let summary = file.finish()?;
+    Ok(Imported { path: output.to_owned(), messages: summary.messages(), span_ns: summary.span_ns, log })
+}
+
+/// Reads the log `input`; returns its bytes and the parsed log.
+///
+/// # Errors
+///
+/// The file cannot be read or is not a valid log.
+pub fn read_log(input: &Path, options: &LogOptions) -> Result<(Vec<u8>, TribometerLog), ImportError> {
+    let bytes = input_file::read(input, input_file::LOG)
+        .map_err(|source| ImportError::Read { path: input.to_owned(), source })?;
+    let log = tribometer_log::parse(&tribometer_log::decode_text(&bytes), options)
+        .map_err(|source| ImportError::Log { path: input.to_owned(), source })?;
+    Ok((bytes, log))
+}
+
+/// The message for sample number `seq`.
+pub fn operating_point(seq: u64, sample: &Sample) -> OperatingPoint {
+    OperatingPoint {
+        header: Header { stamp: Time::from_ns(sample.stamp_ns), frame_id: String::new() },
+        seq,
+        normal_load_n: sample.normal_load_n,
+        disc_speed_rad_s: sample.disc_speed_rad_s,
+        friction_coefficient: sample.friction_coefficient,
+    }
+}
+
+fn write(file: &mut RecordingFile, input: &Path, bytes: &[u8], log: &TribometerLog) -> Result<(), ImportError> {
+    let source = input.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let digest = hex(&Sha256::digest(bytes));
+    let mut metadata = BTreeMap::from([
+        ("source".to_owned(), source),
+        ("source_sha256".to_owned(), digest),
+        ("squealcast_version".to_owned(), env!("CARGO_PKG_VERSION").to_owned()),
+        ("skipped_lines".to_owned(), log.skipped.to_string()),
+    ]);
+    for column in &log.columns {
+        metadata.insert(column.field.name().to_owned(), column.header.clone());
+    }
+    file.write_metadata(&Metadata { name: METADATA_NAME.to_owned(), metadata })?;
+    let channel = file.own_channel(Topic::OperatingPoint)?;
+    for (seq, sample) in (0_u32..).zip(&log.samples) {
+        let cdr = Payload::OperatingPoint(operating_point(seq.into(), sample))
+            .to_cdr()
+            .map_err(|error| ImportError::Encode { path: input.to_owned(), reason: error.to_string() })?;
+        let stamp_ns = u64::try_from(sample.stamp_ns).unwrap_or(0);
+        file.write(channel, seq, stamp_ns, stamp_ns, &cdr)?;
+    }
+    Ok(())
+}

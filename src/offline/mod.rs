@@ -1,0 +1,268 @@
+//! A session without buses: predicts and records measured inputs as fast as possible.
+//!
+//! Time is that of the stamps, also for silences. In contrast to a node, every stability map is computed before the
+//! input that needs it.
+
+mod ahead;
+pub mod verify;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use crate::node::{
+    at_load_and_speed, chart_hash, ends_hash, map_hash, parameter_event, rig_info, session_ends, session_map,
+};
+use crate::physics::{self, Chart, Solver};
+use crate::recording::message::{Message, Payload};
+use crate::recording::recorder::{Recorder, RecorderConfig, RecorderError};
+use crate::rig::Rig;
+use crate::session::settings::Settings;
+use crate::session::{Event, Session, Want};
+use crate::wire::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
+use ahead::Ahead;
+
+/// Stamp of the first input of a simulated offline session, ns since the epoch: 2024-01-01T00:00:00Z. Fixed, so that
+/// equal commands give equal messages.
+pub const START_NS: i64 = 1_704_067_200_000_000_000;
+
+/// Largest number of messages waiting to be written to disk.
+const MOST_QUEUED: usize = 1000;
+
+/// Why a session could not be recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum OfflineError {
+    #[error(transparent)]
+    Recorder(#[from] RecorderError),
+    #[error("{dropped} messages were not recorded: {reason}")]
+    Dropped { dropped: u64, reason: String },
+}
+
+/// A measured quantity with the times of its recording.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Measured {
+    pub log_time_ns: u64,
+    pub publish_time_ns: u64,
+    pub quantity: Quantity,
+}
+
+/// A measured quantity.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Quantity {
+    Conditions(OperatingPoint),
+    Vibration(Vibration),
+}
+
+impl Measured {
+    /// A quantity whose recording times equal its stamp.
+    pub fn at_its_stamp(quantity: Quantity) -> Self {
+        let stamp = match &quantity {
+            Quantity::Conditions(input) => input.header.stamp,
+            Quantity::Vibration(vibration) => vibration.header.stamp,
+        };
+        let time_ns = u64::try_from(stamp.as_ns()).unwrap_or(0);
+        Self { log_time_ns: time_ns, publish_time_ns: time_ns, quantity }
+    }
+}
+
+/// Summary of a session that was predicted and recorded.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Predicted {
+    /// Directory of its recording.
+    pub directory: PathBuf,
+    pub inputs: u64,
+    /// Number of predictions of each level: OK, WARN, SQUEAL, FAULT.
+    pub levels: [u64; 4],
+    /// Why the first stability map that failed could not be computed.
+    pub map_failure: Option<String>,
+}
+
+/// Predicts the `measured` inputs with `rig` and records the session into a new directory in `directory`. Predictions
+/// are charted if `chart` is given. `points` are the conditions in `measured`, in the same order, to be solved ahead of
+/// the session; they may end early.
+///
+/// # Errors
+/// [`OfflineError`].
+pub fn record(
+    rig: &Arc<Rig>,
+    chart: Option<Arc<Chart>>,
+    points: impl Iterator<Item = physics::OperatingPoint>,
+    measured: impl Iterator<Item = Measured>,
+    directory: &Path,
+) -> Result<Predicted, OfflineError> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut ahead = Ahead::new(points, &rig.model, threads);
+    let mut offline = Offline::start(rig, directory)?;
+    let mut chart = Some(chart);
+    for Measured { log_time_ns, publish_time_ns, quantity } in measured {
+        match quantity {
+            Quantity::Vibration(vibration) => {
+                offline.write(log_time_ns, publish_time_ns, Payload::Vibration(vibration));
+            }
+            Quantity::Conditions(input) => {
+                if let Some(chart) = chart.take() {
+                    offline.begin(input.header.stamp, log_time_ns, chart);
+                }
+                offline.silence(input.header.stamp, log_time_ns);
+                offline.prepare(&input, log_time_ns);
+                ahead.step(&mut offline.session, &rig.model);
+                offline.input(input, log_time_ns, publish_time_ns);
+            }
+        }
+    }
+    offline.finish()
+}
+
+/// A session that is being recorded.
+struct Offline {
+    rig: Arc<Rig>,
+    recorder: Recorder,
+    session: Session,
+    solver: Solver,
+    /// Stamp and log time of the latest input.
+    last: Option<(Time, u64)>,
+    /// Load and speed at which the map cannot be computed; not tried again.
+    given_up: Option<physics::OperatingPoint>,
+    inputs: u64,
+    levels: [u64; 4],
+    map_failure: Option<String>,
+}
+
+impl Offline {
+    fn start(rig: &Arc<Rig>, directory: &Path) -> Result<Self, OfflineError> {
+        let recorder = Recorder::start(RecorderConfig {
+            rig_name: rig.name.clone(),
+            rig_content_hash: rig.content_hash.clone(),
+            rig_files: rig.files.clone(),
+            ..RecorderConfig::new(directory)
+        })?;
+        Ok(Self {
+            session: Session::new(rig.clone(), Settings::for_rig(rig)),
+            solver: Solver::new(rig.model.dimension()),
+            rig: rig.clone(),
+            recorder,
+            last: None,
+            given_up: None,
+            inputs: 0,
+            levels: [0; 4],
+            map_failure: None,
+        })
+    }
+
+    fn write(&self, log_time_ns: u64, publish_time_ns: u64, payload: Payload) {
+        // Nothing is live here: wait for the disk instead of dropping messages.
+        while self.recorder.status().queued > MOST_QUEUED {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        self.recorder.record(Message { log_time_ns, publish_time_ns, payload });
+    }
+
+    /// Records a session event, then passes it to the session.
+    fn event(&mut self, stamp: Time, log_time_ns: u64, record: SessionEvent, event: Event) {
+        let header = Header { stamp, ..Default::default() };
+        self.write(log_time_ns, log_time_ns, Payload::SessionEvent(SessionEvent { header, ..record }));
+        self.step(log_time_ns, event);
+    }
+
+    /// One step of the session. Records its prediction and returns the computation it requests.
+    fn step(&mut self, log_time_ns: u64, event: Event) -> Option<Want> {
+        // Settings are those of the rig and no event changes them, so the session refuses nothing.
+        let effects = self.session.step(event).unwrap_or_default();
+        let (prediction, want) = (effects.publish.cloned(), effects.want);
+        if let Some(prediction) = prediction {
+            self.levels[usize::from(prediction.level).min(3)] += 1;
+            self.write(log_time_ns, log_time_ns, Payload::Prediction(prediction));
+        }
+        want
+    }
+
+    /// Records the initial state of the session: rig, settings and chart.
+    fn begin(&mut self, stamp: Time, log_time_ns: u64, chart: Option<Arc<Chart>>) {
+        self.write(log_time_ns, log_time_ns, Payload::RigInfo(rig_info(&self.rig)));
+        let header = Header { stamp, ..Default::default() };
+        let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
+        for (name, value) in settings {
+            let event = parameter_event(header.clone(), name, value);
+            self.write(log_time_ns, log_time_ns, Payload::SessionEvent(event));
+        }
+        if let Some(chart) = chart {
+            let record = SessionEvent { kind: event_kind::CHART, hash: chart_hash(&chart), ..Default::default() };
+            self.event(stamp, log_time_ns, record, Event::ChartReady(chart));
+        }
+    }
+
+    /// Inserts a silence before an input whose stamp follows the previous one by more than the silence timeout.
+    fn silence(&mut self, stamp: Time, log_time_ns: u64) {
+        let timeout = Duration::try_from_secs_f64(self.session.settings().silence_timeout_s).ok();
+        let timeout_ns = timeout.and_then(|timeout| i64::try_from(timeout.as_nanos()).ok());
+        if let (Some((last, last_log_ns)), Some(timeout_ns)) = (self.last, timeout_ns)
+            && stamp.as_ns().saturating_sub(last.as_ns()) > timeout_ns
+        {
+            let silent = Time::from_ns(last.as_ns() + timeout_ns);
+            let log_ns = last_log_ns.saturating_add(timeout_ns.unsigned_abs()).min(log_time_ns);
+            let record = SessionEvent { kind: event_kind::SILENCE, ..Default::default() };
+            self.event(silent, log_ns, record, Event::Silence { stamp: silent });
+        }
+        self.last = Some((stamp, log_time_ns));
+    }
+
+    /// Computes the stability map that the prediction for `input` needs, if the session does not have it.
+    fn prepare(&mut self, input: &OperatingPoint, log_time_ns: u64) {
+        let point = input.point();
+        if self.session.lacks_map(&point) {
+            self.map(input.header.stamp, log_time_ns, &point);
+        }
+    }
+
+    fn input(&mut self, input: OperatingPoint, log_time_ns: u64, publish_time_ns: u64) {
+        self.inputs += 1;
+        let stamp = input.header.stamp;
+        self.write(log_time_ns, publish_time_ns, Payload::OperatingPoint(input.clone()));
+        match self.step(log_time_ns, Event::Input(input)) {
+            None => {}
+            Some(Want::Map(point)) => self.map(stamp, log_time_ns, &point),
+            Some(Want::Ends(point)) => self.ends(stamp, log_time_ns, &point),
+        }
+    }
+
+    fn map(&mut self, stamp: Time, log_time_ns: u64, point: &physics::OperatingPoint) {
+        let place = point.with_friction(0.0);
+        if self.given_up == Some(place) {
+            return;
+        }
+        match session_map(&self.rig, &mut self.solver, point) {
+            Ok(map) => {
+                let record = at_load_and_speed(event_kind::STABILITY_MAP, point, map_hash(&map));
+                self.event(stamp, log_time_ns, record, Event::MapReady(Arc::new(map)));
+            }
+            Err(reason) => {
+                self.given_up = Some(place);
+                self.map_failure.get_or_insert(reason);
+            }
+        }
+    }
+
+    fn ends(&mut self, stamp: Time, log_time_ns: u64, point: &physics::OperatingPoint) {
+        let Some(map) = self.session.map().cloned() else { return };
+        match session_ends(&self.rig, &mut self.solver, &map, point) {
+            Ok(Some(ends)) => {
+                let record = at_load_and_speed(event_kind::WINDOW_ENDS, point, ends_hash(&ends));
+                self.event(stamp, log_time_ns, record, Event::EndsReady(Arc::new(ends)));
+            }
+            Ok(None) => self.map(stamp, log_time_ns, point),
+            Err(reason) => drop(self.map_failure.get_or_insert(reason)),
+        }
+    }
+
+    fn finish(self) -> Result<Predicted, OfflineError> {
+        let Self { recorder, inputs, levels, map_failure, .. } = self;
+        let finished = recorder.finish(Duration::from_secs(600))?;
+        match finished.status.dropped() {
+            0 => Ok(Predicted { directory: finished.directory, inputs, levels, map_failure }),
+            dropped => {
+                let reason = finished.status.why_dropped().unwrap_or_default();
+                Err(OfflineError::Dropped { dropped, reason })
+            }
+        }
+    }
+}
