@@ -13,13 +13,13 @@ use bus::{answer, into, next, point, shm, wait_until};
 use crossbeam_channel::{Receiver, Sender, unbounded};
 use squealcast::bus::heard::Heard;
 use squealcast::bus::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource};
+use squealcast::msgs::{OperatingPoint, Prediction};
 use squealcast::node::{Incoming, Node, Outputs, Shortcut, Watch, session_chart};
 use squealcast::physics::synthetic::{Synthetic, rig};
 use squealcast::physics::{Chart, ContactLaw};
 use squealcast::rig::Rig;
 use squealcast::session::settings::Settings;
 use squealcast::system::clock;
-use squealcast::wire::{OperatingPoint, Prediction};
 
 /// Conditions sent at 1 kHz before the other of the two takes its turn.
 const BLOCK: usize = 1000;

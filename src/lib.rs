@@ -16,6 +16,7 @@ macro_rules! note {
 }
 
 pub use squealcast_core::{fem, physics, reduction};
+pub use squealcast_msgs as msgs;
 
 pub mod bus;
 pub mod commands;
@@ -35,4 +36,3 @@ pub mod sound;
 pub mod study;
 pub mod system;
 mod text;
-pub mod wire;

@@ -4,14 +4,14 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::Arc;
 
+use squealcast::msgs::shm::{Form, PredictionForm};
+use squealcast::msgs::{self, Header, OperatingPoint, Time};
 use squealcast::node::session_chart;
 use squealcast::physics::synthetic::{Synthetic, rig};
 use squealcast::physics::{ContactLaw, Solver};
 use squealcast::rig::Rig;
 use squealcast::session::settings::Settings;
 use squealcast::session::{Event, Session, map_options};
-use squealcast::wire::shm::{Form, PredictionForm};
-use squealcast::wire::{self, Header, OperatingPoint, Time};
 
 /// The system's allocator, which counts for each thread.
 struct Counting;
@@ -70,7 +70,7 @@ fn allocations(session: &mut Session, bytes: &mut Vec<u8>, seqs: std::ops::Range
         let prediction = session.step(event).expect("no setting is changed").publish.expect("every input is answered");
         let form = PredictionForm::from_message(prediction).expect("it fits");
         assert!(form.mode_count > 0);
-        wire::write_cdr(prediction, bytes).expect("it is encoded");
+        msgs::write_cdr(prediction, bytes).expect("it is encoded");
         let allocations = ALLOCATIONS.get() - before;
         counted[usize::from(session.counters().solved == solved_before)] += allocations;
     }

@@ -18,8 +18,8 @@ use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::bus::shm::{
     ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, ShmVibrationInput, ShmVibrationSource,
 };
-use squealcast::wire::shm::{Form, OperatingPointForm};
-use squealcast::wire::{OperatingPoint, Prediction, RigInfo, Vibration};
+use squealcast::msgs::shm::{Form, OperatingPointForm};
+use squealcast::msgs::{OperatingPoint, Prediction, RigInfo, Vibration};
 
 /// A node hears its inputs with two readers: a reliable one and a best-effort one.
 const READERS: usize = 2;
@@ -142,7 +142,7 @@ fn a_late_shared_memory_reader_gets_the_latest() {
 #[test]
 fn services_with_other_settings_are_taken_as_they_are() {
     use iceoryx2::prelude::*;
-    use squealcast::wire::shm::OperatingPointForm;
+    use squealcast::msgs::shm::OperatingPointForm;
     let options = shm("foreign");
     let node = NodeBuilder::new().create::<ipc::Service>().expect("node");
     let name = format!("{}rig/operating_point", options.service_prefix);

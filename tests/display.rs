@@ -14,9 +14,9 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use program::{PATIENCE, measuring, npz_bytes};
+use squealcast::msgs::{OperatingPoint, Prediction};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
-use squealcast::wire::{OperatingPoint, Prediction};
 
 /// What measures time, or keeps the processors busy, does so alone.
 static BUSY: Mutex<()> = Mutex::new(());
@@ -260,7 +260,7 @@ fn the_page_shows_a_demo_as_it_is() {
         let level = moment["level"].as_str().unwrap();
         let near = (seq.saturating_sub(100)..seq + 100).filter_map(|seq| published.get(&seq));
         let levels: Vec<String> =
-            near.map(|(_, near)| squealcast::wire::level::name(near.level).to_lowercase()).collect();
+            near.map(|(_, near)| squealcast::msgs::level::name(near.level).to_lowercase()).collect();
         assert!(levels.iter().any(|near| near == level), "{level} about input {seq}");
         let numbers = &moment["numbers"];
         for (name, value) in [
@@ -314,7 +314,7 @@ fn the_page_shows_a_demo_as_it_is() {
     }
     let squealed = |moment: &&serde_json::Value| {
         let seq: u64 = moment["seq"].as_str().unwrap().parse().unwrap();
-        published[&seq].1.level == squealcast::wire::level::SQUEAL
+        published[&seq].1.level == squealcast::msgs::level::SQUEAL
     };
     assert!(moments.iter().any(|moment| squealed(&moment)) && !moments.iter().all(|moment| squealed(&moment)));
     println!("first paint {} ms, page work {} of a core", seen["first_paint_ms"], seen["work"]);
@@ -733,7 +733,7 @@ fn memory_is_flat_with_pages_attached() {
 /// Every path of the Foxglove layout names a topic and a field that there is.
 #[test]
 fn the_foxglove_layout_names_what_there_is() {
-    use squealcast::wire::schema::Topic;
+    use squealcast::msgs::schema::Topic;
     let text = include_str!("../launch/foxglove-layout.json");
     let layout: serde_json::Value = serde_json::from_str(text).unwrap();
     let panels = layout["configById"].as_object().unwrap();

@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use squealcast::display::shape::shape;
+use squealcast::msgs::{Header, OperatingPoint, Prediction, Time};
 use squealcast::node::{session_chart, session_map};
 use squealcast::physics::numbering::compare;
 use squealcast::physics::{MapOptions, Solver};
 use squealcast::rig::{EMBEDDED, Rig};
 use squealcast::session::settings::Settings;
 use squealcast::session::{Event, Session, chart_options, map_options};
-use squealcast::wire::{Header, OperatingPoint, Prediction, Time};
 
 /// Every embedded rig but the one whose chart takes long.
 fn rigs() -> impl Iterator<Item = Rig> {

@@ -26,9 +26,9 @@ use squealcast::bus::heard::Heard;
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::{Ros2Options, Ros2Source};
 use squealcast::bus::shm::{ShmOptions, ShmSink, ShmSource, ShmVibrationSource};
+use squealcast::msgs::{Header, OperatingPoint, Prediction, RigInfo, Sensitivity, Time, Vibration};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
-use squealcast::wire::{Header, OperatingPoint, Prediction, RigInfo, Sensitivity, Time, Vibration};
 use tempfile::TempDir;
 
 const RIG: &str = "nine-dof-case-2";

@@ -12,14 +12,14 @@ use std::time::{Duration, Instant};
 use program::{PATIENCE, command, folder, launch, run, text, write};
 use squealcast::bus::heard::Heard;
 use squealcast::bus::shm::{ShmOptions, ShmReader};
+use squealcast::msgs::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
+use squealcast::msgs::shm::{OperatingPointForm, SensitivityForm};
+use squealcast::msgs::{Header, OperatingPoint, Sensitivity, Time, Vibration, event_kind};
 use squealcast::offline::verify::{Charts, verify};
 use squealcast::recording::mcap_file::{FileSystem, RecordingFile};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Entry, Recorded, Recording};
 use squealcast::rig::Rig;
-use squealcast::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
-use squealcast::wire::shm::{OperatingPointForm, SensitivityForm};
-use squealcast::wire::{Header, OperatingPoint, Sensitivity, Time, Vibration, event_kind};
 
 const S: u64 = 1_000_000_000;
 /// Start of the recordings made here, ns since the epoch.
@@ -84,7 +84,7 @@ fn payloads(path: &Path) -> Vec<(u64, Payload)> {
     Recording::open(path).expect("a recording").messages().map(known).collect()
 }
 
-fn predictions(path: &Path) -> Vec<squealcast::wire::Prediction> {
+fn predictions(path: &Path) -> Vec<squealcast::msgs::Prediction> {
     let prediction = |(_, payload)| match payload {
         Payload::Prediction(prediction) => Some(prediction),
         _ => None,
@@ -208,7 +208,7 @@ fn topics_decide_which_conditions_are_predicted() {
 #[test]
 fn a_topic_that_cannot_be_read_says_why() {
     let folder = folder();
-    let prediction = squealcast::wire::Prediction { input_seq: 0, ..Default::default() };
+    let prediction = squealcast::msgs::Prediction { input_seq: 0, ..Default::default() };
     let schema = Topic::Prediction.schema().replace("float64 friction_margin_error\n", "");
     let messages = [
         written("/rig/operating_point", T0, point(0, T0, 500.0, 0.3)),

@@ -17,12 +17,12 @@ use std::{
 
 use program::{Running, command, files_below, folder, run, text};
 use records::*;
+use squealcast::msgs::{Header, SessionEvent, Time};
 use squealcast::recording::mcap_file::{Disk, FileSystem};
 use squealcast::recording::message::{Message, Payload};
 use squealcast::recording::reader::Recording;
 use squealcast::recording::recorder::{QUEUE_MESSAGES, Recorder, RecorderConfig, RecorderError, State};
 use squealcast::recording::recover::{Outcome, RecoverError, recover};
-use squealcast::wire::{Header, SessionEvent, Time};
 use tempfile::TempDir;
 
 fn now_ns() -> u64 {

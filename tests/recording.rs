@@ -13,12 +13,12 @@ use std::{
 use proptest::prelude::*;
 use records::*;
 use squealcast::import::{ImportOptions, import};
+use squealcast::msgs::schema::Topic;
+use squealcast::msgs::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, SessionEvent, Time};
 use squealcast::recording::message::{Message, Payload};
 use squealcast::recording::reader::{Entry, ReadOptions, Recorded, Recording};
 use squealcast::recording::recorder::{Recorder, RecorderConfig, State};
 use squealcast::recording::recover::{Outcome, recover};
-use squealcast::wire::schema::Topic;
-use squealcast::wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, SessionEvent, Time};
 use tempfile::TempDir;
 
 fn others() -> Vec<Message> {

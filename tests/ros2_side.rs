@@ -21,9 +21,9 @@ use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::process::{Ros2Process, Sinks};
 use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::bus::shm::{ShmOptions, ShmSink, ShmSource};
+use squealcast::msgs::{DiagnosticStatus, Header, OperatingPoint, Prediction, RigInfo, Time, level};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
-use squealcast::wire::{DiagnosticStatus, Header, OperatingPoint, Prediction, RigInfo, Time, level};
 use tempfile::TempDir;
 
 /// How far the memory of a node may be from what it was before an attack, bytes.

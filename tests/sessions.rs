@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use program::{Running, command, files_below, folder, launch, promised, run, text, until, write};
+use squealcast::msgs::event_kind;
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
-use squealcast::wire::event_kind;
 use tempfile::TempDir;
 
 // --- recordings ------------------------------------------------------------------------------------------------------
@@ -212,7 +212,7 @@ fn signals_end_the_demo_with_a_finished_recording() {
 }
 
 /// The first sensitivities in a session, finished or not, that know the nearest end of a window.
-fn told_with_an_end(session: &Path) -> Option<squealcast::wire::Sensitivity> {
+fn told_with_an_end(session: &Path) -> Option<squealcast::msgs::Sensitivity> {
     let recording = Recording::open(session).ok()?;
     recording.messages().find_map(|entry| match entry.message {
         Recorded::Known(Payload::Sensitivity(told)) if !told.nearest_window_end.is_nan() => Some(told),

@@ -28,8 +28,8 @@ use self::discovery::Discovery;
 use self::link::{Durability, Link, MAX_UNANSWERED};
 use super::heard::{Bus, Counts, Heard};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
-use crate::wire::schema::Topic;
-use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
+use crate::msgs::schema::Topic;
+use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
 /// Name of the node before remapping.
 pub const NODE_NAME: &str = "squealcast";

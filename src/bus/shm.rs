@@ -27,7 +27,7 @@ use thiserror::Error;
 
 use super::heard::{Bus, Counters, Counts, Gaps, Heard};
 use super::shm_place;
-use crate::wire::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
+use crate::msgs::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
 
 /// The ports may be used from any thread; peers with single-threaded ports can connect to them.
 type Ipc = ipc_threadsafe::Service;

@@ -5,9 +5,9 @@ use clap::Args;
 use crate::bus::ros_args::RosArgs;
 use crate::bus::ros2::{NODE_NAME, Ros2Error, Ros2Options};
 use crate::bus::shm::ShmOptions;
+use crate::msgs::shm::{Form, OperatingPointForm};
+use crate::msgs::topic;
 use crate::node::status::InputSources;
-use crate::wire::shm::{Form, OperatingPointForm};
-use crate::wire::topic;
 
 /// Which buses to join, and how
 #[derive(Clone, Debug, Args)]

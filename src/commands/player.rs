@@ -7,8 +7,8 @@ use anyhow::{Context, ensure};
 
 use crate::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use crate::bus::shm::{ShmOptions, ShmOutput, ShmSensitivity, ShmSource, ShmVibrationSource};
+use crate::msgs::schema::Topic;
 use crate::recording::message::Payload;
-use crate::wire::schema::Topic;
 
 /// Time without a new reader after which waiting for readers ends.
 const SETTLED: Duration = Duration::from_millis(500);

@@ -9,13 +9,14 @@ use super::recordings::Recordings;
 use super::{Outcome, print};
 use crate::files::chart_file::ChartFile;
 use crate::import::{operating_point, read_log};
+use crate::msgs::schema::Topic;
 use crate::node::{kept_chart, session_chart};
 use crate::offline::{self, Measured, Predicted, Quantity};
 use crate::physics::Chart;
 use crate::recording::message::Payload;
 use crate::recording::reader::{Recorded, is_recording};
 use crate::rig::Rig;
-use crate::wire::schema::Topic;
+use crate::session::conditions;
 
 /// Predict recorded conditions as fast as possible, from recordings with operating points and from tribometer logs. For
 /// each, a recording with predictions is written, with the rig's own settings and the original stamps
@@ -59,7 +60,7 @@ impl Options {
             return Err(anyhow!("{}: holds no operating points to predict", path.display()));
         }
         let points = recording.messages().filter_map(|entry| match entry.message {
-            Recorded::Known(Payload::OperatingPoint(input)) => Some(input.point()),
+            Recorded::Known(Payload::OperatingPoint(input)) => Some(conditions(&input)),
             _ => None,
         });
         let mut messages = recording.messages();
@@ -85,7 +86,7 @@ impl Options {
     fn log(&self, path: &Path, rig: &Arc<Rig>, chart: Option<Arc<Chart>>) -> anyhow::Result<Outcome> {
         let (_, log) = read_log(path, &self.log.options())?;
         let outcome = super::import::describe(&log);
-        let points = log.samples.iter().zip(0..).map(|(sample, seq)| operating_point(seq, sample).point());
+        let points = log.samples.iter().zip(0..).map(|(sample, seq)| conditions(&operating_point(seq, sample)));
         let measured = log
             .samples
             .iter()

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::bail;
 use clap::Args;
 
+use crate::msgs::schema::Topic;
 use crate::recording::reader::{ReadOptions, Recording, recordings_at};
-use crate::wire::schema::Topic;
 
 /// Which recordings to read, and how
 #[derive(Clone, Debug, Args)]

@@ -12,14 +12,14 @@ use super::player::Player;
 use super::recordings::{Recordings, without_predictions};
 use super::{Outcome, failure, live, not_negative, positive, print, signals};
 use crate::bus::ros_args::RosArgs;
+use crate::msgs::schema::Topic;
+use crate::msgs::{Time, event_kind};
 use crate::node::Watch;
 use crate::offline::verify::{Charts, Verification, verify};
 use crate::recording::message::Payload;
 use crate::recording::pace::{Due, Pacer, Pacing};
 use crate::recording::reader::{Recorded, Recording};
 use crate::rig::{Rig, RigFile};
-use crate::wire::schema::Topic;
-use crate::wire::{Time, event_kind};
 
 /// Play a recording on live buses, or predict recordings again and compare
 #[derive(Debug, Args)]

@@ -11,11 +11,11 @@ use super::{Outcome, finite, not_negative, positive, signals};
 use crate::bus::ros_args::RosArgs;
 use crate::bus::ros2::Ros2Source;
 use crate::bus::shm::{ShmSource, ShmVibrationSource};
+use crate::msgs::{Header, OperatingPoint, Time, Vibration};
 use crate::offline::{self, Measured, Quantity};
 use crate::rig::Rig;
 use crate::simulator::{self, Peak, Profile, Simulator, Tone};
 use crate::system::clock;
-use crate::wire::{Header, OperatingPoint, Time, Vibration};
 
 /// Publish simulated conditions, or record a simulated session
 #[derive(Debug, Args)]

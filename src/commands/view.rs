@@ -11,9 +11,9 @@ use super::replay::recorded_rig;
 use super::{Outcome, signals};
 use crate::display::comparison::Criteria;
 use crate::display::recorded::Recorded;
+use crate::msgs::schema::Topic;
 use crate::recording::reader::Recording;
 use crate::rig::Rig;
-use crate::wire::schema::Topic;
 
 /// Show a recording on the page, with a time line
 #[derive(Debug, Args)]

@@ -4,9 +4,9 @@ use std::collections::VecDeque;
 
 use serde::Serialize;
 
+use crate::msgs::Time;
 use crate::node::status::Status;
 use crate::node::{Sample, UnstableMode};
-use crate::wire::Time;
 
 /// The kind of an event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

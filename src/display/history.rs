@@ -208,8 +208,8 @@ impl History {
 mod tests {
     use super::*;
     use crate::display::events::tests::sample;
+    use crate::msgs::level;
     use crate::node::status::Status;
-    use crate::wire::level;
 
     #[test]
     fn bins_hold_ranges_and_the_gravest_level_and_are_bounded() {

@@ -13,6 +13,7 @@ use super::state::{CountersShown, Shown, State, spread, trend_per_s};
 use crate::node::{Sample, VibrationSample, Watch};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
+use crate::session::conditions;
 use crate::system::clock;
 
 /// Length of a bin of the history, ns.
@@ -171,7 +172,7 @@ impl Source for Live {
         let snapshot = self.watch.snapshot();
         let input = snapshot.input.ok_or("no conditions were heard yet")?;
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
-        let shape = shape(&self.rig, &mut solver, snapshot.map.as_deref(), &input.point(), id)?;
+        let shape = shape(&self.rig, &mut solver, snapshot.map.as_deref(), &conditions(&input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
     }
 }
@@ -179,8 +180,8 @@ impl Source for Live {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::msgs::{OperatingPoint, Prediction, level};
     use crate::node::status::InputSources;
-    use crate::wire::{OperatingPoint, Prediction, level};
 
     /// The page gets the predicted level, at every level, and no statement where nothing is known.
     #[test]

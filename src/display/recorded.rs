@@ -11,14 +11,15 @@ use super::server::{About, Note, Source};
 use super::shape::shape;
 use super::state::{Shown, State, spread, trend_per_s};
 use super::time_line::TimeLine;
+use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind, level};
 use crate::node::status::{Assessment, Inputs, Status};
 use crate::node::{Sample, VibrationSample, session_map};
 use crate::physics::{Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded as Content, Recording};
 use crate::rig::Rig;
+use crate::session::conditions;
 use crate::simulator;
-use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind, level};
 
 /// Bins of the history; their length grows with the recording.
 const BINS: usize = 3000;
@@ -331,7 +332,7 @@ impl Source for Recorded {
         let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
         let map = self.stability_map(self.map_number(time_s));
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
-        let shape = shape(&self.rig, &mut solver, map.as_deref(), &input.point(), id)?;
+        let shape = shape(&self.rig, &mut solver, map.as_deref(), &conditions(&input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
     }
 }
@@ -342,8 +343,8 @@ mod tests {
     use crate::display::comparison::Criteria;
     use crate::display::events::EventKind;
     use crate::display::report::{Origin, report};
+    use crate::msgs::{Header, Time, level};
     use crate::offline::{self, Measured, Quantity};
-    use crate::wire::{Header, Time, level};
 
     const STEPS: u32 = 40;
 

@@ -8,8 +8,8 @@ use super::events::{Event, EventKind, EventMoment, Events, iso, seconds};
 use super::recorded::Recorded;
 use crate::figures::html::{escaped, facts, figure, page, section};
 use crate::figures::plot;
+use crate::msgs::{SessionEvent, event_kind};
 use crate::node::status::Status;
-use crate::wire::{SessionEvent, event_kind};
 
 /// Number of stability maps drawn.
 const WORST: usize = 3;

@@ -4,10 +4,10 @@ use serde::Serialize;
 
 use super::events::seconds;
 use super::history::{Bin, History};
+use crate::msgs::{OperatingPoint, Prediction};
 use crate::node::status::Assessment;
 use crate::session::Counters;
 use crate::simulator;
-use crate::wire::{OperatingPoint, Prediction};
 
 /// Time over which spread and trend are computed, s.
 const RECENT_S: f64 = 2.0;
@@ -85,7 +85,7 @@ impl<'a> Shown<'a> {
     /// `input` must be the input of `prediction`; another one is ignored.
     pub fn new(input: Option<&OperatingPoint>, prediction: &'a Prediction) -> Self {
         let input = input.filter(|input| input.seq == prediction.input_seq);
-        let mode = |mode: &crate::wire::Mode| {
+        let mode = |mode: &crate::msgs::Mode| {
             let values = [
                 mode.frequency_hz,
                 mode.growth_rate_per_s,
@@ -153,8 +153,8 @@ pub fn trend_per_s(history: &History, time_s: f64) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::display::events::tests::sample;
+    use crate::msgs::Mode;
     use crate::node::status::Status;
-    use crate::wire::Mode;
 
     #[test]
     fn spread_and_trend_look_two_seconds_back() {

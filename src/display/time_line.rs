@@ -1,7 +1,7 @@
 //! Places recorded messages by their stamps, so that a recording made from a tenfold playback still spans the time of
 //! the original measurement.
 
-use crate::wire::Time;
+use crate::msgs::Time;
 
 /// Stamps that run backward by more than this start again, ns: a recording was played another time.
 const BACKWARD_NS: i64 = 1_000_000_000;

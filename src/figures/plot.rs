@@ -11,10 +11,10 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use crate::display::curves::Curves;
 use crate::display::history::{Bin, History};
+use crate::msgs::level;
 use crate::physics::Window;
 use crate::physics::identification::{Identified, Trial};
 use crate::study::bench::Route;
-use crate::wire::level;
 
 /// Drawing units per px. The plotting library rounds positions to whole units; a finer grid keeps curves smooth.
 const FINE: u32 = 8;

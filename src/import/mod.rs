@@ -12,10 +12,10 @@ use mcap::records::Metadata;
 use sha2::{Digest, Sha256};
 
 use crate::files::input_file;
+use crate::msgs::{Header, OperatingPoint, Time, schema::Topic};
 use crate::recording::mcap_file::{RecordingFile, WriteError};
 use crate::recording::message::Payload;
 use crate::text::hex::hex;
-use crate::wire::{Header, OperatingPoint, Time, schema::Topic};
 use tribometer_log::{LogError, LogOptions, Sample, TribometerLog};
 
 /// Name of the metadata record that describes the origin of the recording. Its keys: `source`, `source_sha256`,

@@ -33,13 +33,13 @@ pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, W
 use crate::bus::heard::{Bus, Heard};
 use crate::files::chart_file::ChartFile;
 use crate::full_model::certificate::Certificate;
+use crate::msgs::{self, Header, RigInfo, SessionEvent, Time, event_kind};
 use crate::physics::{Chart, Ends, OperatingPoint, StabilityMap};
 use crate::recording::message::Payload;
 use crate::rig::Rig;
-use crate::session::settings::Settings;
 use crate::session::{Event, Session, Want, map_serves};
+use crate::session::{conditions, settings::Settings};
 use crate::system::clock;
-use crate::wire::{self, Header, RigInfo, SessionEvent, Time, event_kind};
 use mapper::Mapper;
 use sensitivity::Question;
 use shortcut::Place;
@@ -68,9 +68,9 @@ const SENSITIVITY_EVERY: Duration = Duration::from_secs(1);
 #[derive(Clone, Debug)]
 pub enum Incoming {
     /// An operating point received over a bus.
-    Input(Heard<wire::OperatingPoint>),
+    Input(Heard<msgs::OperatingPoint>),
     /// A measured vibration received over a bus. It is recorded and shown, and does not affect predictions.
-    Vibration(Heard<wire::Vibration>),
+    Vibration(Heard<msgs::Vibration>),
     /// A changed setting; its value is already validated.
     Parameter { name: String, value: f64 },
     /// The requested stability map, or why it could not be computed.
@@ -79,7 +79,7 @@ pub enum Incoming {
     /// the outer one says why the computation failed.
     Ends { map: Arc<StabilityMap>, ends: Result<Result<Arc<Ends>, OperatingPoint>, String> },
     /// The requested sensitivities, or why they could not be computed.
-    Sensitivity(Box<Result<wire::Sensitivity, String>>),
+    Sensitivity(Box<Result<msgs::Sensitivity, String>>),
     /// The chart of the rig, or why it could not be built.
     Chart(Result<Arc<Chart>, String>),
     /// End of the run.
@@ -233,13 +233,13 @@ impl Node {
     /// Whether `input` can be predicted on the receiving thread: nothing waits before it and it needs no dense solve.
     /// The first input, and the first after a silence, are queued instead: they wake the node's thread, which then
     /// watches for the next silence.
-    fn answers_at_once(&self, input: &wire::OperatingPoint) -> bool {
+    fn answers_at_once(&self, input: &msgs::OperatingPoint) -> bool {
         let heard_lately = self.last_heard.is_some() && !self.silent;
-        self.backlog.is_empty() && heard_lately && self.session.answers_at_once(&input.point())
+        self.backlog.is_empty() && heard_lately && self.session.answers_at_once(&conditions(&input))
     }
 
     /// Predicts for an input on the thread that received it.
-    fn answer(&mut self, heard: Heard<wire::OperatingPoint>) {
+    fn answer(&mut self, heard: Heard<msgs::OperatingPoint>) {
         if self.is_new(&heard) {
             self.input(heard);
         }
@@ -269,14 +269,14 @@ impl Node {
     }
 
     /// Whether the input has not already come over the other bus.
-    fn is_new(&mut self, heard: &Heard<wire::OperatingPoint>) -> bool {
+    fn is_new(&mut self, heard: &Heard<msgs::OperatingPoint>) -> bool {
         let is_new = self.heard_before.is_new(heard.bus, heard.message.header.stamp, heard.message.seq);
         self.statistics.duplicates += u64::from(!is_new);
         is_new
     }
 
     /// Predicts for an input. If it is too old, or too many inputs wait behind it, it is recorded but passed over.
-    fn input(&mut self, heard: Heard<wire::OperatingPoint>) {
+    fn input(&mut self, heard: Heard<msgs::OperatingPoint>) {
         self.last_heard = Some(Instant::now());
         self.silent = false;
         self.statistics.heard(heard.bus);
@@ -289,7 +289,7 @@ impl Node {
             self.outputs.record(heard.at, Payload::OperatingPoint(heard.message));
             return;
         }
-        let point = heard.message.point();
+        let point = conditions(&heard.message);
         let worked_before = self.session.counters().worked();
         self.step(Event::Input(heard.message.clone()), Some(heard));
         let took = Duration::from_nanos(clock::monotonic_ns().saturating_sub(started));
@@ -302,7 +302,7 @@ impl Node {
 
     /// Shows and records a measured vibration. The session does not get it, so predictions are the same with and
     /// without.
-    fn vibration(&mut self, heard: Heard<wire::Vibration>) {
+    fn vibration(&mut self, heard: Heard<msgs::Vibration>) {
         // A vibration has no sequence number. The copies that come over both buses have the same stamp and the same
         // frequency bit by bit.
         let vibration = heard.message;
@@ -363,7 +363,7 @@ impl Node {
         }
         self.next_sensitivity = now + SENSITIVITY_EVERY;
         let prediction = self.session.prediction();
-        if prediction.level == wire::level::FAULT || !self.outputs.want_sensitivities() {
+        if prediction.level == msgs::level::FAULT || !self.outputs.want_sensitivities() {
             return;
         }
         let question = Question::new(prediction, point);
@@ -374,7 +374,7 @@ impl Node {
         }
     }
 
-    fn sensitivity(&mut self, found: Result<wire::Sensitivity, String>) {
+    fn sensitivity(&mut self, found: Result<msgs::Sensitivity, String>) {
         self.mapper.done(|_| false);
         match found {
             Ok(sensitivity) => {
@@ -420,7 +420,7 @@ impl Node {
 
     /// Feeds an event to the session; `input` is the received message if the event is one. The prediction is first sent
     /// over shared memory, since a reader waits for it there. Then input and prediction are recorded, in this order.
-    fn step(&mut self, event: Event, input: Option<Heard<wire::OperatingPoint>>) {
+    fn step(&mut self, event: Event, input: Option<Heard<msgs::OperatingPoint>>) {
         match self.session.step(event) {
             Ok(effects) => {
                 if let Some(prediction) = effects.publish {
@@ -577,7 +577,7 @@ mod tests {
         let settings = Settings { warn_margin: 0.3, ..Settings::for_rig(&rig) };
         let (sender, receiver) = channel();
         for seq in 0..COUNT {
-            let message = wire::OperatingPoint {
+            let message = msgs::OperatingPoint {
                 header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
                 seq,
                 normal_load_n: 500.0,
@@ -617,7 +617,7 @@ mod tests {
         let thread = std::thread::spawn(move || node.run(&receiver));
         let (mut seq, mut at_once, mut all) = (0, 0, vec![]);
         let mut ask = |disc_speed_rad_s: f64| {
-            let message = wire::OperatingPoint {
+            let message = msgs::OperatingPoint {
                 header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
                 seq,
                 normal_load_n: 500.0,
@@ -677,7 +677,7 @@ mod tests {
         };
         let input = |seq: u64| {
             let header = Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() };
-            let point = wire::OperatingPoint {
+            let point = msgs::OperatingPoint {
                 header,
                 seq,
                 normal_load_n: 500.0,
@@ -703,12 +703,12 @@ mod tests {
     fn old_inputs_are_passed_over_but_for_the_newest() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
         let (sender, receiver) = channel();
-        let mut old = Heard::now(Bus::Shm, wire::OperatingPoint::default());
+        let mut old = Heard::now(Bus::Shm, msgs::OperatingPoint::default());
         while clock::monotonic_ns().saturating_sub(old.at.monotonic_ns) <= LATEST.as_nanos() as u64 {
             std::thread::sleep(Duration::from_millis(10));
         }
         for seq in 0..3 {
-            old.message = wire::OperatingPoint {
+            old.message = msgs::OperatingPoint {
                 seq,
                 normal_load_n: 500.0,
                 disc_speed_rad_s: 13.0,

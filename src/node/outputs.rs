@@ -8,10 +8,10 @@ use crate::bus::heard::Counts;
 use crate::bus::ros2::NODE_NAME;
 use crate::bus::ros2::process::{Health, Ros2Process};
 use crate::bus::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};
+use crate::msgs::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
 use crate::recording::message::{Message, Payload};
 use crate::recording::recorder::RecorderHandle;
 use crate::system::clock::Reading;
-use crate::wire::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
 
 /// The buses and the recorder of a node; each is optional.
 #[derive(Default)]

@@ -70,8 +70,8 @@ fn read(folder: &Path) -> Vec<Payload> {
     recording.messages().filter_map(|entry| known(entry.message)).collect()
 }
 
-fn conditions(seq: u64) -> wire::OperatingPoint {
-    wire::OperatingPoint {
+fn conditions(seq: u64) -> msgs::OperatingPoint {
+    msgs::OperatingPoint {
         header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
         seq,
         normal_load_n: 500.0,
@@ -92,7 +92,7 @@ fn inputs(recorded: &[Payload]) -> Vec<u64> {
 }
 
 fn predicted(recorded: &[Payload]) -> Vec<(u64, bool)> {
-    let fault = |level| level == wire::level::FAULT;
+    let fault = |level| level == msgs::level::FAULT;
     let of = |p: &Payload| if let Payload::Prediction(p) = p { Some((p.input_seq, fault(p.level))) } else { None };
     recorded.iter().filter_map(of).collect()
 }
@@ -100,7 +100,7 @@ fn predicted(recorded: &[Payload]) -> Vec<(u64, bool)> {
 #[test]
 fn silence_is_a_fault_once_and_the_next_input_ends_it() {
     const TIMEOUT: Duration = Duration::from_millis(50);
-    let fault = |node: &Recorded9Dof| node.level() == Some(wire::level::FAULT);
+    let fault = |node: &Recorded9Dof| node.level() == Some(msgs::level::FAULT);
     let change = |settings: &mut Settings| settings.silence_timeout_s = TIMEOUT.as_secs_f64();
     let node = Recorded9Dof::start(change, vec![heard_now(0)]);
     node.until("a fault", fault);
@@ -187,7 +187,7 @@ fn a_clock_that_is_set_does_not_bend_a_recording() {
 /// prediction.
 #[test]
 fn the_recorder_has_room_for_what_the_buses_keep_twice_over() {
-    use crate::wire::shm::{Form, OperatingPointForm};
+    use crate::msgs::shm::{Form, OperatingPointForm};
     let kept = 2 * OperatingPointForm::WAITING_SAMPLES;
     assert!(QUEUE_MESSAGES >= 2 * 2 * kept, "{QUEUE_MESSAGES} for {kept} inputs");
 }

@@ -1,9 +1,9 @@
 //! The message with the sensitivities of a prediction to conditions and contact.
 
+use crate::msgs::{Derivatives, Header, ModeSensitivity, PairSensitivity, Prediction, Sensitivity, sensitivity_law};
 use crate::physics::sensitivity::{Change, of_roots};
 use crate::physics::{End, Ends, OperatingPoint, Solver, StabilityMap, Vectors};
 use crate::rig::Rig;
-use crate::wire::{Derivatives, Header, ModeSensitivity, PairSensitivity, Prediction, Sensitivity, sensitivity_law};
 
 /// A request for the sensitivities of a prediction.
 #[derive(Clone, Debug)]

@@ -7,7 +7,7 @@ use crossbeam_channel::Sender;
 
 use super::{Incoming, Node};
 use crate::bus::heard::Heard;
-use crate::wire;
+use crate::msgs;
 
 /// Holds the node while it runs; whoever has the lock may use it.
 #[derive(Clone, Default)]
@@ -35,7 +35,7 @@ impl Shortcut {
     /// Predicts for an input on this thread if it needs no dense solve, the node is idle, and no input waits in the
     /// channel or on the bus (`more_waits`). Otherwise queues it. Never blocks. False if the channel is full and the
     /// input is lost.
-    pub fn input(&self, heard: Heard<wire::OperatingPoint>, more_waits: bool) -> bool {
+    pub fn input(&self, heard: Heard<msgs::OperatingPoint>, more_waits: bool) -> bool {
         // Items are only taken out of the channel under this lock. If the channel is empty here, no input can be
         // overtaken.
         if !more_waits

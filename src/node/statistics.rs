@@ -6,11 +6,11 @@ use std::time::Duration;
 use super::Outputs;
 use super::status::{Inputs, Status};
 use crate::bus::heard::{Bus, Counts};
+use crate::msgs::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
 use crate::physics::Chart;
 use crate::recording::recorder::State;
 use crate::rig::Rig;
 use crate::session::Counters;
-use crate::wire::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
 
 /// Levels of `diagnostic_msgs/DiagnosticStatus`.
 mod diagnostic_level {
@@ -255,7 +255,7 @@ fn pair(key: &str, value: impl ToString) -> KeyValue {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::level;
+    use crate::msgs::level;
 
     struct Reporter {
         statistics: Statistics,

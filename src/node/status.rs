@@ -6,9 +6,10 @@ use std::fmt::Write;
 use serde::Serialize;
 
 use super::watch::{UnstableMode, fastest_modes};
+use crate::msgs::{OperatingPoint, Prediction, level};
 use crate::physics::{Ends, OperatingPoint as Point, StabilityMap};
+use crate::session::conditions;
 use crate::text::number::significant;
-use crate::wire::{OperatingPoint, Prediction, level};
 
 /// The status of a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
@@ -175,7 +176,7 @@ impl Assessment {
         let [fastest, ..] = fastest_modes(prediction);
         let input = input.filter(|input| input.seq == prediction.input_seq);
         let next = input.zip(windows).and_then(|(input, (map, ends))| {
-            NextSqueal::new(prediction, &input.point(), map, ends).filter(|_| status.is_known())
+            NextSqueal::new(prediction, &conditions(&input), map, ends).filter(|_| status.is_known())
         });
         let fastest = fastest.filter(|_| status.is_known());
         let message = match status {
@@ -242,10 +243,10 @@ impl InputSources {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::msgs::Mode;
     use crate::physics::Solver;
     use crate::rig::Rig;
     use crate::session::map_options;
-    use crate::wire::Mode;
 
     fn inputs(heard: bool, silent: bool) -> Inputs {
         Inputs { heard, silent }

@@ -6,10 +6,10 @@ use std::time::Instant;
 use serde::Serialize;
 
 use super::status::{Assessment, Inputs, Status};
+use crate::msgs::{OperatingPoint, Prediction, Vibration};
 use crate::physics::{Ends, NextWindow, StabilityMap};
-use crate::session::Counters;
+use crate::session::{Counters, conditions};
 use crate::system::clock;
-use crate::wire::{OperatingPoint, Prediction, Vibration};
 
 /// The state of a node as displays show it.
 #[derive(Clone, Debug, Default)]
@@ -49,7 +49,7 @@ impl Snapshot {
         let prediction = self.prediction.as_ref().filter(|prediction| !prediction.friction_margin.is_nan())?;
         let input = self.input.as_ref().filter(|input| input.seq == prediction.input_seq)?;
         let map = self.map.as_deref()?;
-        map.next_window(self.ends.as_deref().unwrap_or(&map.ends), &input.point())
+        map.next_window(self.ends.as_deref().unwrap_or(&map.ends), &conditions(&input))
     }
 }
 
@@ -259,7 +259,7 @@ impl Watch {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::{Mode, level};
+    use crate::msgs::{Mode, level};
 
     fn prediction(growth: &[f64], unstable_modes: u32) -> Prediction {
         let mode =

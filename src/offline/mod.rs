@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use crate::msgs::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
 use crate::node::{
     at_load_and_speed, chart_hash, ends_hash, map_hash, parameter_event, rig_info, session_ends, session_map,
 };
@@ -17,9 +18,8 @@ use crate::physics::{self, Chart, Solver};
 use crate::recording::message::{Message, Payload};
 use crate::recording::recorder::{Recorder, RecorderConfig, RecorderError};
 use crate::rig::Rig;
-use crate::session::settings::Settings;
 use crate::session::{Event, Session, Want};
-use crate::wire::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
+use crate::session::{conditions, settings::Settings};
 use ahead::Ahead;
 
 /// Stamp of the first input of a simulated offline session, ns since the epoch: 2024-01-01T00:00:00Z. Fixed, so that
@@ -208,7 +208,7 @@ impl Offline {
 
     /// Computes the stability map that the prediction for `input` needs, if the session does not have it.
     fn prepare(&mut self, input: &OperatingPoint, log_time_ns: u64) {
-        let point = input.point();
+        let point = conditions(&input);
         if self.session.lacks_map(&point) {
             self.map(input.header.stamp, log_time_ns, &point);
         }

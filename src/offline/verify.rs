@@ -12,14 +12,14 @@ use bytes::Bytes;
 
 use super::ahead::Ahead;
 use crate::files::chart_file::ChartFile;
+use crate::msgs::{self, Prediction, SessionEvent, Time, event_kind};
 use crate::node::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map};
 use crate::physics::{OperatingPoint, Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded, Recording};
 use crate::rig::Rig;
-use crate::session::settings::Settings;
 use crate::session::{Event, Session};
-use crate::wire::{self, Prediction, SessionEvent, Time, event_kind};
+use crate::session::{conditions, settings::Settings};
 
 /// Number of differences described in words; all others are only counted.
 const DESCRIBED: usize = 10;
@@ -119,7 +119,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
     };
     let predicted = recording.messages().filter_map(|entry| match entry.message {
         Recorded::Known(Payload::OperatingPoint(input)) => {
-            answered.contains(&(input.header.stamp, input.seq)).then(|| input.point())
+            answered.contains(&(input.header.stamp, input.seq)).then(|| conditions(&input))
         }
         _ => None,
     });
@@ -237,7 +237,7 @@ fn compare(
     computed: &Prediction,
     found: &mut Verification,
 ) -> Result<(), VerifyError> {
-    let computed_bytes = wire::to_cdr(computed).map_err(|error| VerifyError::Encode(error.to_string()))?;
+    let computed_bytes = msgs::to_cdr(computed).map_err(|error| VerifyError::Encode(error.to_string()))?;
     if recorded_bytes == computed_bytes {
         found.identical += 1;
         return Ok(());
@@ -252,7 +252,7 @@ fn compare(
     }
     found.describe(|| {
         let words = |p: &Prediction| {
-            let (level, count) = (wire::level::name(p.level), p.modes.len());
+            let (level, count) = (msgs::level::name(p.level), p.modes.len());
             format!("{level}, {count} modes, margin {}, growth {} 1/s", p.friction_margin, p.max_growth_rate_per_s)
         };
         format!("seq {}: recorded {}; now {}", recorded.input_seq, words(recorded), words(computed))

@@ -20,7 +20,7 @@ use mcap::{
 use super::bag::{FileSummary, TopicInfo};
 use super::record_walker::Attachment;
 use crate::files::whole_file::{WholeFile, WholeFileError, folder_of, sync_open_folder};
-use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
+use crate::msgs::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
 
 /// A chunk is closed by the first message after this many bytes; including that message it stays below 768 KiB.
 const CHUNK_BYTES: u64 = 640 << 10;

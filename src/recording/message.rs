@@ -1,7 +1,7 @@
 //! Recorded messages of all topics of the node.
 
-use crate::wire::{
-    self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Time, Vibration,
+use crate::msgs::{
+    self, CdrError, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Time, Vibration,
     schema::Topic,
 };
 
@@ -49,15 +49,15 @@ impl Payload {
     /// # Errors
     ///
     /// Content that CDR cannot represent, such as a string longer than 4 GiB.
-    pub fn to_cdr(&self) -> Result<Vec<u8>, cdr_encoding::Error> {
+    pub fn to_cdr(&self) -> Result<Vec<u8>, CdrError> {
         match self {
-            Self::OperatingPoint(message) => wire::to_cdr(message),
-            Self::Prediction(message) => wire::to_cdr(message),
-            Self::SessionEvent(message) => wire::to_cdr(message),
-            Self::RigInfo(message) => wire::to_cdr(message),
-            Self::Sensitivity(message) => wire::to_cdr(message),
-            Self::Diagnostics(message) => wire::to_cdr(message),
-            Self::Vibration(message) => wire::to_cdr(message),
+            Self::OperatingPoint(message) => msgs::to_cdr(message),
+            Self::Prediction(message) => msgs::to_cdr(message),
+            Self::SessionEvent(message) => msgs::to_cdr(message),
+            Self::RigInfo(message) => msgs::to_cdr(message),
+            Self::Sensitivity(message) => msgs::to_cdr(message),
+            Self::Diagnostics(message) => msgs::to_cdr(message),
+            Self::Vibration(message) => msgs::to_cdr(message),
         }
     }
 
@@ -66,15 +66,15 @@ impl Payload {
     /// # Errors
     ///
     /// The bytes are not a message of that type.
-    pub fn from_cdr(topic: Topic, cdr: &[u8]) -> Result<Self, cdr_encoding::Error> {
+    pub fn from_cdr(topic: Topic, cdr: &[u8]) -> Result<Self, CdrError> {
         Ok(match topic {
-            Topic::OperatingPoint => Self::OperatingPoint(wire::from_cdr(cdr)?),
-            Topic::Prediction => Self::Prediction(wire::from_cdr(cdr)?),
-            Topic::SessionEvent => Self::SessionEvent(wire::from_cdr(cdr)?),
-            Topic::RigInfo => Self::RigInfo(wire::from_cdr(cdr)?),
-            Topic::Sensitivity => Self::Sensitivity(wire::from_cdr(cdr)?),
-            Topic::Diagnostics => Self::Diagnostics(wire::from_cdr(cdr)?),
-            Topic::Vibration => Self::Vibration(wire::from_cdr(cdr)?),
+            Topic::OperatingPoint => Self::OperatingPoint(msgs::from_cdr(cdr)?),
+            Topic::Prediction => Self::Prediction(msgs::from_cdr(cdr)?),
+            Topic::SessionEvent => Self::SessionEvent(msgs::from_cdr(cdr)?),
+            Topic::RigInfo => Self::RigInfo(msgs::from_cdr(cdr)?),
+            Topic::Sensitivity => Self::Sensitivity(msgs::from_cdr(cdr)?),
+            Topic::Diagnostics => Self::Diagnostics(msgs::from_cdr(cdr)?),
+            Topic::Vibration => Self::Vibration(msgs::from_cdr(cdr)?),
         })
     }
 }

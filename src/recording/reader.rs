@@ -18,7 +18,7 @@ use super::message::Payload;
 use super::record_walker::{Attachment, Channel, Damage, Depth, Item, RawMessage, RecordWalker};
 use super::topics::{ChoiceError, RecordedTopics, Unread};
 use crate::files::input_file;
-use crate::wire::schema::Topic;
+use crate::msgs::{CdrError, schema::Topic};
 
 /// Messages are read ahead in batches: the largest number of messages in a batch, the unpacked bytes after which a
 /// batch ends, and the number of batches kept ahead.
@@ -356,7 +356,7 @@ impl Iterator for Messages<'_> {
 }
 
 /// Why a message cannot be decoded.
-fn undecodable(data: &[u8], error: &cdr_encoding::Error) -> String {
+fn undecodable(data: &[u8], error: &CdrError) -> String {
     if data.starts_with(&ZSTD_MAGIC) {
         return "compressed message by message; `ros2 bag convert` makes a recording without".to_owned();
     }

@@ -8,7 +8,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use super::record_walker::Channel;
-use crate::wire::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic, field_difference};
+use crate::msgs::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic, field_difference};
 
 /// Why a topic is not read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

@@ -9,6 +9,7 @@ use std::fmt::Write;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 
+use crate::msgs::{self, Header, MAX_MODES, Prediction, Time, level};
 use crate::physics::chart::build::ChartOptions;
 use crate::physics::chart::{Chart, Scratch};
 use crate::physics::{
@@ -17,14 +18,22 @@ use crate::physics::{
 };
 use crate::rig::Rig;
 use crate::text::number::Significant;
-use crate::wire::{self, Header, MAX_MODES, Prediction, Time, level};
 use settings::{SettingError, Settings};
+
+/// The operating point of an input, as the physics uses it.
+pub fn conditions(input: &msgs::OperatingPoint) -> OperatingPoint {
+    OperatingPoint {
+        normal_load_n: input.normal_load_n,
+        disc_speed_rad_s: input.disc_speed_rad_s,
+        friction_coefficient: input.friction_coefficient,
+    }
+}
 
 /// An event that advances a session.
 #[derive(Clone, Debug)]
 pub enum Event {
     /// An operating point to predict for.
-    Input(wire::OperatingPoint),
+    Input(msgs::OperatingPoint),
     /// A setting changed.
     Parameter { name: String, value: f64 },
     /// No input came for [`Settings::silence_timeout_s`]; `stamp` is the time at which that was detected.
@@ -283,8 +292,8 @@ impl Session {
     }
 
     /// Predicts for an input; returns what should be computed for later predictions.
-    fn input(&mut self, input: wire::OperatingPoint) -> Option<Want> {
-        let point = input.point();
+    fn input(&mut self, input: msgs::OperatingPoint) -> Option<Want> {
+        let point = conditions(&input);
         let (header, seq) = (input.header, input.seq);
         let nanosec = header.stamp.nanosec;
         if nanosec >= 1_000_000_000 {
@@ -541,7 +550,7 @@ fn same(a: &OperatingPoint, b: &OperatingPoint) -> bool {
 
 /// Copies the modes to publish to `out`, in ascending frequency. Of more than [`MAX_MODES`], those with the largest
 /// growth rates are kept. `order` is a buffer for sorting.
-fn publish_modes(modes: &[Mode], order: &mut Vec<usize>, out: &mut Vec<wire::Mode>) {
+fn publish_modes(modes: &[Mode], order: &mut Vec<usize>, out: &mut Vec<msgs::Mode>) {
     order.clear();
     order.extend(0..modes.len());
     if modes.len() > MAX_MODES {
@@ -553,7 +562,7 @@ fn publish_modes(modes: &[Mode], order: &mut Vec<usize>, out: &mut Vec<wire::Mod
     out.clear();
     out.extend(order.iter().map(|&k| {
         let Mode { id, root } = modes[k];
-        wire::Mode {
+        msgs::Mode {
             id,
             frequency_hz: root.frequency_hz(),
             growth_rate_per_s: root.growth_rate_per_s(),

@@ -11,7 +11,7 @@ fn session() -> Session {
 }
 
 fn conditions(seq: u64, load: f64, speed: f64, mu: f64) -> Event {
-    Event::Input(wire::OperatingPoint {
+    Event::Input(msgs::OperatingPoint {
         header: Header { stamp: Time::from_ns(1_000_000_000 + 1_000_000 * seq as i64), ..Default::default() },
         seq,
         normal_load_n: load,

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender};
 use squealcast::bus::heard::Heard;
 use squealcast::bus::shm::ShmOptions;
-use squealcast::wire::{Header, Mode, OperatingPoint, Prediction, Time, level};
+use squealcast::msgs::{Header, Mode, OperatingPoint, Prediction, Time, level};
 
 pub const PATIENCE: Duration = Duration::from_secs(60);
 

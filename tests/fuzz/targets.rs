@@ -9,6 +9,7 @@ use std::sync::LazyLock;
 use squealcast::bus::params_file;
 use squealcast::full_model::FullModelFile;
 use squealcast::import::tribometer_log;
+use squealcast::msgs::schema::Topic;
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::{Chart, OperatingPoint, Traces};
 use squealcast::recording::message::Payload;
@@ -16,7 +17,6 @@ use squealcast::recording::reader::Recording;
 use squealcast::recording::recover::recover;
 use squealcast::rig::{Rig, RigFile, matrix_market, npz, scale, uff};
 use squealcast::simulator::Profile;
-use squealcast::wire::schema::Topic;
 use tempfile::TempDir;
 
 /// A reader by name.

@@ -4,11 +4,11 @@
 use std::path::Path;
 use std::time::Duration;
 
+use squealcast::msgs::{Header, Mode, OperatingPoint, Prediction, RigInfo, Time};
 use squealcast::recording::message::{Message, Payload};
 use squealcast::recording::reader::{Entry, Recorded, Recording};
 use squealcast::recording::recorder::RecorderConfig;
 use squealcast::rig::RigFile;
-use squealcast::wire::{Header, Mode, OperatingPoint, Prediction, RigInfo, Time};
 
 /// The start of the recordings made here, ns since the epoch.
 pub const T0: u64 = 1_700_000_000_000_000_000;

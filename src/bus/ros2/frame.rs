@@ -11,8 +11,10 @@ use thiserror::Error;
 
 use super::Ros2Options;
 use crate::bus::heard::Counts;
+use crate::msgs::{
+    self, CdrError, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration,
+};
 use crate::system::clock::Reading;
-use crate::wire::{self, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration};
 
 /// Longest frame that the node accepts from its ROS 2 side, bytes.
 pub(super) const MAX_FROM_SIDE: usize = 1 << 16;
@@ -84,13 +86,13 @@ pub(super) enum FrameError {
     #[error("frame of {bytes} bytes, at most {limit} are accepted")]
     TooLong { bytes: usize, limit: usize },
     #[error("malformed frame: {0}")]
-    Malformed(#[from] cdr_encoding::Error),
+    Malformed(#[from] CdrError),
 }
 
 /// The bytes of a frame, its length included.
 pub(super) fn encode(frame: &impl Serialize) -> Result<Vec<u8>, FrameError> {
     let mut bytes = vec![0; LENGTH_BYTES];
-    bytes.append(&mut wire::to_cdr(frame)?);
+    bytes.append(&mut msgs::to_cdr(frame)?);
     let length = bytes.len() - LENGTH_BYTES;
     let too_long = |_| FrameError::TooLong { bytes: length, limit: u32::MAX as usize };
     bytes[..LENGTH_BYTES].copy_from_slice(&u32::try_from(length).map_err(too_long)?.to_le_bytes());
@@ -154,7 +156,7 @@ impl<R: Read> Frames<R> {
             return Err(FrameError::TooLong { bytes: length, limit: self.limit });
         }
         let Some(body) = body.get(..length) else { return Ok(None) };
-        let frame = wire::from_cdr(body)?;
+        let frame = msgs::from_cdr(body)?;
         self.begin += LENGTH_BYTES + length;
         Ok(Some(frame))
     }
@@ -163,7 +165,7 @@ impl<R: Read> Frames<R> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::wire::{Header, Mode, Time};
+    use crate::msgs::{Header, Mode, Time};
 
     fn input(seq: u64) -> FromSide {
         let header = Header { stamp: Time::from_ns(-5), frame_id: "rig".to_owned() };

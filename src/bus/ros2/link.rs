@@ -19,7 +19,7 @@ use super::ears::{Ears, Refused};
 use super::loopback::keep_to_loopback;
 use super::qos_conflicts::QosConflicts;
 use super::{Ros2Error, Ros2Options, heard};
-use crate::wire::topic;
+use crate::msgs::topic;
 
 /// Samples that may wait for the thread that reads a subscription; RustDDS acknowledges samples beyond it and drops
 /// them. After a loss a reliable subscription delivers nothing until the sample is retransmitted, and then everything

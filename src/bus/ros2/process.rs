@@ -20,7 +20,7 @@ use crossbeam_channel::{Receiver, Sender, bounded, select};
 use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide, encode};
 use super::{NOTE, Ros2Error, Ros2Options};
 use crate::bus::heard::{Bus, Counts, Heard};
-use crate::wire::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
+use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
 /// The command that runs the ROS 2 side of a node.
 pub const COMMAND: &str = "ros2-side";

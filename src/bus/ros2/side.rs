@@ -20,8 +20,8 @@ use serde::Serialize;
 use super::frame::{Frames, FromSide, MAX_TO_SIDE, Next, Start, Status, ToSide, encode};
 use super::{Parameters, Ros2, Ros2Error};
 use crate::bus::heard::Heard;
+use crate::msgs::Prediction;
 use crate::system::memory;
-use crate::wire::Prediction;
 
 /// Limit on the private memory of this process, bytes (`RLIMIT_DATA`). An allocation beyond it aborts the process.
 const MEMORY_LIMIT: u64 = 256 << 20;

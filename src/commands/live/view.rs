@@ -6,10 +6,10 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph, Row, Table};
 
 use super::Frame;
+use crate::msgs::Mode;
 use crate::node::Snapshot;
 use crate::node::status::{Assessment, Status};
 use crate::text::number::{above_error, significant};
-use crate::wire::Mode;
 
 /// Number of rows reserved for the table of modes, including border and header, however long the text above it is.
 const LEAST_TABLE: u16 = 5;
@@ -254,9 +254,9 @@ pub mod tests {
     use ratatui::buffer::Buffer;
 
     use super::*;
+    use crate::msgs::{Header, OperatingPoint, Prediction, Time, level};
     use crate::node::Watch;
     use crate::node::status::InputSources;
-    use crate::wire::{Header, OperatingPoint, Prediction, Time, level};
 
     /// What a node shows at each status: 57 modes, of which the 2nd and the 16th grow fastest.
     pub fn snapshot(status: Status) -> Snapshot {

@@ -12,12 +12,12 @@ use crossbeam_channel::{Receiver, RecvTimeoutError};
 use mcap::records::Metadata;
 
 use super::{Command, METADATA_NAME, RecorderConfig, RecorderError, Shared, State, chain, make_directory};
+use crate::msgs::{event_kind, schema::Topic};
 use crate::recording::bag::{self, FileSummary};
 use crate::recording::mcap_file::{RecordingFile, Whereabouts, WriteError};
 use crate::recording::message::{Message, Payload};
 use crate::recording::record_walker::Attachment;
 use crate::recording::recover::ACTIVE;
-use crate::wire::{event_kind, schema::Topic};
 
 /// Free space required before a new file is begun after a failure, bytes, so that it does not fail again at once.
 const WANTED_FREE_BYTES: u64 = 32 << 20;

@@ -1,13 +1,35 @@
-//! The messages of `msgs/`: their form on ROS 2 and in recordings, and their shared-memory forms.
+//! The messages of squealcast: what a rig sends to the node and what the node publishes.
 //!
-//! The structs below match the `.msg` files field by field; serde gives their CDR encoding.
+//! Every list is here once: the messages with their CDR encoding on ROS 2 and in recordings (this module), the topics
+//! with their MCAP schemas ([`schema`]), and the fixed-size forms in shared memory ([`shm`]). The `.msg` files of the ROS 2
+//! package `squealcast_msgs` are in the same folder; the structs match them field by field.
+//!
+//! A program that sends conditions over ROS 2 or writes them to a recording encodes an [`OperatingPoint`]:
+//!
+//! ```
+//! use squealcast_msgs::{Header, OperatingPoint, Time, from_cdr, to_cdr};
+//!
+//! let conditions = OperatingPoint {
+//!     header: Header { stamp: Time::from_ns(1_700_000_000_000_000_000), frame_id: "rig".to_owned() },
+//!     seq: 1,
+//!     normal_load_n: 500.0,
+//!     disc_speed_rad_s: 13.0,
+//!     friction_coefficient: 0.35,
+//! };
+//! let bytes = to_cdr(&conditions)?;
+//! assert_eq!(from_cdr::<OperatingPoint>(&bytes)?, conditions);
+//! # Ok::<(), squealcast_msgs::CdrError>(())
+//! ```
+//!
+//! `examples/shared_memory_client.rs` sends conditions over shared memory and prints what is predicted.
+
+#![warn(missing_docs)]
 
 pub mod schema;
 pub mod shm;
 
+pub use cdr_encoding::Error as CdrError;
 use serde::{Deserialize, Serialize};
-
-use crate::physics;
 
 /// Topic names in recordings, and on ROS 2 for a node in the namespace `/`.
 pub mod topic {
@@ -42,125 +64,192 @@ pub const MAX_MODES: usize = 64;
 /// `builtin_interfaces/Time`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Time {
+    /// Whole seconds since the Unix epoch.
     pub sec: i32,
+    /// Nanoseconds within the second, below 10⁹.
     pub nanosec: u32,
 }
 
 /// `std_msgs/Header`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Header {
+    /// Time of measurement.
     pub stamp: Time,
+    /// Source of the measurement; `simulated` marks a simulated rig.
     pub frame_id: String,
 }
 
 /// `squealcast_msgs/OperatingPoint`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct OperatingPoint {
+    /// The stamp is the time of measurement.
     pub header: Header,
+    /// Sequence number; a gap means lost inputs.
     pub seq: u64,
+    /// Normal load, N.
     pub normal_load_n: f64,
+    /// Disc speed, rad/s; its sign is the direction of rotation.
     pub disc_speed_rad_s: f64,
+    /// Measured friction coefficient.
     pub friction_coefficient: f64,
 }
 
 /// `squealcast_msgs/Vibration`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Vibration {
+    /// The stamp is the time of measurement.
     pub header: Header,
+    /// Frequency of the highest peak of the spectrum, Hz.
     pub frequency_hz: f64,
+    /// Level of that peak, dB; the reference is that of the instrument.
     pub level_db: f64,
 }
 
 /// `squealcast_msgs/Mode`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Mode {
+    /// Identity of the mode; it stays the same as conditions change.
     pub id: u32,
+    /// `|Im λ| / 2π`, Hz.
     pub frequency_hz: f64,
+    /// `Re λ`, 1/s; positive if the mode grows.
     pub growth_rate_per_s: f64,
+    /// `-Re λ / |λ|`.
     pub damping_ratio: f64,
+    /// The pad's share in the mode, 0 to 1; NaN if unknown.
     pub pad_participation: f64,
+    /// Scaled residual of the eigenpair; for a charted root, a bound of it.
     pub residual: f64,
+    /// Bound of the error of `frequency_hz`, Hz; NaN if unknown.
     pub frequency_error_hz: f64,
+    /// Bound of the error of `growth_rate_per_s`, 1/s; NaN if unknown.
     pub growth_rate_error_per_s: f64,
 }
 
 /// `squealcast_msgs/Prediction`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Prediction {
+    /// Header of the input; the stamp is its time of measurement.
     pub header: Header,
+    /// Sequence number of the input.
     pub input_seq: u64,
+    /// One of [`level`].
     pub level: u8,
+    /// Whether the last prediction was kept because the conditions stayed within the dead-band.
     pub reused: bool,
+    /// Number of unstable modes in the band.
     pub unstable_modes: u32,
+    /// Growth rate of the fastest growing mode, 1/s.
     pub max_growth_rate_per_s: f64,
+    /// Frequency of the fastest growing mode, Hz, if it is unstable; else NaN.
     pub worst_frequency_hz: f64,
+    /// End of a window of instability nearest to the friction coefficient; NaN if there is none or it is not known yet.
     pub critical_friction: f64,
+    /// Distance to `critical_friction`: positive outside a window, negative inside.
     pub friction_margin: f64,
+    /// Bound of the error of the margin; NaN if unknown.
     pub friction_margin_error: f64,
+    /// The limit that decided the level, and notes.
     pub reason: String,
+    /// Modes of the band in ascending frequency; of more than [`MAX_MODES`], those that grow fastest.
     pub modes: Vec<Mode>,
 }
 
 /// `squealcast_msgs/Derivatives`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Derivatives {
+    /// With respect to the friction coefficient.
     pub by_friction_coefficient: f64,
+    /// With respect to the normal load, per N.
     pub by_normal_load_n: f64,
+    /// With respect to the disc speed, per rad/s.
     pub by_disc_speed_rad_s: f64,
+    /// With respect to the logarithm of a factor on the stiffness of all contact pairs; NaN without contact pairs.
     pub by_contact_stiffness: f64,
+    /// With respect to the logarithm of a factor on the damping of all contact pairs; NaN without contact pairs.
     pub by_contact_damping: f64,
 }
 
 /// `squealcast_msgs/ModeSensitivity`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ModeSensitivity {
+    /// Identity of the mode.
     pub id: u32,
+    /// One of [`sensitivity_law`].
     pub law: u8,
+    /// Derivatives of the frequency, Hz.
     pub frequency_hz: Derivatives,
+    /// Derivatives of the growth rate, 1/s.
     pub growth_rate_per_s: Derivatives,
 }
 
 /// The values of [`ModeSensitivity::law`].
 pub mod sensitivity_law {
+    /// Root and conditions are related linearly to first order.
     pub const LINEAR: u8 = 0;
+    /// Too close to merging for a tangent; the law of the pair is in [`Sensitivity::pairs`].
     pub const SQUARE_ROOT: u8 = 1;
 }
 
 /// `squealcast_msgs/PairSensitivity`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PairSensitivity {
+    /// Identity of one mode.
     pub first_id: u32,
+    /// Identity of the other mode.
     pub second_id: u32,
+    /// Whether `z` is `λ²` (undamped rigs); otherwise it is `λ`.
     pub squares: bool,
+    /// Real part of the mean of both `z`.
     pub mean_real: f64,
+    /// Imaginary part of the mean of both `z`.
     pub mean_imaginary: f64,
+    /// Real part of the square of half the difference of both `z`.
     pub discriminant_real: f64,
+    /// Imaginary part of the square of half the difference of both `z`.
     pub discriminant_imaginary: f64,
+    /// Derivatives of `mean_real`.
     pub mean_real_derivatives: Derivatives,
+    /// Derivatives of `mean_imaginary`.
     pub mean_imaginary_derivatives: Derivatives,
+    /// Derivatives of `discriminant_real`.
     pub discriminant_real_derivatives: Derivatives,
+    /// Derivatives of `discriminant_imaginary`.
     pub discriminant_imaginary_derivatives: Derivatives,
 }
 
 /// `squealcast_msgs/Sensitivity`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Sensitivity {
+    /// Header of the input it was computed for.
     pub header: Header,
+    /// Sequence number of that input.
     pub input_seq: u64,
+    /// Normal load of that input, N.
     pub normal_load_n: f64,
+    /// Disc speed of that input, rad/s.
     pub disc_speed_rad_s: f64,
+    /// Friction coefficient of that input.
     pub friction_coefficient: f64,
+    /// End of a window of instability nearest to the friction coefficient; NaN if unknown.
     pub nearest_window_end: f64,
+    /// Derivatives of that end; 0 with respect to the friction coefficient.
     pub nearest_window_end_derivatives: Derivatives,
+    /// The modes of the prediction.
     pub modes: Vec<ModeSensitivity>,
+    /// Pairs of modes that are close to merging.
     pub pairs: Vec<PairSensitivity>,
 }
 
 /// The values of [`Prediction::level`].
 pub mod level {
+    /// No mode is close to instability.
     pub const OK: u8 = 0;
+    /// An unstable window or low damping is near.
     pub const WARN: u8 = 1;
+    /// A mode grows.
     pub const SQUEAL: u8 = 2;
+    /// No prediction could be made.
     pub const FAULT: u8 = 3;
 
     /// The name of a level.
@@ -177,56 +266,83 @@ pub mod level {
 /// `squealcast_msgs/RigInfo`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RigInfo {
+    /// Name of the rig.
     pub name: String,
+    /// SHA-256 of the rig file and of every file it refers to.
     pub content_hash: String,
+    /// Version of the program.
     pub version: String,
+    /// Number of modes.
     pub mode_count: u32,
+    /// Highest frequency that is listed and judged, Hz.
     pub band_max_hz: f64,
+    /// How the rig differs from the full model it was reduced from; empty if unknown.
     pub reduction: String,
 }
 
 /// `squealcast_msgs/SessionEvent`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SessionEvent {
+    /// The stamp of the event.
     pub header: Header,
+    /// One of [`event_kind`].
     pub kind: u8,
+    /// Of a parameter: its name.
     pub name: String,
+    /// Of a parameter: its value.
     pub value: f64,
+    /// Of a stability map or window ends: the load they hold for, N.
     pub normal_load_n: f64,
+    /// Of a stability map or window ends: the disc speed they hold for, rad/s.
     pub disc_speed_rad_s: f64,
+    /// Of a stability map, window ends or a chart: hash of the content.
     pub hash: String,
 }
 
 /// The values of [`SessionEvent::kind`].
 pub mod event_kind {
+    /// A setting changed.
     pub const PARAMETER: u8 = 0;
+    /// No input arrived in time.
     pub const SILENCE: u8 = 1;
+    /// A stability map was computed.
     pub const STABILITY_MAP: u8 = 2;
+    /// A chart was completed.
     pub const CHART: u8 = 3;
+    /// Ends of windows were computed.
     pub const WINDOW_ENDS: u8 = 4;
 }
 
 /// `diagnostic_msgs/DiagnosticArray`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct DiagnosticArray {
+    /// The stamp is the time of publication.
     pub header: Header,
+    /// One entry per component.
     pub status: Vec<DiagnosticStatus>,
 }
 
 /// `diagnostic_msgs/DiagnosticStatus`; level OK=0, WARN=1, ERROR=2, STALE=3.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct DiagnosticStatus {
+    /// OK=0, WARN=1, ERROR=2, STALE=3.
     pub level: u8,
+    /// Component.
     pub name: String,
+    /// Summary.
     pub message: String,
+    /// Name of the rig.
     pub hardware_id: String,
+    /// Details.
     pub values: Vec<KeyValue>,
 }
 
 /// `diagnostic_msgs/KeyValue`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct KeyValue {
+    /// Name of the value.
     pub key: String,
+    /// The value as text.
     pub value: String,
 }
 
@@ -240,7 +356,8 @@ impl Derivatives {
         by_contact_damping: f64::NAN,
     };
 
-    /// From derivatives in the order of [`physics::Parameter::ALL`].
+    /// From derivatives with respect to friction coefficient, normal load, disc speed, contact stiffness and contact
+    /// damping.
     pub fn new(derivatives: [f64; 5]) -> Self {
         let [friction, load, speed, stiffness, damping] = derivatives;
         Self {
@@ -252,7 +369,7 @@ impl Derivatives {
         }
     }
 
-    /// In the order of [`physics::Parameter::ALL`].
+    /// In the order of [`Derivatives::new`].
     pub fn values(&self) -> [f64; 5] {
         [
             self.by_friction_coefficient,
@@ -277,19 +394,8 @@ impl Time {
     }
 }
 
-impl OperatingPoint {
-    /// The operating point as the physics uses it.
-    pub fn point(&self) -> physics::OperatingPoint {
-        physics::OperatingPoint {
-            normal_load_n: self.normal_load_n,
-            disc_speed_rad_s: self.disc_speed_rad_s,
-            friction_coefficient: self.friction_coefficient,
-        }
-    }
-}
-
 /// The CDR encoding of a message: encapsulation header `00 01 00 00`, then little-endian CDR.
-pub fn to_cdr<M: Serialize>(message: &M) -> Result<Vec<u8>, cdr_encoding::Error> {
+pub fn to_cdr<M: Serialize>(message: &M) -> Result<Vec<u8>, CdrError> {
     let mut bytes = vec![];
     write_cdr(message, &mut bytes)?;
     Ok(bytes)
@@ -299,17 +405,17 @@ pub fn to_cdr<M: Serialize>(message: &M) -> Result<Vec<u8>, cdr_encoding::Error>
 ///
 /// # Errors
 /// As [`to_cdr`].
-pub fn write_cdr<M: Serialize>(message: &M, bytes: &mut Vec<u8>) -> Result<(), cdr_encoding::Error> {
+pub fn write_cdr<M: Serialize>(message: &M, bytes: &mut Vec<u8>) -> Result<(), CdrError> {
     bytes.clear();
     bytes.extend([0, 1, 0, 0]);
     cdr_encoding::to_writer::<_, byteorder::LittleEndian, _>(bytes, message)
 }
 
 /// Decodes a message from CDR bytes with encapsulation header, in either byte order.
-pub fn from_cdr<M: for<'de> Deserialize<'de>>(bytes: &[u8]) -> Result<M, cdr_encoding::Error> {
+pub fn from_cdr<M: for<'de> Deserialize<'de>>(bytes: &[u8]) -> Result<M, CdrError> {
     match bytes {
         [0, 0, _, _, payload @ ..] => Ok(cdr_encoding::from_bytes::<M, byteorder::BigEndian>(payload)?.0),
         [0, 1, _, _, payload @ ..] => Ok(cdr_encoding::from_bytes::<M, byteorder::LittleEndian>(payload)?.0),
-        _ => Err(cdr_encoding::Error::Message("no plain CDR encapsulation header".to_owned())),
+        _ => Err(CdrError::Message("no plain CDR encapsulation header".to_owned())),
     }
 }

@@ -3,7 +3,7 @@
 //! As `ros2 bag record` writes it, a schema is the text of the `.msg` file followed by every message it refers to. Each
 //! of those is preceded by a line of 80 `=` and a line `MSG: package/Type`.
 
-use super::topic;
+use crate::topic;
 
 /// A topic that the node records, with its type, schema and quality of service.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -29,12 +29,10 @@ const HEADER: (&str, &str) = (
     "# Standard metadata for higher-level stamped data types.\nbuiltin_interfaces/Time stamp\nstring frame_id\n",
 );
 const TIME: (&str, &str) = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n");
-const MODE: (&str, &str) = ("squealcast_msgs/Mode", include_str!("../../msgs/msg/Mode.msg"));
-const DERIVATIVES: (&str, &str) = ("squealcast_msgs/Derivatives", include_str!("../../msgs/msg/Derivatives.msg"));
-const MODE_SENSITIVITY: (&str, &str) =
-    ("squealcast_msgs/ModeSensitivity", include_str!("../../msgs/msg/ModeSensitivity.msg"));
-const PAIR_SENSITIVITY: (&str, &str) =
-    ("squealcast_msgs/PairSensitivity", include_str!("../../msgs/msg/PairSensitivity.msg"));
+const MODE: (&str, &str) = ("squealcast_msgs/Mode", include_str!("../msg/Mode.msg"));
+const DERIVATIVES: (&str, &str) = ("squealcast_msgs/Derivatives", include_str!("../msg/Derivatives.msg"));
+const MODE_SENSITIVITY: (&str, &str) = ("squealcast_msgs/ModeSensitivity", include_str!("../msg/ModeSensitivity.msg"));
+const PAIR_SENSITIVITY: (&str, &str) = ("squealcast_msgs/PairSensitivity", include_str!("../msg/PairSensitivity.msg"));
 const DIAGNOSTIC_STATUS: (&str, &str) = (
     "diagnostic_msgs/DiagnosticStatus",
     "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\nstring hardware_id\n\
@@ -94,13 +92,13 @@ impl Topic {
     /// The text of the `.msg` file of the topic's type.
     pub fn definition(self) -> &'static str {
         match self {
-            Self::OperatingPoint => include_str!("../../msgs/msg/OperatingPoint.msg"),
-            Self::Prediction => include_str!("../../msgs/msg/Prediction.msg"),
-            Self::SessionEvent => include_str!("../../msgs/msg/SessionEvent.msg"),
-            Self::RigInfo => include_str!("../../msgs/msg/RigInfo.msg"),
-            Self::Sensitivity => include_str!("../../msgs/msg/Sensitivity.msg"),
+            Self::OperatingPoint => include_str!("../msg/OperatingPoint.msg"),
+            Self::Prediction => include_str!("../msg/Prediction.msg"),
+            Self::SessionEvent => include_str!("../msg/SessionEvent.msg"),
+            Self::RigInfo => include_str!("../msg/RigInfo.msg"),
+            Self::Sensitivity => include_str!("../msg/Sensitivity.msg"),
             Self::Diagnostics => DIAGNOSTIC_ARRAY,
-            Self::Vibration => include_str!("../../msgs/msg/Vibration.msg"),
+            Self::Vibration => include_str!("../msg/Vibration.msg"),
         }
     }
 

@@ -106,24 +106,42 @@ pub const REASON_BYTES: usize = 128;
 /// A message that does not fit its shared-memory form, or bytes that are not a message.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 pub enum FormError {
+    /// The stamp of the form is outside the range of a message stamp.
     #[error("stamp_ns {0} is beyond what a message stamp can hold (seconds as i32)")]
     Stamp(i64),
+    /// More modes than the form carries.
     #[error("{found} modes, at most {MAX_MODES} are carried")]
-    ModeCount { found: usize },
+    ModeCount {
+        /// Number of modes found.
+        found: usize,
+    },
+    /// More pairs than the form carries.
     #[error("{found} pairs, at most {MAX_PAIRS} are carried")]
-    PairCount { found: usize },
+    PairCount {
+        /// Number of pairs found.
+        found: usize,
+    },
+    /// An unknown law of a sensitivity.
     #[error("law {0}, expected 0 or 1")]
     Law(u32),
+    /// A flag that is neither 0 nor 1.
     #[error("squares {0}, expected 0 or 1")]
     Squares(u32),
+    /// An unknown level.
     #[error("level {0}, expected 0 to {fault}", fault = level::FAULT)]
     Level(u8),
+    /// A flag that is neither 0 nor 1.
     #[error("reused {0}, expected 0 or 1")]
     Reused(u8),
+    /// A reason longer than the form carries.
     #[error("reason_len {0}, at most {REASON_BYTES} bytes are carried")]
     ReasonLength(u8),
+    /// A reason that is not UTF-8.
     #[error("reason is valid UTF-8 only up to byte {valid_up_to}")]
-    ReasonUtf8 { valid_up_to: usize },
+    ReasonUtf8 {
+        /// Number of leading bytes that are UTF-8.
+        valid_up_to: usize,
+    },
 }
 
 /// A shared-memory form of a message.
@@ -155,6 +173,7 @@ pub trait Form: ZeroCopySend + Copy + std::fmt::Debug + Send + 'static {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("squealcast/OperatingPoint/1")]
+#[expect(missing_docs, reason = "the tables above document every field")]
 pub struct OperatingPointForm {
     pub stamp_ns: i64,
     pub seq: u64,
@@ -167,6 +186,7 @@ pub struct OperatingPointForm {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("squealcast/Vibration/1")]
+#[expect(missing_docs, reason = "the tables above document every field")]
 pub struct VibrationForm {
     pub stamp_ns: i64,
     pub frequency_hz: f64,
@@ -177,6 +197,7 @@ pub struct VibrationForm {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("squealcast/Mode/1")]
+#[expect(missing_docs, reason = "the tables above document every field")]
 pub struct ModeForm {
     pub id: u32,
     pub zero: u32,
@@ -193,6 +214,7 @@ pub struct ModeForm {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("squealcast/Prediction/2")]
+#[expect(missing_docs, reason = "the tables above document every field")]
 pub struct PredictionForm {
     pub stamp_ns: i64,
     pub input_seq: u64,
@@ -369,6 +391,7 @@ impl From<&ModeForm> for Mode {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("squealcast/ModeSensitivity/1")]
+#[expect(missing_docs, reason = "the tables above document every field")]
 pub struct ModeSensitivityForm {
     pub id: u32,
     pub law: u32,
@@ -380,6 +403,7 @@ pub struct ModeSensitivityForm {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, ZeroCopySend)]
 #[type_name("squealcast/PairSensitivity/1")]
+#[expect(missing_docs, reason = "the tables above document every field")]
 pub struct PairSensitivityForm {
     pub first_id: u32,
     pub second_id: u32,
@@ -395,6 +419,7 @@ pub struct PairSensitivityForm {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
 #[type_name("squealcast/Sensitivity/1")]
+#[expect(missing_docs, reason = "the tables above document every field")]
 pub struct SensitivityForm {
     pub stamp_ns: i64,
     pub input_seq: u64,
