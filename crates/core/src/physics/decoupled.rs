@@ -13,9 +13,9 @@ use super::spectrum::{Root, RootError, SolveError, Spectrum, Vectors, order, squ
 
 /// A model divided into coupled and uncoupled coordinates.
 #[derive(Clone, Debug)]
-pub struct Parts {
+pub(super) struct Division {
     /// The model of the coupled coordinates.
-    pub coupled: Model,
+    pub(super) coupled: Model,
     /// Indices of the coupled coordinates in the whole model.
     places: Vec<usize>,
     /// Indices of the uncoupled coordinates.
@@ -23,14 +23,9 @@ pub struct Parts {
 }
 
 impl Model {
-    /// The division of the model; `None` if all coordinates are coupled, and also if none are.
-    pub(super) fn parts(&self) -> Option<&Parts> {
-        self.parts.get_or_init(|| Parts::of(self).map(Box::new)).as_deref()
-    }
-
     /// Number of uncoupled coordinates: modes that the eigenvalue problem does not contain.
     pub fn decoupled_count(&self) -> usize {
-        self.parts().map_or(0, |parts| parts.alone.len())
+        self.division.as_ref().map_or(0, |division| division.alone.len())
     }
 
     /// Diagonal entries `k` of `K` and `C`, or of their derivatives, with the `coefficient` of each term.
@@ -63,9 +58,9 @@ struct Entry {
     sensitivity: c64,
 }
 
-impl Parts {
+impl Division {
     /// Divides a model; `None` if no coordinate is uncoupled, or all are.
-    fn of(model: &Model) -> Option<Self> {
+    pub(super) fn of(model: &Model) -> Option<Self> {
         let terms = || model.stiffness.iter().chain(&model.damping);
         let is_alone = |k: usize| {
             let zero = |matrix: &Mat<f64>| {
@@ -82,7 +77,7 @@ impl Parts {
             term: Term { matrix: part(&known.term.matrix), law: known.term.law.clone() },
             symmetric: known.symmetric,
         };
-        let mut coupled = Model {
+        let coupled = Model {
             dimension: places.len(),
             stiffness: model.stiffness.iter().map(part_of).collect(),
             damping: model.damping.iter().map(part_of).collect(),
@@ -90,10 +85,9 @@ impl Parts {
             pad_mass: model.pad_mass.as_ref().map(part),
             contact_law: model.contact_law,
             has_contact: model.has_contact,
-            parts: None.into(), // nothing is alone among those
+            division: None,
         };
-        coupled.drop_zero_terms();
-        Some(Self { coupled, places, alone })
+        Some(Self { coupled: coupled.finished(), places, alone })
     }
 
     /// Completes the spectrum of the coupled coordinates with the roots of the uncoupled ones.

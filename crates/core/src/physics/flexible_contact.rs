@@ -76,8 +76,7 @@ impl Model {
         let at_rest = self.flexible_contact(pairs, residual)?.at(0.0)?;
         self.add_at_rest(at_rest)?;
         self.has_contact = true;
-        self.drop_zero_terms();
-        Ok(self)
+        Ok(self.finished())
     }
 
     /// Adds the contact's stiffness and damping at `μ = 0`.

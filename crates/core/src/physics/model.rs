@@ -5,12 +5,12 @@
 //! a scalar [`Law`] of the operating point. Contact is given as [`ContactPairs`] and converted to terms when the
 //! model is built.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 use faer::{Mat, MatRef};
 
 use super::chart::chebyshev;
-use super::decoupled::Parts;
+use super::decoupled::Division;
 use super::operating_point::{ContactState, OperatingPoint};
 
 /// A constant matrix times a scalar law of the operating point.
@@ -198,6 +198,26 @@ pub(super) struct KnownTerm {
 }
 
 impl KnownTerm {
+    /// Checks that the matrix of a term is `dimension×dimension` and finite, and determines whether it is symmetric.
+    /// `what` names the term in errors.
+    fn new(term: Term, dimension: usize, what: impl Fn() -> String) -> Result<Self, ModelError> {
+        let (rows, columns) = term.matrix.shape();
+        if rows != dimension || columns != dimension {
+            return Err(ModelError::Shape { what: what(), rows, columns, expected: dimension });
+        }
+        let mut symmetric = true;
+        for column in 0..columns {
+            for row in 0..rows {
+                let value = term.matrix[(row, column)];
+                if !value.is_finite() {
+                    return Err(ModelError::NotFinite { what: what(), row, column, value });
+                }
+                symmetric &= value == term.matrix[(column, row)];
+            }
+        }
+        Ok(Self { term, symmetric })
+    }
+
     /// `coefficient` of the term's law, checked to be finite.
     pub(super) fn factor(&self, coefficient: impl Fn(&Law) -> f64, p: &OperatingPoint) -> Result<f64, ModelError> {
         let value = coefficient(&self.term.law);
@@ -227,8 +247,9 @@ pub struct Model {
     pub(super) has_contact: bool,
     pub(super) pad_modes: Option<usize>,
     pub(super) pad_mass: Option<Mat<f64>>,
-    /// Which coordinates are coupled and which are not, computed at first use; `None` if all are coupled.
-    pub(super) parts: OnceLock<Option<Box<Parts>>>,
+    /// Division into coupled and uncoupled coordinates; `None` if all are coupled, and also if none are. Computed by
+    /// [`Model::finished`], with which every constructor ends.
+    pub(super) division: Option<Box<Division>>,
 }
 
 /// Properties of the matrices that [`Model::assemble`] wrote.
@@ -255,20 +276,21 @@ impl Model {
         contact_law: ContactLaw,
         pad_modes: Option<usize>,
     ) -> Result<Self, ModelError> {
-        let (has_contact, pad_mass, parts) = (false, None, OnceLock::new());
-        let (stiffness_terms, damping_terms) = (stiffness, damping);
-        let (stiffness, damping) = (vec![], vec![]);
-        let mut model = Self { dimension, stiffness, damping, contact_law, has_contact, pad_modes, pad_mass, parts };
-        for (k, term) in stiffness_terms.into_iter().enumerate() {
-            let known = model.known(term, || format!("stiffness term {k}"))?;
-            model.stiffness.push(known);
-        }
-        for (k, term) in damping_terms.into_iter().enumerate() {
-            let known = model.known(term, || format!("damping term {k}"))?;
-            model.damping.push(known);
-        }
-        model.drop_zero_terms();
-        Ok(model)
+        let known = |terms: Vec<Term>, what: &str| -> Result<Vec<KnownTerm>, ModelError> {
+            let numbered = terms.into_iter().enumerate();
+            numbered.map(|(k, term)| KnownTerm::new(term, dimension, || format!("{what} term {k}"))).collect()
+        };
+        let model = Self {
+            dimension,
+            stiffness: known(stiffness, "stiffness")?,
+            damping: known(damping, "damping")?,
+            contact_law,
+            has_contact: false,
+            pad_modes,
+            pad_mass: None,
+            division: None,
+        };
+        Ok(model.finished())
     }
 
     /// Adds the terms of the contact between pad and disc:
@@ -336,47 +358,29 @@ impl Model {
         self.add_damping("friction slope", congruence(t, &slope, t), Law::FrictionSlope)?;
         self.add_damping("lateral friction", congruence(b, &inverse_radius, b), Law::LateralFriction)?;
         self.has_contact = true;
-        self.drop_zero_terms();
-        Ok(self)
+        Ok(self.finished())
     }
 
     pub(super) fn add_stiffness(&mut self, what: &str, matrix: Mat<f64>, law: Law) -> Result<(), ModelError> {
-        let known = self.known(Term { matrix, law }, || what.to_owned())?;
+        let known = KnownTerm::new(Term { matrix, law }, self.dimension, || what.to_owned())?;
         self.stiffness.push(known);
         Ok(())
     }
 
     pub(super) fn add_damping(&mut self, what: &str, matrix: Mat<f64>, law: Law) -> Result<(), ModelError> {
-        let known = self.known(Term { matrix, law }, || what.to_owned())?;
+        let known = KnownTerm::new(Term { matrix, law }, self.dimension, || what.to_owned())?;
         self.damping.push(known);
         Ok(())
     }
 
-    /// Checks shape and entries of a term and determines whether its matrix is symmetric.
-    fn known(&mut self, term: Term, what: impl Fn() -> String) -> Result<KnownTerm, ModelError> {
-        self.parts = OnceLock::new(); // what is known of the model before may not hold with it
-        let (rows, columns) = term.matrix.shape();
-        if rows != self.dimension || columns != self.dimension {
-            return Err(ModelError::Shape { what: what(), rows, columns, expected: self.dimension });
-        }
-        let mut symmetric = true;
-        for column in 0..columns {
-            for row in 0..rows {
-                let value = term.matrix[(row, column)];
-                if !value.is_finite() {
-                    return Err(ModelError::NotFinite { what: what(), row, column, value });
-                }
-                symmetric &= value == term.matrix[(column, row)];
-            }
-        }
-        Ok(KnownTerm { term, symmetric })
-    }
-
-    /// Drops terms whose matrix is zero: they would only cost time.
-    pub(super) fn drop_zero_terms(&mut self) {
+    /// The model with all its terms: drops terms whose matrix is zero, which would only cost time, and divides the
+    /// coordinates into coupled and uncoupled ones.
+    pub(super) fn finished(mut self) -> Self {
         let is_zero = |known: &KnownTerm| known.term.matrix.norm_max() == 0.0;
         self.stiffness.retain(|known| !is_zero(known));
         self.damping.retain(|known| !is_zero(known));
+        self.division = Division::of(&self).map(Box::new);
+        self
     }
 
     /// Number of coordinates, `n`.
@@ -396,9 +400,9 @@ impl Model {
     /// # Errors
     /// [`ModelError::Shape`], [`ModelError::NotFinite`].
     pub fn with_pad_mass(mut self, mass: Mat<f64>) -> Result<Self, ModelError> {
-        let known = self.known(Term { matrix: mass, law: Law::Constant }, || "mass of the pad".to_owned())?;
-        self.pad_mass = Some(known.term.matrix);
-        Ok(self)
+        let term = Term { matrix: mass, law: Law::Constant };
+        self.pad_mass = Some(KnownTerm::new(term, self.dimension, || "mass of the pad".to_owned())?.term.matrix);
+        Ok(self.finished())
     }
 
     /// The pad's contribution to the unit mass matrix, `n×n`, if coordinates move pad and disc together and it is
@@ -412,14 +416,15 @@ impl Model {
         let constant = |terms: &[KnownTerm]| -> Vec<KnownTerm> {
             terms.iter().filter(|known| matches!(known.term.law, Law::Constant)).cloned().collect()
         };
-        Self {
+        let model = Self {
             stiffness: constant(&self.stiffness),
             damping: constant(&self.damping),
             has_contact: false,
-            parts: OnceLock::new(),
             pad_mass: self.pad_mass.clone(),
+            division: None,
             ..*self
-        }
+        };
+        model.finished()
     }
 
     /// Whether the model has contact pairs of its own, which open at zero load.

@@ -91,11 +91,11 @@ impl Solver {
     /// [`SolveError::Trace`] and [`SolveError::Residual`] if the result fails a check.
     pub fn solve(&mut self, model: &Model, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, SolveError> {
         let damped = model.is_damped(p);
-        match model.parts() {
+        match &model.division {
             None => self.solve_coupled(model, p, vectors, damped),
-            Some(parts) => {
-                let coupled = self.solve_coupled(&parts.coupled, p, vectors, damped)?;
-                parts.complete(model, coupled, vectors)
+            Some(division) => {
+                let coupled = self.solve_coupled(&division.coupled, p, vectors, damped)?;
+                division.complete(model, coupled, vectors)
             }
         }
     }
