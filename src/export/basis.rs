@@ -124,13 +124,18 @@ fn system_rig(
                 Law::Custom(law) => {
                     keys.insert("scale".to_owned(), law.text.as_str().into());
                 }
+                Law::DiscSpeed { power } => {
+                    keys.insert("scale".to_owned(), format!("disc_speed_rad_s^{power}").into());
+                }
                 law @ (Law::ContactStiffness
                 | Law::FrictionStiffness
                 | Law::ContactDamping
                 | Law::FrictionDamping
                 | Law::FrictionSlope
                 | Law::LateralFriction
-                | Law::FrictionChebyshev { .. }) => {
+                | Law::FrictionChebyshev { .. }
+                | Law::DiscSpeedInContact { .. }
+                | Law::DiscSpeedChebyshev { .. }) => {
                     bail!("{key} term {index} follows {law:?}; expected a constant or an expression in a [system]");
                 }
             }

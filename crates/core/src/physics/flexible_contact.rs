@@ -10,6 +10,8 @@
 //! M(μ) = I + (B_n + μ B_t)ᵀ S⁻¹ (Q_nn + μ Q_nt) S⁻¹ B_n
 //! ```
 //!
+//! Gyroscopic and spin terms `Ω^p A` of the disc become `Ω^p M⁻¹ A`; the rotation of the truncated modes is omitted.
+//!
 //! `M⁻¹ K` and `M⁻¹ C` are smooth in `μ`. They become sums of terms: the value at 0, plus `x = s μ` times a Chebyshev
 //! expansion of `(f(x) - f(0)) / x`. Damping by the friction slope and by lateral friction acts on modal velocities
 //! without `M⁻¹`; the error is of second order in the residual.
@@ -20,7 +22,7 @@ use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef};
 
 use super::chart::chebyshev;
-use super::model::{ContactPairs, Law, Model, ModelError};
+use super::model::{ContactPairs, KnownTerm, Law, Model, ModelError};
 
 /// Maximum condition number of `I + K_c R(μ)`.
 const CONDITION_LIMIT: f64 = 1e10;
@@ -55,10 +57,17 @@ impl Model {
         let at_rest = contact.at(0.0)?;
         let expansion = contact.expansion(&at_rest, range)?;
         self.add_at_rest(at_rest)?;
-        for (degree, [stiffness, damping]) in expansion.into_iter().enumerate() {
+        let turning = self.turning_powers();
+        for (degree, matrices) in expansion.into_iter().enumerate() {
             let law = Law::FrictionChebyshev { degree, range };
-            self.add_stiffness("friction stiffness", stiffness, law.clone())?;
-            self.add_damping("friction damping", damping, law)?;
+            let turned = |power| Law::DiscSpeedChebyshev { power, degree, range };
+            self.add_matrices(
+                ["friction stiffness", "friction damping"],
+                matrices,
+                [law.clone(), law],
+                &turning,
+                turned,
+            )?;
         }
         self.with_friction_damping(pairs)
     }
@@ -80,9 +89,39 @@ impl Model {
     }
 
     /// Adds the contact's stiffness and damping at `μ = 0`.
-    fn add_at_rest(&mut self, [stiffness, damping]: [Mat<f64>; 2]) -> Result<(), ModelError> {
-        self.add_stiffness("contact stiffness", stiffness, Law::ContactStiffness)?;
-        self.add_damping("contact damping", damping, Law::ContactDamping)
+    fn add_at_rest(&mut self, matrices: Vec<Mat<f64>>) -> Result<(), ModelError> {
+        let (turning, laws) = (self.turning_powers(), [Law::ContactStiffness, Law::ContactDamping]);
+        let turned = |power| Law::DiscSpeedInContact { power };
+        self.add_matrices(["contact stiffness", "contact damping"], matrices, laws, &turning, turned)
+    }
+
+    /// Adds the matrices of [`FlexibleContact::at`]: stiffness and damping with their `laws`, and those of the terms of
+    /// [`Self::turning_powers`] with the law `turned` of their power.
+    fn add_matrices(
+        &mut self,
+        what: [&str; 2],
+        matrices: Vec<Mat<f64>>,
+        laws: [Law; 2],
+        turning: &[Vec<u8>; 2],
+        turned: impl Fn(u8) -> Law,
+    ) -> Result<(), ModelError> {
+        let [of_stiffness, of_damping] = turning.each_ref().map(|powers| powers.iter().map(|&power| turned(power)));
+        let [stiffness, damping] = laws;
+        let kinds = [(true, stiffness), (false, damping)].into_iter();
+        let kinds = kinds.chain(of_stiffness.map(|law| (true, law))).chain(of_damping.map(|law| (false, law)));
+        for (matrix, (is_stiffness, law)) in matrices.into_iter().zip(kinds) {
+            if is_stiffness {
+                self.add_stiffness(what[0], matrix, law)?;
+            } else {
+                self.add_damping(what[1], matrix, law)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The powers `p` of the terms of `K` and of `C` with [`Law::DiscSpeed`].
+    fn turning_powers(&self) -> [Vec<u8>; 2] {
+        [&self.stiffness, &self.damping].map(|terms| turning(terms).map(|(power, _)| power).collect())
     }
 
     /// Checks the contact and combines it with the model's terms without contact.
@@ -105,7 +144,9 @@ impl Model {
                 return Err(ModelError::Shape { what, rows, columns, expected: count });
             }
         }
-        Ok(FlexibleContact { pairs, residual, free: self.constant_terms() })
+        let turning = turning(&self.stiffness).chain(turning(&self.damping));
+        let turning = turning.map(|(_, matrix)| matrix.clone()).collect();
+        Ok(FlexibleContact { pairs, residual, free: self.constant_terms(), turning })
     }
 
     /// `K` and `C` without contact.
@@ -120,17 +161,28 @@ impl Model {
     }
 }
 
+/// Power and matrix of each term with [`Law::DiscSpeed`].
+fn turning(terms: &[KnownTerm]) -> impl Iterator<Item = (u8, &Mat<f64>)> {
+    terms.iter().filter_map(|known| {
+        let Law::DiscSpeed { power } = known.term.law else { return None };
+        Some((power, &known.term.matrix))
+    })
+}
+
 /// A contact with residual flexibility and the model it is added to.
 struct FlexibleContact<'a> {
     pairs: &'a ContactPairs,
     residual: &'a ResidualFlexibility,
     /// `diag(Ω²)` and `diag(2ζΩ)`.
     free: [Mat<f64>; 2],
+    /// Gyroscopic and spin terms.
+    turning: Vec<Mat<f64>>,
 }
 
 impl FlexibleContact<'_> {
-    /// The contribution of the contact to `M⁻¹ K` and `M⁻¹ C` at `x = s μ`, both `n×n`.
-    fn at(&self, x: f64) -> Result<[Mat<f64>; 2], ModelError> {
+    /// The contribution of the contact to `M⁻¹ K` and `M⁻¹ C` at `x = s μ`, and to `M⁻¹ A` of every gyroscopic and spin
+    /// term, all `n×n`. Without residual inertia there are only the first two.
+    fn at(&self, x: f64) -> Result<Vec<Mat<f64>>, ModelError> {
         let ContactPairs { normal, sliding, stiffness_n_per_m, damping_n_s_per_m, .. } = self.pairs;
         let c = normal.nrows();
         let flexibility = &self.residual.normal + faer::Scale(x) * &self.residual.sliding;
@@ -172,36 +224,35 @@ impl FlexibleContact<'_> {
             // `M⁻¹ (K_free + K_contact) - K_free`, and the same for `C`.
             stiffness = solver.solve(stiffness + &self.free[0]) - &self.free[0];
             damping = solver.solve(damping + &self.free[1]) - &self.free[1];
+            let turning = self.turning.iter().map(|term| solver.solve(term) - term);
+            return Ok([stiffness, damping].into_iter().chain(turning).collect());
         }
-        Ok([stiffness, damping])
+        Ok(vec![stiffness, damping])
     }
 
     /// Chebyshev coefficients over `[-range, range]` of `(f(x) - at_rest) / x`, where `f` is [`Self::at`].
-    fn expansion(&self, at_rest: &[Mat<f64>; 2], range: f64) -> Result<Vec<[Mat<f64>; 2]>, ModelError> {
+    fn expansion(&self, at_rest: &[Mat<f64>], range: f64) -> Result<Vec<Vec<Mat<f64>>>, ModelError> {
         // The number of nodes is even so that no node is 0.
         let mut m = 8;
         loop {
             let mut quotients = vec![];
             for node in chebyshev::nodes(m) {
                 let x = node * range;
-                let [stiffness, damping] = self.at(x)?;
-                quotients.push([
-                    faer::Scale(1.0 / x) * (stiffness - &at_rest[0]),
-                    faer::Scale(1.0 / x) * (damping - &at_rest[1]),
-                ]);
+                let moved = self.at(x)?.into_iter().zip(at_rest);
+                quotients.push(moved.map(|(moved, rest)| faer::Scale(1.0 / x) * (moved - rest)).collect());
             }
             let expansion = coefficients(&quotients);
-            let worst = [0, 1]
+            let worst = (0..at_rest.len())
                 .map(|part| {
                     let largest = at_rest[part].norm_max() + expansion[0][part].norm_max();
                     let tail = expansion[m - 2][part].norm_max() + expansion[m - 1][part].norm_max();
                     if largest > 0.0 { tail / largest } else { 0.0 }
                 })
-                .into_iter()
                 .fold(0.0, f64::max);
             if worst < FIT_LIMIT {
                 let kept = expansion.iter().rposition(|coefficient| {
-                    (0..2).any(|part| coefficient[part].norm_max() > 0.01 * FIT_LIMIT * expansion[0][part].norm_max())
+                    (0..at_rest.len())
+                        .any(|part| coefficient[part].norm_max() > 0.01 * FIT_LIMIT * expansion[0][part].norm_max())
                 });
                 return Ok(expansion.into_iter().take(kept.map_or(0, |last| last + 1)).collect());
             }
@@ -214,7 +265,7 @@ impl FlexibleContact<'_> {
 }
 
 /// Chebyshev coefficients of the interpolating polynomial through matrices at the nodes.
-fn coefficients(values: &[[Mat<f64>; 2]]) -> Vec<[Mat<f64>; 2]> {
+fn coefficients(values: &[Vec<Mat<f64>>]) -> Vec<Vec<Mat<f64>>> {
     let m = values.len();
     let weights: Vec<Vec<f64>> = (0..m)
         .map(|node| {
@@ -231,7 +282,7 @@ fn coefficients(values: &[[Mat<f64>; 2]]) -> Vec<[Mat<f64>; 2]> {
         }
         sum
     };
-    (0..m).map(|degree| [sum(degree, 0), sum(degree, 1)]).collect()
+    (0..m).map(|degree| (0..values[0].len()).map(|part| sum(degree, part)).collect()).collect()
 }
 
 fn symmetric_part(matrix: &Mat<f64>) -> Mat<f64> {

@@ -22,16 +22,20 @@ pub mod summary;
 pub mod synthetic;
 #[cfg(test)]
 mod test_models;
+mod traces;
 pub mod tracking;
+#[cfg(test)]
+mod turning;
 
 pub use chart::{Chart, NotCharted};
 pub use critical::{Window, WindowKind};
 pub use ends::{Bounded, End, Ends, NearestEnd};
 pub use flexible_contact::ResidualFlexibility;
-pub use model::{ContactLaw, ContactPairs, CustomLaw, Exact, Law, Model, ModelError, Parameter, Term, Traces};
+pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Parameter, Term};
 pub use numbering::Census;
 pub use operating_point::{ContactState, OperatingPoint};
 pub use solver::Solver;
 pub use spectrum::{Root, RootError, SolveError, Spectrum, Vectors};
 pub use stability_map::{MapError, MapOptions, NextWindow, StabilityMap};
 pub use summary::{Mode, Summary};
+pub use traces::{Exact, Traces};

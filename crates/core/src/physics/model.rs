@@ -43,6 +43,13 @@ pub enum Law {
     /// `x T_k(x / r)` with `x = s μ`, while the contact slides. A sum of such terms expands `f(x) - f(0)` of a smooth
     /// function `f`. Undefined for `|μ| > r`.
     FrictionChebyshev { degree: usize, range: f64 },
+    /// `Ω^p` of the disc speed `Ω` with its sign, rad/s, in any contact state: gyroscopic terms (`p = 1`) and spin
+    /// terms (`p = 2`) of a disc that turns in the frame of the pad.
+    DiscSpeed { power: u8 },
+    /// `Ω^p` while the contact is closed.
+    DiscSpeedInContact { power: u8 },
+    /// `Ω^p x T_k(x / r)`, the product of [`Law::DiscSpeed`] and [`Law::FrictionChebyshev`].
+    DiscSpeedChebyshev { power: u8, degree: usize, range: f64 },
     /// Any other function, given as an expression in the rig file.
     Custom(CustomLaw),
 }
@@ -90,6 +97,13 @@ impl Law {
             Self::FrictionChebyshev { degree, range } => {
                 let x = p.disc_speed_rad_s.signum() * mu;
                 when(sliding, chebyshev::beside_zero(x, *degree, *range))
+            }
+            Self::DiscSpeed { power } => p.disc_speed_rad_s.powi(i32::from(*power)),
+            Self::DiscSpeedInContact { power } => when(closed, p.disc_speed_rad_s.powi(i32::from(*power))),
+            Self::DiscSpeedChebyshev { power, degree, range } => {
+                let x = p.disc_speed_rad_s.signum() * mu;
+                let turning = p.disc_speed_rad_s.powi(i32::from(*power));
+                when(sliding, turning * chebyshev::beside_zero(x, *degree, *range))
             }
             Self::Custom(custom) => (custom.evaluate)(&if sliding { *p } else { p.with_friction(0.0) }),
         }
@@ -436,7 +450,8 @@ impl Model {
     /// derivatives with respect to these are available. True with contact pairs and without residual flexibility.
     pub fn is_linear_in_contact(&self) -> bool {
         let mut terms = self.stiffness.iter().chain(&self.damping);
-        self.has_contact && !terms.any(|known| matches!(known.term.law, Law::FrictionChebyshev { .. }))
+        let expands = |law: &Law| matches!(law, Law::FrictionChebyshev { .. } | Law::DiscSpeedChebyshev { .. });
+        self.has_contact && !terms.any(|known| expands(&known.term.law))
     }
 
     /// The contact state at `p`; a model without contact pairs is always closed.
@@ -538,6 +553,22 @@ impl Model {
                 }
                 Friction | Load | Speed | ContactStiffness | ContactDamping => 0.0,
             },
+            Law::DiscSpeed { power } => match parameter {
+                Speed => power_slope(p.disc_speed_rad_s, *power),
+                Friction | Load | ContactStiffness | ContactDamping => 0.0,
+            },
+            Law::DiscSpeedInContact { power } => match parameter {
+                Speed if self.contact_state(p) != ContactState::Open => power_slope(p.disc_speed_rad_s, *power),
+                Friction | Load | Speed | ContactStiffness | ContactDamping => 0.0,
+            },
+            Law::DiscSpeedChebyshev { power, degree, range } => {
+                let expansion = Law::FrictionChebyshev { degree: *degree, range: *range };
+                match parameter {
+                    Speed => power_slope(p.disc_speed_rad_s, *power) * self.coefficient(&expansion, p),
+                    Friction => p.disc_speed_rad_s.powi(i32::from(*power)) * self.derivative(&expansion, p, Friction),
+                    Load | ContactStiffness | ContactDamping => 0.0,
+                }
+            }
             Law::Custom(custom) => self.custom_derivative(custom, law, p, parameter),
         }
     }
@@ -603,6 +634,7 @@ impl Model {
                 Law::ContactStiffness | Law::FrictionStiffness => load |= self.contact_law.exponent != 0.0,
                 Law::FrictionSlope => load = true,
                 Law::LateralFriction => (load, speed) = (true, true),
+                Law::DiscSpeed { .. } | Law::DiscSpeedInContact { .. } | Law::DiscSpeedChebyshev { .. } => speed = true,
                 Law::Custom(custom) => {
                     load |= custom.depends_on_load;
                     speed |= custom.depends_on_speed;
@@ -619,6 +651,7 @@ impl Model {
             Law::Constant | Law::ContactDamping | Law::FrictionDamping | Law::FrictionChebyshev { .. } => true,
             Law::ContactStiffness | Law::FrictionStiffness => exponent == 0.0,
             Law::FrictionSlope | Law::LateralFriction => false,
+            Law::DiscSpeed { .. } | Law::DiscSpeedInContact { .. } | Law::DiscSpeedChebyshev { .. } => false,
             Law::Custom(custom) => !custom.depends_on_load && !custom.depends_on_speed,
         };
         let rest = || self.stiffness.iter().chain(&self.damping).filter(|known| !constant(&known.term.law));
@@ -626,77 +659,11 @@ impl Model {
     }
 }
 
-/// Precomputed traces of a model's matrices: at an operating point only the laws are evaluated.
-#[derive(Clone, Debug)]
-pub struct Traces {
-    stiffness: Vec<f64>,
-    damping: Vec<f64>,
-    /// `tr(A B)` for every pair of terms, for stiffness and for damping.
-    stiffness_products: Mat<f64>,
-    damping_products: Mat<f64>,
-    /// `tr(Aᵀ B)` for every pair of terms.
-    stiffness_norms: Mat<f64>,
-    damping_norms: Mat<f64>,
-}
-
-/// Sums of the roots and norms of the matrices at an operating point, known exactly without solving.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Exact {
-    /// Sums over all roots of the first and second power. Undamped, of `λ²`: `-tr K` and `tr K²`. Damped, of `λ`,
-    /// conjugates and static roots included: `-tr C` and `tr C² - 2 tr K`.
-    pub powers: [f64; 2],
-    /// Frobenius norms of `I`, `C` and `K`.
-    pub norms: [f64; 3],
-}
-
-impl Traces {
-    /// Precomputes the traces of all terms and products of terms.
-    pub fn new(model: &Model) -> Self {
-        let trace = |m: &Mat<f64>| (0..m.nrows()).map(|i| m[(i, i)]).sum();
-        let product = |a: &Mat<f64>, b: &Mat<f64>| -> f64 {
-            (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(j, i)] * b[(i, j)]).sum::<f64>()).sum()
-        };
-        let all = |terms: &[KnownTerm]| terms.iter().map(|k| trace(&k.term.matrix)).collect::<Vec<f64>>();
-        let inner = |a: &Mat<f64>, b: &Mat<f64>| -> f64 {
-            (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(i, j)] * b[(i, j)]).sum::<f64>()).sum()
-        };
-        let pairs = |terms: &[KnownTerm], of: &dyn Fn(&Mat<f64>, &Mat<f64>) -> f64| {
-            Mat::from_fn(terms.len(), terms.len(), |i, j| of(&terms[i].term.matrix, &terms[j].term.matrix))
-        };
-        Self {
-            stiffness: all(&model.stiffness),
-            damping: all(&model.damping),
-            stiffness_products: pairs(&model.stiffness, &product),
-            damping_products: pairs(&model.damping, &product),
-            stiffness_norms: pairs(&model.stiffness, &inner),
-            damping_norms: pairs(&model.damping, &inner),
-        }
-    }
-
-    /// Sums and norms at `p`.
-    pub fn at(&self, model: &Model, p: &OperatingPoint) -> Exact {
-        let weighted = |terms: &[KnownTerm], traces: &[f64]| -> f64 {
-            terms.iter().zip(traces).map(|(known, trace)| model.coefficient(&known.term.law, p) * trace).sum()
-        };
-        let squared = |terms: &[KnownTerm], products: &Mat<f64>| -> f64 {
-            let weight = |k: usize| model.coefficient(&terms[k].term.law, p);
-            let row = |i: usize| (0..terms.len()).map(|j| weight(j) * products[(i, j)]).sum::<f64>();
-            (0..terms.len()).map(|i| weight(i) * row(i)).sum()
-        };
-        let norm = |terms: &[KnownTerm], norms: &Mat<f64>| squared(terms, norms).max(0.0).sqrt();
-        let trace_k = weighted(&model.stiffness, &self.stiffness);
-        let powers = if model.is_damped(p) {
-            let trace_c = weighted(&model.damping, &self.damping);
-            [-trace_c, squared(&model.damping, &self.damping_products) - 2.0 * trace_k]
-        } else {
-            [-trace_k, squared(&model.stiffness, &self.stiffness_products)]
-        };
-        let norms = [
-            (model.dimension as f64).sqrt(),
-            norm(&model.damping, &self.damping_norms),
-            norm(&model.stiffness, &self.stiffness_norms),
-        ];
-        Exact { powers, norms }
+/// Derivative of `Ω^p` with respect to `Ω`.
+fn power_slope(speed: f64, power: u8) -> f64 {
+    match power {
+        0 => 0.0,
+        power => f64::from(power) * speed.powi(i32::from(power) - 1),
     }
 }
 

@@ -12,12 +12,13 @@ use faer::c64;
 use super::chart::build::ChartOptions;
 use super::chart::hold_out::draw;
 use super::chart::{Chart, Scratch};
-use super::model::{Model, Traces};
+use super::model::Model;
 use super::solver::Solver;
 use super::spectrum::{Root, Spectrum, Vectors, square_root};
 use super::stability_map::{MapError, MapOptions, Node, StabilityMap};
 use super::summary::{Mode, Summary};
 use super::synthetic::Uniform;
+use super::traces::Traces;
 use super::tracking::tracked;
 
 /// Two roots closer than this, relative, cannot be distinguished on a chart; they keep the order of the interpolated

@@ -131,9 +131,21 @@ impl FullModel {
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
         let (mut load, mut speed) = (false, false);
         for term in self.stiffness.iter().chain(&self.damping) {
-            if let Law::Custom(custom) = &term.law {
-                load |= custom.depends_on_load;
-                speed |= custom.depends_on_speed;
+            match &term.law {
+                Law::Custom(custom) => {
+                    load |= custom.depends_on_load;
+                    speed |= custom.depends_on_speed;
+                }
+                Law::DiscSpeed { .. } | Law::DiscSpeedInContact { .. } | Law::DiscSpeedChebyshev { .. } => speed = true,
+                // Of the contact, whose laws count below.
+                Law::Constant
+                | Law::ContactStiffness
+                | Law::FrictionStiffness
+                | Law::ContactDamping
+                | Law::FrictionDamping
+                | Law::FrictionSlope
+                | Law::LateralFriction
+                | Law::FrictionChebyshev { .. } => {}
             }
         }
         if self.contact.is_some() {
@@ -299,6 +311,23 @@ impl FullModel {
         let (stiffness, damping) = (terms(&self.stiffness), terms(&self.damping));
         let contact = self.contact.as_ref().map(|contact| contact.on(basis.as_ref()));
         Ok(Projected { basis, omega_squared, contact, stiffness, damping })
+    }
+
+    /// The terms of `K` and of `C` that lie within the rows `range` of a part, in the coordinates `phi` of its modes,
+    /// `Φᵀ A Φ`; `phi` has a row for each of the part.
+    pub fn terms_of_part(&self, range: std::ops::Range<usize>, phi: MatRef<'_, f64>) -> [Vec<Term>; 2] {
+        let mut basis = Mat::zeros(self.dimension(), phi.ncols());
+        basis.subrows_mut(range.start, range.len()).copy_from(phi);
+        let within = |term: &&SparseTerm| {
+            entries(&term.matrix).all(|(row, column, _)| range.contains(&row) && range.contains(&column))
+        };
+        [&self.stiffness, &self.damping].map(|terms| {
+            let on_modes = |term: &SparseTerm| Term {
+                matrix: project_sparse(&term.matrix, basis.as_ref(), is_symmetric(&term.matrix)),
+                law: term.law.clone(),
+            };
+            terms.iter().filter(within).map(on_modes).collect()
+        })
     }
 
     /// `M X`.

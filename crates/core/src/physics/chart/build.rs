@@ -15,10 +15,11 @@ use super::hold_out::within_bounds;
 use super::leaf::Branches;
 use super::samples::{Sample, Sampler, follow, spread};
 use super::{Axis, Branch, Chart, Leaf, MAX_AXES, Scratch};
-use crate::physics::model::{Model, Traces};
+use crate::physics::model::Model;
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::Solver;
 use crate::physics::spectrum::{SolveError, Spectrum};
+use crate::physics::traces::Traces;
 
 /// Box and accuracy of a chart.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -5,11 +5,12 @@ use faer::c64;
 use super::build::ChartOptions;
 use super::leaf::MERGING;
 use super::{Chart, NotCharted, Scratch};
-use crate::physics::model::{Model, Traces};
+use crate::physics::model::Model;
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::{ROUNDING, Solver};
 use crate::physics::spectrum::{Root, SolveError, Spectrum, Vectors};
 use crate::physics::synthetic::Uniform;
+use crate::physics::traces::Traces;
 use crate::physics::tracking::tracked;
 
 /// Result of a comparison.

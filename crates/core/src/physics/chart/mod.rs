@@ -19,10 +19,10 @@ mod words;
 
 use faer::c64;
 
-use super::model::Exact;
 use super::numbering::Census;
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, magnitude, square_root};
+use super::traces::Exact;
 use channels::Channels;
 use chebyshev::Basis;
 use cluster::MAX_SIZE;

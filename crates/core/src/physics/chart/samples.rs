@@ -5,10 +5,11 @@ use faer::{Mat, c64};
 
 use super::derivatives::{Change, Derivatives, PAIRS, pairs};
 use super::{Axis, MAX_AXES};
-use crate::physics::model::{Exact, Model, Traces};
+use crate::physics::model::Model;
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::{ROUNDING, Solver};
 use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
+use crate::physics::traces::{Exact, Traces};
 use crate::physics::tracking::{continue_roots, tracked};
 
 /// Condition number of a root above which its slope and curvature are too inaccurate to be used.
