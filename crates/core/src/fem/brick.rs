@@ -12,7 +12,7 @@
 use super::Material;
 
 /// Natural coordinates `ξ, η, ζ` of the corners, in the node order of Abaqus and CalculiX.
-const CORNERS: [[f64; 3]; 8] = [
+pub(super) const CORNERS: [[f64; 3]; 8] = [
     [-1.0, -1.0, -1.0],
     [1.0, -1.0, -1.0],
     [1.0, 1.0, -1.0],
@@ -23,7 +23,7 @@ const CORNERS: [[f64; 3]; 8] = [
     [-1.0, 1.0, 1.0],
 ];
 /// Number of shape functions: 8 nodes and 3 incompatible modes.
-const SHAPES: usize = 11;
+pub(super) const SHAPES: usize = 11;
 
 /// Matrices of one brick.
 #[derive(Clone, Debug, PartialEq)]
@@ -40,13 +40,37 @@ pub struct BrickMatrices {
 /// # Errors
 /// The determinant of the Jacobian, m³, if it is not above 0: the brick is inverted or too distorted.
 pub fn brick(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<BrickMatrices, f64> {
+    let (mut full, mut full_mass) = (full_stiffness(nodes_m, material)?, [[0.0; 3 * SHAPES]; 3 * SHAPES]);
+    add_mass(&mut full_mass, nodes_m, material.density_kg_per_m3);
+    condense(&mut full, &mut full_mass);
+    let outer = |full: &[[f64; 3 * SHAPES]; 3 * SHAPES]| {
+        std::array::from_fn(|row| std::array::from_fn(|column| full[row][column]))
+    };
+    Ok(BrickMatrices { stiffness: outer(&full), mass: outer(&full_mass) })
+}
+
+/// Stiffness over corner and incompatible shape functions, integrated with 2x2x2 points.
+fn full_stiffness(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<[[f64; 3 * SHAPES]; 3 * SHAPES], f64> {
     let (lambda, shear) = material.lame_pa();
+    let mut full = [[0.0; 3 * SHAPES]; 3 * SHAPES];
+    for (gradients, det) in elastic_gradients(nodes_m)? {
+        add_stiffness(&mut full, &gradients, lambda, shear, det);
+    }
+    Ok(full)
+}
+
+/// Gradients of all shape functions, 1/m, and the weight, m³, at each of the 2x2x2 points where stresses are computed.
+/// Those of the incompatible modes use the Jacobian at the centre.
+///
+/// # Errors
+/// The determinant of the Jacobian, m³, if it is not above 0.
+pub(super) fn elastic_gradients(nodes_m: &[[f64; 3]; 8]) -> Result<[([[f64; 3]; SHAPES], f64); 8], f64> {
     let (centre, centre_det) = inverse(&jacobian(nodes_m, [0.0; 3]));
     if centre_det.is_nan() || centre_det <= 0.0 {
         return Err(centre_det);
     }
-    let (mut full, mut full_mass) = ([[0.0; 3 * SHAPES]; 3 * SHAPES], [[0.0; 3 * SHAPES]; 3 * SHAPES]);
-    for corner in CORNERS {
+    let mut points = [([[0.0; 3]; SHAPES], 0.0); 8];
+    for (at, corner) in points.iter_mut().zip(CORNERS) {
         let point = corner.map(|coordinate| coordinate / 3.0_f64.sqrt());
         let (inverse, det) = inverse(&jacobian(nodes_m, point));
         if det.is_nan() || det <= 0.0 {
@@ -61,14 +85,68 @@ pub fn brick(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<BrickMatric
             natural[mode] = -2.0 * coordinate;
             gradients[8 + mode] = product(&centre, natural).map(|slope| slope * centre_det / det);
         }
-        add_stiffness(&mut full, &gradients, lambda, shear, det);
+        *at = (gradients, det);
     }
-    add_mass(&mut full_mass, nodes_m, material.density_kg_per_m3);
-    condense(&mut full, &mut full_mass);
-    let outer = |full: &[[f64; 3 * SHAPES]; 3 * SHAPES]| {
-        std::array::from_fn(|row| std::array::from_fn(|column| full[row][column]))
-    };
-    Ok(BrickMatrices { stiffness: outer(&full), mass: outer(&full_mass) })
+    Ok(points)
+}
+
+/// A point of the 3x3x3 rule that integrates squares of incompatible modes.
+pub(super) struct MassPoint {
+    /// Weight, m³.
+    pub weight: f64,
+    pub shapes: [f64; SHAPES],
+    /// Gradients of the shape functions, 1/m.
+    pub gradients: [[f64; 3]; SHAPES],
+}
+
+/// The points at which mass is integrated, with gradients of the displacement field as it is.
+pub(super) fn mass_points(nodes_m: &[[f64; 3]; 8]) -> impl Iterator<Item = MassPoint> + '_ {
+    three_points().map(move |(point, [a, b, c])| {
+        let (inverse, det) = inverse(&jacobian(nodes_m, point));
+        let gradients = std::array::from_fn(|index| match index {
+            0..8 => product(&inverse, natural_gradient(CORNERS[index], point)),
+            mode => {
+                let mut natural = [0.0; 3];
+                natural[mode - 8] = -2.0 * point[mode - 8];
+                product(&inverse, natural)
+            }
+        });
+        MassPoint { weight: a * b * c * det, shapes: shapes_at(point), gradients }
+    })
+}
+
+/// Natural coordinates and weights of the 3x3x3 Gauss points.
+fn three_points() -> impl Iterator<Item = ([f64; 3], [f64; 3])> {
+    let (points, weights) = ([-0.6_f64.sqrt(), 0.0, 0.6_f64.sqrt()], [5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0]);
+    (0..27).map(move |index| {
+        let [i, j, k] = [index % 3, index / 3 % 3, index / 9];
+        ([points[i], points[j], points[k]], [weights[i], weights[j], weights[k]])
+    })
+}
+
+/// Corner and incompatible shape functions at a point.
+fn shapes_at(point: [f64; 3]) -> [f64; SHAPES] {
+    std::array::from_fn(|shape_index| match shape_index {
+        0..8 => shape(CORNERS[shape_index], point),
+        mode => 1.0 - point[mode - 8].powi(2),
+    })
+}
+
+/// The displacements of all shape functions that follow from those of the corners when the incompatible modes are
+/// eliminated: `u_full = T u`, `33×24`.
+///
+/// # Errors
+/// The determinant of the Jacobian, m³, if it is not above 0.
+pub(super) fn following(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<[[f64; 24]; 3 * SHAPES], f64> {
+    let (mut stiffness, mut none) = (full_stiffness(nodes_m, material)?, [[0.0; 3 * SHAPES]; 3 * SHAPES]);
+    let follows = condense(&mut stiffness, &mut none);
+    let mut of_corners = [[0.0; 24]; 3 * SHAPES];
+    (0..24).for_each(|corner| of_corners[corner][corner] = 1.0);
+    for (index, weights) in follows.iter().enumerate() {
+        let row = 24 + index;
+        of_corners[row] = std::array::from_fn(|column| (0..row).map(|j| weights[j] * of_corners[j][column]).sum());
+    }
+    Ok(of_corners)
 }
 
 /// Adds `w ∇ₐᵀ D ∇_b` of an isotropic material at one integration point with weight `w`: the block
@@ -101,14 +179,10 @@ fn add_stiffness(
 /// Adds `∫ ρ Nᵀ N dV` over corner and incompatible shape functions. 3x3x3 points are needed because squares of
 /// incompatible modes are of fourth degree.
 fn add_mass(full: &mut [[f64; 3 * SHAPES]; 3 * SHAPES], nodes_m: &[[f64; 3]; 8], density_kg_per_m3: f64) {
-    let (points, weights) = ([-0.6_f64.sqrt(), 0.0, 0.6_f64.sqrt()], [5.0 / 9.0, 8.0 / 9.0, 5.0 / 9.0]);
-    for [i, j, k] in (0..27).map(|index| [index % 3, index / 3 % 3, index / 9]) {
-        let point = [points[i], points[j], points[k]];
-        let weight = density_kg_per_m3 * weights[i] * weights[j] * weights[k] * inverse(&jacobian(nodes_m, point)).1;
-        let shapes: [f64; SHAPES] = std::array::from_fn(|shape_index| match shape_index {
-            0..8 => shape(CORNERS[shape_index], point),
-            mode => 1.0 - point[mode - 8].powi(2),
-        });
+    for (point, [a, b, c]) in three_points() {
+        // In this order of factors, on which the last bit of the mass depends.
+        let weight = density_kg_per_m3 * a * b * c * inverse(&jacobian(nodes_m, point)).1;
+        let shapes = shapes_at(point);
         for (a, of_a) in shapes.iter().enumerate() {
             for (b, of_b) in shapes.iter().enumerate() {
                 for direction in 0..3 {
@@ -120,8 +194,13 @@ fn add_mass(full: &mut [[f64; 3 * SHAPES]; 3 * SHAPES], nodes_m: &[[f64; 3]; 8],
 }
 
 /// Eliminates the incompatible modes, last first, by static condensation `α = T u` of the stiffness. The mass is
-/// transformed with the same `T` (Guyan reduction). Both matrices stay exactly symmetric.
-fn condense(stiffness: &mut [[f64; 3 * SHAPES]; 3 * SHAPES], mass: &mut [[f64; 3 * SHAPES]; 3 * SHAPES]) {
+/// transformed with the same `T` (Guyan reduction). Both matrices stay exactly symmetric. Returns, for each of the
+/// nine, the weights of the displacements before it that it follows.
+fn condense(
+    stiffness: &mut [[f64; 3 * SHAPES]; 3 * SHAPES],
+    mass: &mut [[f64; 3 * SHAPES]; 3 * SHAPES],
+) -> [[f64; 3 * SHAPES]; 9] {
+    let mut all = [[0.0; 3 * SHAPES]; 9];
     for pivot in (24..3 * SHAPES).rev() {
         let (row, inertia) = (stiffness[pivot], mass[pivot]);
         let follows: [f64; 3 * SHAPES] = std::array::from_fn(|j| -row[j] / row[pivot]);
@@ -133,7 +212,9 @@ fn condense(stiffness: &mut [[f64; 3 * SHAPES]; 3 * SHAPES], mass: &mut [[f64; 3
                 (stiffness[j][i], mass[j][i]) = (stiffness[i][j], mass[i][j]);
             }
         }
+        all[pivot - 24] = follows;
     }
+    all
 }
 
 fn shape(corner: [f64; 3], point: [f64; 3]) -> f64 {

@@ -7,7 +7,8 @@
 //!
 //! [`brick`] computes the element matrices, with the incompatible modes of Wilson and Taylor. A [`Mesh`] holds nodes,
 //! bricks and hanging nodes; a [`Block`] is a structured piece of it. A [`Structure`] adds supports and springs and is
-//! assembled. [`tribometer`] is the reference rig.
+//! assembled; [`Structure::turning`] gives the matrices of one that turns about an axis. [`tribometer`] is the reference
+//! rig.
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
@@ -15,10 +16,12 @@ mod brick;
 mod mesh;
 mod structure;
 pub mod tribometer;
+mod turning;
 
 pub use brick::{BrickMatrices, brick};
 pub use mesh::{Block, Brick, Component, Extent, Mesh, SOLID, stations};
 pub use structure::{Assembled, Spring, Structure};
+pub use turning::{Axis, Turning, TurningError};
 
 /// An isotropic, linearly elastic material.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use faer::sparse::SymbolicSparseColMat;
 
-use super::{FemError, Mesh, brick};
+use super::{Brick, FemError, Material, Mesh, brick};
 use crate::reduction::SparseMatrix;
 
 /// A spring along one direction (0 to 2 for x, y, z) between two nodes, or between a node and the ground.
@@ -72,26 +72,16 @@ impl Structure {
             component.material.check(&component.name)?;
         }
         let rows = self.rows();
-        let mut row_of = vec![[None; 3]; self.mesh.nodes_m.len()];
-        for (row, &(node, direction)) in rows.iter().enumerate() {
-            row_of[node][direction] = Some(row);
-        }
+        let row_of = self.row_of(&rows);
         let neighbours = self.neighbours()?;
         let pattern = |(node, _): (usize, usize)| -> Vec<usize> {
             neighbours[node].iter().flat_map(|&other| row_of[other]).flatten().collect()
         };
-        let (mut stiffness, mut mass) = (Symmetric::new(&rows, pattern), Symmetric::new(&rows, pattern));
+        let (mut stiffness, mut mass) = (Mirrored::new(&rows, pattern), Mirrored::new(&rows, pattern));
         for (index, element) in self.mesh.bricks.iter().enumerate() {
-            let component = &self.mesh.components[element.component];
-            let matrices = brick(&self.mesh.corners_m(element), &component.material)
-                .map_err(|value| FemError::Inverted { brick: index, component: component.name.clone(), value })?;
-            // Corner, independent node that it depends on, weight.
-            let terms: Vec<(usize, usize, f64)> = element
-                .nodes
-                .iter()
-                .enumerate()
-                .flat_map(|(corner, &node)| self.mesh.weights(node).into_iter().map(move |(i, w)| (corner, i, w)))
-                .collect();
+            let (nodes_m, material) = self.brick_at(index);
+            let matrices = brick(&nodes_m, material).map_err(|value| self.inverted(index, value))?;
+            let terms = self.corner_terms(element);
             for &(a, node, weight) in &terms {
                 for &(b, other, share) in &terms {
                     for d in 0..3 {
@@ -122,7 +112,69 @@ impl Structure {
                 }
             }
         }
-        Ok(Assembled { stiffness: stiffness.finish(), mass: mass.finish(), rows })
+        let symmetric = Entry::Symmetric;
+        Ok(Assembled { stiffness: stiffness.finish(symmetric), mass: mass.finish(symmetric), rows })
+    }
+
+    /// Assembles one matrix over the free degrees of freedom from that of every brick, by the index of the brick.
+    ///
+    /// # Errors
+    /// [`FemError::Loose`].
+    pub(super) fn assemble_bricks(
+        &self,
+        entry: Entry,
+        of_brick: &mut dyn FnMut(usize) -> [[f64; 24]; 24],
+    ) -> Result<SparseMatrix, FemError> {
+        let rows = self.rows();
+        let (row_of, neighbours) = (self.row_of(&rows), self.neighbours()?);
+        let pattern = |(node, _): (usize, usize)| -> Vec<usize> {
+            neighbours[node].iter().flat_map(|&other| row_of[other]).flatten().collect()
+        };
+        let mut sum = Mirrored::new(&rows, pattern);
+        for (index, element) in self.mesh.bricks.iter().enumerate() {
+            let matrix = of_brick(index);
+            let terms = self.corner_terms(element);
+            for &(a, node, weight) in &terms {
+                for &(b, other, share) in &terms {
+                    for d in 0..3 {
+                        let Some(row) = row_of[node][d] else { continue };
+                        for (e, column) in row_of[other].into_iter().enumerate() {
+                            let Some(column) = column.filter(|&column| column <= row) else { continue };
+                            sum.add(row, column, weight * share * matrix[3 * a + d][3 * b + e]);
+                        }
+                    }
+                }
+            }
+        }
+        Ok(sum.finish(entry))
+    }
+
+    /// The row of each direction of every node; `None` if it is fixed or hangs on others.
+    pub(super) fn row_of(&self, rows: &[(usize, usize)]) -> Vec<[Option<usize>; 3]> {
+        let mut row_of = vec![[None; 3]; self.mesh.nodes_m.len()];
+        for (row, &(node, direction)) in rows.iter().enumerate() {
+            row_of[node][direction] = Some(row);
+        }
+        row_of
+    }
+
+    /// Corners and material of a brick.
+    pub(super) fn brick_at(&self, index: usize) -> ([[f64; 3]; 8], &Material) {
+        let element = &self.mesh.bricks[index];
+        (self.mesh.corners_m(element), &self.mesh.components[element.component].material)
+    }
+
+    pub(super) fn inverted(&self, index: usize, value: f64) -> FemError {
+        let component = self.mesh.components[self.mesh.bricks[index].component].name.clone();
+        FemError::Inverted { brick: index, component, value }
+    }
+
+    /// Corner, independent node that it depends on, and weight.
+    fn corner_terms(&self, element: &Brick) -> Vec<(usize, usize, f64)> {
+        let corners = element.nodes.iter().enumerate();
+        corners
+            .flat_map(|(corner, &node)| self.mesh.weights(node).into_iter().map(move |(i, w)| (corner, i, w)))
+            .collect()
     }
 
     /// The elongation of a spring as a weighted sum over independent nodes.
@@ -169,14 +221,23 @@ impl Structure {
     }
 }
 
-/// A symmetric matrix of known pattern, assembled in its lower triangle.
-struct Symmetric {
+/// How the entries above the diagonal follow from those below it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Entry {
+    /// They are equal.
+    Symmetric,
+    /// They have the opposite sign, and the diagonal is 0.
+    Skew,
+}
+
+/// A symmetric or skew matrix of known, symmetric pattern, assembled in its lower triangle.
+struct Mirrored {
     starts: Vec<usize>,
     rows: Vec<usize>,
     values: Vec<f64>,
 }
 
-impl Symmetric {
+impl Mirrored {
     /// A zero matrix; `of` returns the rows, ascending, with entries in the column of a degree of freedom. The pattern
     /// must be symmetric.
     fn new(rows: &[(usize, usize)], of: impl Fn((usize, usize)) -> Vec<usize>) -> Self {
@@ -195,17 +256,22 @@ impl Symmetric {
     }
 
     /// Copies the lower triangle to the upper one, so that both agree exactly.
-    fn finish(mut self) -> SparseMatrix {
+    fn finish(mut self, entry: Entry) -> SparseMatrix {
         let n = self.starts.len() - 1;
         // Columns are visited in ascending order, so the entries above the diagonal of each column are filled in
         // ascending order too.
         let mut upper = self.starts.clone();
         for column in 0..n {
-            for entry in self.starts[column]..self.starts[column + 1] {
-                let row = self.rows[entry];
+            for place in self.starts[column]..self.starts[column + 1] {
+                let row = self.rows[place];
                 if row > column {
-                    self.values[upper[row]] = self.values[entry];
+                    self.values[upper[row]] = match entry {
+                        Entry::Symmetric => self.values[place],
+                        Entry::Skew => -self.values[place],
+                    };
                     upper[row] += 1;
+                } else if row == column && entry == Entry::Skew {
+                    self.values[place] = 0.0;
                 }
             }
         }
@@ -221,7 +287,7 @@ mod tests {
     use faer::Mat;
 
     use super::*;
-    use crate::fem::{Extent, Material, SOLID, stations};
+    use crate::fem::{Extent, SOLID, stations};
     use crate::reduction::lowest_modes;
 
     const STEEL: Material = Material { density_kg_per_m3: 7800.0, young_pa: 210e9, poisson: 0.27 };

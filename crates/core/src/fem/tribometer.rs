@@ -33,7 +33,7 @@
 use std::f64::consts::TAU;
 
 use super::mesh::{divided, pieces};
-use super::{Block, Extent, FemError, Material, Mesh, SOLID, Spring, Structure, stations};
+use super::{Axis, Block, Extent, FemError, Material, Mesh, SOLID, Spring, Structure, stations};
 
 /// Distance of the middle of the cylinder from the axis of the disc, m.
 pub const MEAN_RADIUS_M: f64 = 0.1;
@@ -41,6 +41,9 @@ pub const MEAN_RADIUS_M: f64 = 0.1;
 pub const PATCH: [usize; 2] = [14, 21];
 /// Normal stiffness of each contact pair, N/m.
 pub const CONTACT_STIFFNESS_N_PER_M: f64 = 1.251e7;
+
+/// Axis about which the disc turns.
+pub const AXIS: Axis = Axis { point_m: [0.0; 3], direction: [0.0, 1.0, 0.0] };
 
 const PAD: Material = material(4500.0, 20e9, 0.29);
 const PAD_HOLDER: Material = material(7000.0, 180e9, 0.3);

@@ -21,6 +21,7 @@
 //!
 //! Pure: no clock, file, bus, log or serialisation.
 
+mod balance;
 mod compare;
 mod contact_solver;
 mod coverage;
@@ -41,10 +42,12 @@ mod project;
 mod residual;
 mod schur;
 mod sparse;
+
 mod substructures;
 #[cfg(test)]
 mod test_models;
 
+pub use balance::balanced_displacement;
 pub use compare::{
     CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
 };
@@ -59,6 +62,7 @@ pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep
 pub use project::{project_dense, project_sparse};
 pub use residual::{InertiaBy, Residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
+
 pub use substructures::{Kept, Substructure, keep_modes};
 
 /// Largest difference of two mirrored entries of a symmetric matrix, relative to its largest entry; it allows for
