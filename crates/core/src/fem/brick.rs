@@ -53,23 +53,31 @@ pub fn brick(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<BrickMatric
 fn full_stiffness(nodes_m: &[[f64; 3]; 8], material: &Material) -> Result<[[f64; 3 * SHAPES]; 3 * SHAPES], f64> {
     let (lambda, shear) = material.lame_pa();
     let mut full = [[0.0; 3 * SHAPES]; 3 * SHAPES];
-    for (gradients, det) in elastic_gradients(nodes_m)? {
-        add_stiffness(&mut full, &gradients, lambda, shear, det);
+    for StressPoint { weight, gradients } in stress_points(nodes_m)? {
+        add_stiffness(&mut full, &gradients, lambda, shear, weight);
     }
     Ok(full)
 }
 
-/// Gradients of all shape functions, 1/m, and the weight, m³, at each of the 2x2x2 points where stresses are computed.
-/// Those of the incompatible modes use the Jacobian at the centre.
+/// A point of the 2x2x2 rule at which stresses are computed.
+#[derive(Clone, Copy)]
+pub(super) struct StressPoint {
+    /// Weight, m³.
+    pub weight: f64,
+    /// Gradients of all shape functions, 1/m. Those of the incompatible modes use the Jacobian at the centre.
+    pub gradients: [[f64; 3]; SHAPES],
+}
+
+/// The points at which stresses are computed.
 ///
 /// # Errors
 /// The determinant of the Jacobian, m³, if it is not above 0.
-pub(super) fn elastic_gradients(nodes_m: &[[f64; 3]; 8]) -> Result<[([[f64; 3]; SHAPES], f64); 8], f64> {
+pub(super) fn stress_points(nodes_m: &[[f64; 3]; 8]) -> Result<[StressPoint; 8], f64> {
     let (centre, centre_det) = inverse(&jacobian(nodes_m, [0.0; 3]));
     if centre_det.is_nan() || centre_det <= 0.0 {
         return Err(centre_det);
     }
-    let mut points = [([[0.0; 3]; SHAPES], 0.0); 8];
+    let mut points = [StressPoint { weight: 0.0, gradients: [[0.0; 3]; SHAPES] }; 8];
     for (at, corner) in points.iter_mut().zip(CORNERS) {
         let point = corner.map(|coordinate| coordinate / 3.0_f64.sqrt());
         let (inverse, det) = inverse(&jacobian(nodes_m, point));
@@ -85,7 +93,7 @@ pub(super) fn elastic_gradients(nodes_m: &[[f64; 3]; 8]) -> Result<[([[f64; 3]; 
             natural[mode] = -2.0 * coordinate;
             gradients[8 + mode] = product(&centre, natural).map(|slope| slope * centre_det / det);
         }
-        *at = (gradients, det);
+        *at = StressPoint { weight: det, gradients };
     }
     Ok(points)
 }

@@ -19,7 +19,7 @@
 
 use faer::Mat;
 
-use super::brick::{elastic_gradients, following, mass_points};
+use super::brick::{StressPoint, following, mass_points, stress_points};
 use super::structure::{Entry, Structure};
 use super::{FemError, Material};
 use crate::reduction::{ReductionError, SparseMatrix, balanced_displacement};
@@ -171,14 +171,14 @@ fn brick_turning(nodes_m: &[[f64; 3]; 8], material: &Material, axis: &Axis) -> R
 /// `K_σ` of a brick whose corners have the displacements `of_corners`, m.
 fn brick_stiffening(nodes_m: &[[f64; 3]; 8], material: &Material, of_corners: &[f64; 24]) -> [[f64; 24]; 24] {
     const SHAPES: usize = super::brick::SHAPES;
-    let (Ok(follows), Ok(points)) = (following(nodes_m, material), elastic_gradients(nodes_m)) else {
+    let (Ok(follows), Ok(points)) = (following(nodes_m, material), stress_points(nodes_m)) else {
         unreachable!("the brick was assembled before");
     };
     let displacement: [f64; 3 * SHAPES] =
         std::array::from_fn(|row| follows[row].iter().zip(of_corners).map(|(weight, u)| weight * u).sum());
     let (lambda, shear) = material.lame_pa();
     let mut full = [[0.0; SHAPES]; SHAPES];
-    for (gradients, weight) in points {
+    for StressPoint { weight, gradients } in points {
         // ∂u_d/∂x_i.
         let slope = |d: usize, i: usize| -> f64 {
             (0..SHAPES).map(|shape| displacement[3 * shape + d] * gradients[shape][i]).sum()
