@@ -1,7 +1,7 @@
 //! The node at the speed of the bus, over shared memory, beside a bare round trip over the same bus. For a quiet machine:
 //! `cargo bench --bench bus_speed`.
 
-#[path = "../tests/bus/mod.rs"]
+#[path = "../tests/suite/bus/mod.rs"]
 mod bus;
 
 use std::sync::Arc;

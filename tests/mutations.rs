@@ -5,6 +5,8 @@
 //! takes as long as all other tests; `tests/fuzz` does it. `SQUEALCAST_FUZZ_S` is how many seconds each reader gets, and
 //! `SQUEALCAST_FUZZ_SEED` the seed. Arguments name readers; `--corpus FOLDER` writes the sound files instead.
 
+#[allow(dead_code)]
+#[path = "suite/program/mod.rs"]
 mod program;
 #[path = "fuzz/targets.rs"]
 mod targets;

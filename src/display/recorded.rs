@@ -332,7 +332,7 @@ impl Source for Recorded {
         let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
         let map = self.stability_map(self.map_number(time_s));
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
-        let shape = shape(&self.rig, &mut solver, map.as_deref(), &conditions(&input), id)?;
+        let shape = shape(&self.rig, &mut solver, map.as_deref(), &conditions(input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
     }
 }

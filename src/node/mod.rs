@@ -235,7 +235,7 @@ impl Node {
     /// watches for the next silence.
     fn answers_at_once(&self, input: &msgs::OperatingPoint) -> bool {
         let heard_lately = self.last_heard.is_some() && !self.silent;
-        self.backlog.is_empty() && heard_lately && self.session.answers_at_once(&conditions(&input))
+        self.backlog.is_empty() && heard_lately && self.session.answers_at_once(&conditions(input))
     }
 
     /// Predicts for an input on the thread that received it.

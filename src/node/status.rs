@@ -176,7 +176,7 @@ impl Assessment {
         let [fastest, ..] = fastest_modes(prediction);
         let input = input.filter(|input| input.seq == prediction.input_seq);
         let next = input.zip(windows).and_then(|(input, (map, ends))| {
-            NextSqueal::new(prediction, &conditions(&input), map, ends).filter(|_| status.is_known())
+            NextSqueal::new(prediction, &conditions(input), map, ends).filter(|_| status.is_known())
         });
         let fastest = fastest.filter(|_| status.is_known());
         let message = match status {

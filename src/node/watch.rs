@@ -49,7 +49,7 @@ impl Snapshot {
         let prediction = self.prediction.as_ref().filter(|prediction| !prediction.friction_margin.is_nan())?;
         let input = self.input.as_ref().filter(|input| input.seq == prediction.input_seq)?;
         let map = self.map.as_deref()?;
-        map.next_window(self.ends.as_deref().unwrap_or(&map.ends), &conditions(&input))
+        map.next_window(self.ends.as_deref().unwrap_or(&map.ends), &conditions(input))
     }
 }
 

@@ -1,0 +1,40 @@
+//! Tests of the whole program, in one binary: each of these modules would otherwise be linked with everything the program
+//! depends on. `cargo test --test suite rig_files::` runs one module.
+//!
+//! `program`, `bus`, `domain`, `records` and `forger` are helpers.
+
+mod basis_rigs;
+mod brake;
+mod bus;
+mod buses;
+mod ceilings;
+mod commands;
+mod display;
+mod domain;
+mod examples;
+mod file_systems;
+mod forger;
+mod full_model;
+mod identify;
+mod identities;
+mod modal_rigs;
+mod neighbours;
+mod non_matching;
+mod peers;
+mod program;
+mod readers;
+mod readme;
+mod recorder_faults;
+mod recording;
+mod records;
+mod reduce;
+mod reproduce;
+mod rig_files;
+mod rig_models;
+mod ros2_side;
+mod scipy;
+mod sessions;
+mod stress;
+mod tribometer;
+mod upstream;
+mod usage;
