@@ -4,7 +4,7 @@
 //! - [`physics`] computes roots, stability maps, window ends and charts.
 //! - [`session`] turns inputs and session events into predictions, as a pure step.
 //! - [`node`] runs a session on a [`bus`] and records it ([`recording`]); [`offline`] runs one without buses.
-//! - [`sound`] hears squeal in sampled sound or acceleration, as a pure detector.
+//! - [`sound`] detects squeal in sampled sound or acceleration.
 //! - [`display`] shows a node or a recording; [`figures`] draws; [`study`] measures and reproduces.
 //! - [`commands`] contains the commands.
 //!

@@ -1,8 +1,19 @@
-//! Hears squeal: a pure, deterministic detector of squeal in sampled sound or acceleration.
+//! Finds squeal in sampled sound or acceleration; pure and deterministic.
 //!
-//! [`waveform`] is what the detector hears: samples of one channel with their rate, unit and time. Nothing here reads a
-//! file, a bus or a clock; time comes from the stamps of the samples.
+//! - [`waveform`]: samples of one channel with their rate, unit and time.
+//! - [`spectrum`]: short-time spectra and the tones in them; [`weighting`]: A-weighting.
+//! - [`envelope`]: onset, end and growth of one tone; [`detector`]: squeals in a stream of samples.
+//! - [`simulated`]: sound with squeals whose properties are known.
+//!
+//! Nothing here reads a file, a bus or a clock; time comes from the stamps of the samples.
 
+pub mod detector;
+pub mod envelope;
+pub mod simulated;
+pub mod spectrum;
 pub mod waveform;
+pub mod weighting;
 
+pub use detector::{Counts, Detection, Detector, DetectorError, Harmonic, Interruption, Settings, Squeal};
+pub use envelope::Growth;
 pub use waveform::{Calibration, Channel, ChannelError, Quantity, Sensitivity, Unit, Waveform};
