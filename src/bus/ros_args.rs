@@ -343,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn malformed_arguments_are_told() {
+    fn malformed_arguments_are_refused_with_a_reason() {
         let error = |line: &str| split(line).expect_err("malformed").to_string();
         assert_eq!(error("--ros-args --nonsense"), "unknown ROS argument \"--nonsense\"");
         assert_eq!(error("--ros-args -r"), "ROS argument -r needs a value");

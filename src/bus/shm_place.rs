@@ -119,7 +119,7 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
 
     #[test]
-    fn a_folder_of_somebody_else_is_not_used() {
+    fn a_folder_of_another_user_is_not_used() {
         let folder = tempfile::tempdir().unwrap();
         let user = folder.path().metadata().unwrap().uid();
         assert_eq!(usable(&folder.path().join("none"), user), Ok(()));

@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn the_command_that_stands_in_for_a_rig_publishes_where_the_node_listens() {
+    fn the_simulator_command_publishes_on_the_topic_of_the_node() {
         let arguments = ["--ros-args", "-r", "/rig/operating_point:=/brake1/point"].map(str::to_owned);
         let (args, _) = RosArgs::split(arguments).expect("rules");
         let buses = options();

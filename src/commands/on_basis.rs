@@ -158,19 +158,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ranges_in_words() {
+    fn ranges_as_text() {
         let all = ranges("mu=0:1, speed=6:60,load=500").unwrap();
         assert_eq!(all.friction_coefficient, Some([0.0, 1.0]));
         assert_eq!(all.disc_speed_rad_s, Some([6.0, 60.0]));
         assert_eq!(all.normal_load_n, Some([500.0, 500.0]));
-        for (text, told) in [
+        for (text, expected) in [
             ("mu", "no `=`"),
             ("mu=a", "invalid float"),
             ("mu=0:1:2", "3 numbers"),
             ("mass=1", "none of mu, load and speed"),
             ("mu=0,mu=1", "`mu` twice"),
         ] {
-            assert!(ranges(text).unwrap_err().contains(told), "{text}: {}", ranges(text).unwrap_err());
+            assert!(ranges(text).unwrap_err().contains(expected), "{text}: {}", ranges(text).unwrap_err());
         }
     }
 }

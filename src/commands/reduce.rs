@@ -341,8 +341,8 @@ mod tests {
     fn counts_of_modes() {
         assert_eq!(mode_counts("80+75").unwrap().0, [80, 75]);
         assert_eq!(mode_counts("12").unwrap().0, [12]);
-        for (text, told) in [("80+", "expected counts such as 80+80"), ("0+3", "at least 1"), ("a", "`a`")] {
-            assert!(mode_counts(text).unwrap_err().contains(told), "{text}");
+        for (text, expected) in [("80+", "expected counts such as 80+80"), ("0+3", "at least 1"), ("a", "`a`")] {
+            assert!(mode_counts(text).unwrap_err().contains(expected), "{text}");
         }
     }
 }

@@ -87,7 +87,7 @@ pub fn serve(
     (sender, receiver): (Sender<Incoming>, Receiver<Incoming>),
 ) -> anyhow::Result<Outcome> {
     if let Some(known) = &rig.reduction {
-        note!("{}", known.told());
+        note!("{}", known.summary());
     }
     // Before the recording begins, so that it is always finished when a signal arrives.
     let stop = sender.clone();
@@ -110,8 +110,8 @@ pub fn serve(
     let shortcut = Shortcut::new(sender.clone());
     if let Some(shm) = buses.shm() {
         outputs.shm = Some(ShmOutput::new(&shm).context("shared memory; --no-shm stays off it")?);
-        if let Some(told) = outputs.other_nodes() {
-            note!("warning: {told}");
+        if let Some(others) = outputs.other_nodes() {
+            note!("warning: {others}");
         }
         outputs.shm_sensitivity = Some(ShmSensitivity::new(&shm)?);
         if listening == Listening::ToTheBuses {

@@ -112,7 +112,7 @@ fn text(rig: &Rig, full: &FullModelFile, found: &Verified) -> String {
     if !found.windows.is_empty() {
         text += "\nwindows of instability\n";
     }
-    let told = |ends: &Option<WindowEnds>| match ends {
+    let ends_in_words = |ends: &Option<WindowEnds>| match ends {
         None => "none".to_owned(),
         Some(WindowEnds { mu_from, mu_to: Some(to), frequency_hz }) => {
             format!("{mu_from:.8} to {to:.8} at {frequency_hz:.3} Hz")
@@ -128,10 +128,10 @@ fn text(rig: &Rig, full: &FullModelFile, found: &Verified) -> String {
             window.normal_load_n,
             window.disc_speed_rad_s,
             window.kind,
-            told(&window.full),
-            told(&window.rig)
+            ends_in_words(&window.full),
+            ends_in_words(&window.rig)
         );
     }
-    text += &format!("\n{}\n", found.certificate.told());
+    text += &format!("\n{}\n", found.certificate.summary());
     text
 }

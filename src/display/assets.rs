@@ -80,7 +80,7 @@ mod tests {
 
     /// The page must not refer to another origin: apart from licences and namespaces it contains no addresses.
     #[test]
-    fn the_page_asks_nobody_else() {
+    fn the_page_requests_no_other_origin() {
         for asset in ASSETS.iter().filter(|asset| !asset.path.starts_with("vendor/")) {
             let text = String::from_utf8_lossy(asset.bytes).replace("http://www.w3.org/2000/svg", "");
             assert!(!text.contains("http:") && !text.contains("https:"), "{}", asset.path);
@@ -173,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_of_modes_are_told_apart_by_the_colour_blind() {
+    fn colours_of_modes_differ_for_colour_blind_people() {
         let panel = colours("--panel");
         let modes: Vec<Vec<[u8; 3]>> = (0..7).map(|k| colours(&format!("--mode-{k}"))).collect();
         for theme in 0..2 {

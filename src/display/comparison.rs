@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn hits_misses_and_false_alarms_are_told_apart() {
+    fn hits_misses_and_false_alarms_are_counted_separately() {
         let events = predicted(&[(5.0, 10.0), (20.0, 25.0), (30.0, 35.0), (40.0, 45.0), (57.0, 58.0)]);
         let tones = [
             (6.0, 9.0, 1530.0),   // a hit, 1 s after the prediction, 2 % off

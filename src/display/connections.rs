@@ -322,7 +322,7 @@ mod tests {
     }
 
     #[test]
-    fn silent_connections_keep_nobody_out() {
+    fn silent_connections_do_not_block_others() {
         let served = Served::start(patient());
         let mut used = served.connect();
         assert!(is_answered(&mut used));

@@ -365,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn every_moment_says_what_was_predicted_then() {
+    fn every_moment_shows_its_own_prediction() {
         let directory = tempfile::tempdir().expect("a folder");
         let recorded = ramp(directory.path());
         assert_eq!(recorded.moments.len(), STEPS as usize);
@@ -394,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn a_report_says_that_its_conditions_were_simulated_and_tells_onset_and_peak_apart() {
+    fn a_report_names_simulated_conditions_and_separates_onset_from_peak() {
         let directory = tempfile::tempdir().expect("a folder");
         let recorded = ramp(directory.path());
         let [event] = recorded.events.iter().collect::<Vec<_>>()[..] else { panic!("{:?}", recorded.events) };

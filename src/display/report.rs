@@ -160,13 +160,13 @@ fn session(recorded: &Recorded, origin: &Origin, from_s: f64, to_s: f64) -> Stri
         ("predictions", format!("{} ({})", recorded.predictions(), counted.join(", "))),
     ];
     let settings = recorded.session_events.iter().filter(|(_, event)| event.kind == event_kind::PARAMETER);
-    let told: Vec<String> = settings
+    let listed: Vec<String> = settings
         .map(|(time_ns, event)| match seconds(*time_ns) - from_s {
             late if late > STARTING_S => format!("{} = {} after {late:.2} s", event.name, event.value),
             _ => format!("{} = {}", event.name, event.value),
         })
         .collect();
-    rows.push(("settings", told.join("; ")));
+    rows.push(("settings", listed.join("; ")));
     facts(rows)
 }
 
@@ -270,7 +270,7 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
                  </tr></thead><tbody>\n";
     }
     for (k, Judged { squeal, verdict }) in (1..).zip(found.measured.iter().take(LISTED)) {
-        let (kind, told) = match *verdict {
+        let (kind, predicted) = match *verdict {
             Verdict::Hit { event, mode_id, lead_s, frequency_difference } => (
                 "hit",
                 [
@@ -290,7 +290,7 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
             format!("{:.1}", squeal.peak_db),
             number(squeal.frequency_hz),
         ];
-        let cells: String = measured.iter().chain(&told).map(|cell| format!("<td>{cell}</td>")).collect();
+        let cells: String = measured.iter().chain(&predicted).map(|cell| format!("<td>{cell}</td>")).collect();
         let _ = writeln!(html, "<tr class=\"{kind}\">{cells}</tr>");
     }
     if !found.measured.is_empty() {
@@ -308,7 +308,7 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
 
 /// The section on maps, charts and changed settings.
 fn session_events(recorded: &Recorded, from_s: f64) -> String {
-    let told = |(time_ns, event): &(i64, SessionEvent)| {
+    let row = |(time_ns, event): &(i64, SessionEvent)| {
         let after_s = seconds(*time_ns) - from_s;
         let (what, of) = match event.kind {
             event_kind::STABILITY_MAP => {
@@ -324,7 +324,7 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
         let cells = [format!("{after_s:.3}"), what.to_owned(), escaped(&of), escaped(hash)];
         Some(cells.iter().map(|cell| format!("<td>{cell}</td>")).collect::<String>())
     };
-    let rows: Vec<String> = recorded.session_events.iter().filter_map(told).collect();
+    let rows: Vec<String> = recorded.session_events.iter().filter_map(row).collect();
     if rows.is_empty() {
         return "<p>None.</p>\n".to_owned();
     }

@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn json_has_null_for_what_is_not_known_and_all_digits_of_what_is() {
+    fn json_has_null_for_unknown_values_and_all_digits_of_known_ones() {
         let prediction = Prediction {
             input_seq: 7,
             critical_friction: f64::NAN,

@@ -54,7 +54,7 @@ mod tests {
     const S: i64 = 1_000_000_000;
 
     #[test]
-    fn stamps_decide_and_what_has_none_follows_the_recording() {
+    fn messages_are_placed_by_stamp_or_else_by_log_time() {
         let mut line = TimeLine::default();
         assert_eq!(line.unstamped(90 * S), 90 * S, "nothing is known of the stamps");
         // Recorded during a tenfold playback.

@@ -58,7 +58,7 @@ impl Certificate {
     }
 
     /// The certificate in one line of text.
-    pub fn told(&self) -> String {
+    pub fn summary(&self) -> String {
         let (critical, what) = match (self.windows_compared_at, self.critical_friction_error) {
             (0, _) => (", windows of instability not compared".to_owned(), "unstable modes"),
             (_, Some(error)) => (format!(", critical friction {error:.1e}"), "unstable modes or windows"),
@@ -156,9 +156,9 @@ pub fn verify_against(
     let mut solver = Solver::new(rig.model.dimension());
     let mut points = vec![];
     for (index, p) in held_out(rig, against).into_iter().enumerate() {
-        let told = format!("point {} of {}", index + 1, against.points);
+        let label = format!("point {} of {}", index + 1, against.points);
         let found = full_solver
-            .roots(&p, band_rad_s, FullVectors::None, &mut |step| progress(&told, step))
+            .roots(&p, band_rad_s, FullVectors::None, &mut |step| progress(&label, step))
             .with_context(|| format!("full model at {p:?}"))?;
         let lambdas: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
         let reduced = reduced_roots(&rig.model, &mut solver, &p).with_context(|| format!("rig at {p:?}"))?;
@@ -188,9 +188,9 @@ pub fn verify_against(
     let places = if against.windows { places(rig) } else { vec![] };
     let windows_compared_at = places.len();
     for p in places {
-        let told = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
+        let label = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
         let of_full =
-            full_windows(&full.model, full_solver, &p, band_rad_s, &options, &mut |step| progress(&told, step))?;
+            full_windows(&full.model, full_solver, &p, band_rad_s, &options, &mut |step| progress(&label, step))?;
         let of_rig = StabilityMap::build(&rig.model, &mut solver, &p, &options)?.windows;
         let compared = compare_windows(&of_full, &of_rig);
         if !compared.pairs.is_empty() {

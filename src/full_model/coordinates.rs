@@ -14,7 +14,7 @@ use std::io::BufRead;
 use super::entries::{Entries, MOST_ROWS};
 use super::tables::Nodes;
 use crate::rig::RigError;
-use crate::rig::lines::{Lines, refuse, told};
+use crate::rig::lines::{Lines, found, refuse};
 
 /// A diagonal entry of at least this marks a constrained row: Abaqus writes boundary conditions this way.
 const HELD: f64 = 1e35;
@@ -46,7 +46,7 @@ fn scan(
             words[count] = word;
             count += 1;
         }
-        let refuse = |field: &str, word: &str, limit: &str| refuse(file, line, field, told(word), limit);
+        let refuse = |field: &str, word: &str, limit: &str| refuse(file, line, field, found(word), limit);
         let value = |word: &str| match word.replace(['D', 'd'], "e").parse::<f64>() {
             Ok(value) if value.is_finite() => Ok(value),
             _ => Err(refuse("value", word, "a finite number")),
@@ -124,7 +124,7 @@ pub fn read(
             Listed::Numbers(row, column, value) => {
                 for (what, index) in [("row", row), ("column", column)] {
                     if index >= n {
-                        return Err(refuse(file, line, what, told(&(index + 1).to_string()), &format!("1 to {n}")));
+                        return Err(refuse(file, line, what, found(&(index + 1).to_string()), &format!("1 to {n}")));
                     }
                 }
                 (row, column, value)
@@ -202,7 +202,7 @@ pub fn dof(file: &str, input: impl BufRead) -> Result<Vec<Label>, RigError> {
         });
         match label {
             Some(label) => rows.push(label),
-            None => return Err(refuse(file, line, "row", told(content), "node.direction, the direction from 1 to 6")),
+            None => return Err(refuse(file, line, "row", found(content), "node.direction, the direction from 1 to 6")),
         }
     }
     Ok(rows)
@@ -229,7 +229,7 @@ pub fn deck_nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, 
             let turned =
                 |(key, value): (&str, &str)| key.eq_ignore_ascii_case("SYSTEM") && !value.eq_ignore_ascii_case("R");
             if keyword.eq_ignore_ascii_case("SYSTEM") || inside && system.any(turned) {
-                return Err(refuse(file, line, "nodes", told(content), "nodes in the global rectangular system"));
+                return Err(refuse(file, line, "nodes", found(content), "nodes in the global rectangular system"));
             }
             continue;
         }
@@ -243,12 +243,12 @@ pub fn deck_nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, 
             (Some(label), &[x, y, z]) if [x, y, z].iter().all(|value| value.is_finite()) && cells.len() == 4 => {
                 if let Some(before) = seen.insert(label, line) {
                     let limit = format!("every node once; line {before} has it too");
-                    return Err(refuse(file, line, "node", told(&label.to_string()), &limit));
+                    return Err(refuse(file, line, "node", found(&label.to_string()), &limit));
                 }
                 labels.push(label);
                 positions.push([scale * x, scale * y, scale * z]);
             }
-            _ => return Err(refuse(file, line, "node", told(content), "a node and three finite coordinates")),
+            _ => return Err(refuse(file, line, "node", found(content), "a node and three finite coordinates")),
         }
     }
     if labels.is_empty() {

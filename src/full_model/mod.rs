@@ -364,7 +364,7 @@ fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Resul
             let field = |name: &str| format!("system.{key}[{index}].{name}");
             let (law, _) = system::checked_law(&file, &field("scale"), &raw.scale, &settings.reference)?;
             let (row_of, held) = (&HashMap::new(), &mut HashSet::new());
-            let expected = part::Expected { rows: n, told: "system.mass", row_of, held };
+            let expected = part::Expected { rows: n, source: "system.mass", row_of, held };
             let matrix = part::matrix(files, &field("matrix"), &raw.matrix, 1.0, Some(expected))?;
             let symmetry = if crate::reduction::is_symmetric(&matrix) { "symmetric" } else { "unsymmetric" };
             let entries = matrix.compute_nnz();

@@ -34,7 +34,7 @@ struct Read<'a> {
 pub struct Expected<'a> {
     pub rows: usize,
     /// The file or field that determines the number of rows, for errors.
-    pub told: &'a str,
+    pub source: &'a str,
     /// Row of each label.
     pub row_of: &'a HashMap<Label, usize>,
     /// Labels known to be constrained; they have no row.
@@ -67,7 +67,7 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
     let mut held = HashSet::new();
     let mut matrix = |key: &str, file: &str| -> Result<SparseMatrix, RigError> {
         let field = field(key);
-        let expected = Expected { rows: rows.len(), told: rows_file, row_of: &row_of_label, held: &mut held };
+        let expected = Expected { rows: rows.len(), source: rows_file, row_of: &row_of_label, held: &mut held };
         let matrix = self::matrix(files, &field, file, raw.units.of_matrices(), Some(expected))?;
         let read = Read { field, file, matrix, row_of: &row_of_label };
         read.check(files, key == "mass")?;
@@ -156,8 +156,8 @@ pub fn matrix(
     let toml = files.toml.clone();
     files.read(field, file, |input| {
         let expected = match expected {
-            Some(Expected { rows, told, row_of, held }) if !is_matrix_market(input) => {
-                let (entries, mirrored) = coordinates::read(file, input, (rows, told), row_of, held)?;
+            Some(Expected { rows, source, row_of, held }) if !is_matrix_market(input) => {
+                let (entries, mirrored) = coordinates::read(file, input, (rows, source), row_of, held)?;
                 return Ok(entries.compress(rows, mirrored, factor));
             }
             expected => expected,
@@ -171,7 +171,7 @@ pub fn matrix(
         let n = size.rows;
         let limit = match expected {
             _ if size.columns != n || n == 0 || n >= MOST_ROWS => format!("a square matrix of 1 to {MOST_ROWS} rows"),
-            Some(Expected { rows, told, .. }) if rows != n => format!("{rows}x{rows}, as {told}"),
+            Some(Expected { rows, source, .. }) if rows != n => format!("{rows}x{rows}, as {source}"),
             // Checked before memory for n columns is allocated.
             None if entries.len() < n => "an entry on every place of the diagonal".to_owned(),
             _ => return Ok(entries.compress(n, size.mirrored, factor)),
@@ -210,8 +210,8 @@ impl Read<'_> {
         for row in 0..self.matrix.nrows() {
             let listed = view.get(row, row).copied();
             if listed.is_none() {
-                let told = format!("at row {}, column {} is missing up to here", row + 1, row + 1);
-                return Err(self.at_line(files, (row, row), told, "every row on the diagonal; is the file whole?"));
+                let problem = format!("at row {}, column {} is missing up to here", row + 1, row + 1);
+                return Err(self.at_line(files, (row, row), problem, "every row on the diagonal; is the file whole?"));
             }
             let value = listed.unwrap_or(0.0);
             if value < 0.0 || (mass && value == 0.0) {
@@ -226,7 +226,7 @@ impl Read<'_> {
             for (row, &value) in view.row_idx_of_col(column).zip(view.val_of_col(column)) {
                 let mirrored = view.get(column, row).copied().unwrap_or(0.0);
                 if (value - mirrored).abs() > limit {
-                    let told = format!(
+                    let problem = format!(
                         "at row {}, column {} is {value}, but {mirrored} at row {}, column {}",
                         row + 1,
                         column + 1,
@@ -234,7 +234,7 @@ impl Read<'_> {
                         row + 1
                     );
                     let limit = format!("a symmetric matrix; mirrored entries may differ by {limit:.3e}");
-                    return Err(self.at_line(files, (row, column), told, &limit));
+                    return Err(self.at_line(files, (row, column), problem, &limit));
                 }
             }
         }

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::io::BufRead;
 
 use crate::rig::RigError;
-use crate::rig::lines::{Lines, told};
+use crate::rig::lines::{Lines, found};
 
 /// Directions of the rows of a node, in numerical order.
 const DIRECTIONS: [&str; 6] = ["x", "y", "z", "rx", "ry", "rz"];
@@ -38,7 +38,7 @@ pub fn nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, RigEr
     let labelled = match header.as_str() {
         "x_m,y_m,z_m" => false,
         "node,x_m,y_m,z_m" => true,
-        other => return Err(lines.refuse("header", told(other), "x_m,y_m,z_m or node,x_m,y_m,z_m")),
+        other => return Err(lines.refuse("header", found(other), "x_m,y_m,z_m or node,x_m,y_m,z_m")),
     };
     let (mut positions, mut labels, mut seen) = (vec![], vec![], HashMap::new());
     while let Some((line, content)) = lines.advance()? {
@@ -46,8 +46,9 @@ pub fn nodes(file: &str, input: impl BufRead, scale: f64) -> Result<Nodes, RigEr
             continue;
         }
         let cells: Vec<&str> = content.split(',').map(str::trim).collect();
-        let refuse =
-            |field: &str, text: &str, limit: &str| Err(crate::rig::lines::refuse(file, line, field, told(text), limit));
+        let refuse = |field: &str, text: &str, limit: &str| {
+            Err(crate::rig::lines::refuse(file, line, field, found(text), limit))
+        };
         let (label, coordinates) = match cells.as_slice() {
             [label, coordinates @ ..] if labelled => match label.parse::<u64>() {
                 Ok(label) => (label, coordinates),
@@ -82,7 +83,7 @@ pub fn rows(file: &str, input: impl BufRead) -> Result<Vec<(u64, usize)>, RigErr
     let mut lines = Lines::new(file, input);
     let header = header(&mut lines)?;
     if header != "node,direction" {
-        return Err(lines.refuse("header", told(&header), "node,direction"));
+        return Err(lines.refuse("header", found(&header), "node,direction"));
     }
     let mut rows = vec![];
     while let Some((line, content)) = lines.advance()? {
@@ -97,7 +98,7 @@ pub fn rows(file: &str, input: impl BufRead) -> Result<Vec<(u64, usize)>, RigErr
             Some(row) => rows.push(row),
             None => {
                 let limit = "a node and one of x, y, z, rx, ry, rz";
-                return Err(crate::rig::lines::refuse(file, line, "row", told(content), limit));
+                return Err(crate::rig::lines::refuse(file, line, "row", found(content), limit));
             }
         }
     }

@@ -491,7 +491,7 @@ pub fn rig_info(rig: &Rig) -> RigInfo {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         mode_count: rig.model.dimension() as u32,
         band_max_hz: rig.band_max_hz.unwrap_or(f64::NAN),
-        reduction: rig.reduction.as_ref().map(Certificate::told).unwrap_or_default(),
+        reduction: rig.reduction.as_ref().map(Certificate::summary).unwrap_or_default(),
     }
 }
 
@@ -559,7 +559,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_heard_long_ago_is_forgotten_without_taking_memory() {
+    fn old_inputs_are_forgotten_and_their_memory_reused() {
         let mut heard = Remembered::new(100);
         let room = (heard.bus.capacity(), heard.order.capacity());
         for seq in 0..100_000 {
@@ -571,7 +571,7 @@ mod tests {
     }
 
     #[test]
-    fn of_a_long_backlog_the_newest_is_predicted_whatever_bus_repeats_it() {
+    fn the_newest_input_of_a_long_backlog_is_predicted_on_either_bus() {
         const COUNT: u64 = 8000;
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
         let settings = Settings { warn_margin: 0.3, ..Settings::for_rig(&rig) };

@@ -186,7 +186,7 @@ fn a_clock_that_is_set_does_not_bend_a_recording() {
 /// After a stop, shared memory and ROS 2 deliver the inputs they kept all at once. Each is recorded with its
 /// prediction.
 #[test]
-fn the_recorder_has_room_for_what_the_buses_keep_twice_over() {
+fn the_recorder_queue_holds_twice_the_depth_of_the_buses() {
     use crate::msgs::shm::{Form, OperatingPointForm};
     let kept = 2 * OperatingPointForm::WAITING_SAMPLES;
     assert!(QUEUE_MESSAGES >= 2 * 2 * kept, "{QUEUE_MESSAGES} for {kept} inputs");

@@ -279,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn the_level_says_that_nothing_was_heard_that_it_squeals_and_that_inputs_stopped() {
+    fn the_diagnostic_level_reflects_no_input_squeal_and_silence() {
         let mut reporter = Reporter::new();
         assert_eq!(reporter.report(), (diagnostic_level::WARN, "WAITING".to_owned()), "nothing is known yet");
         reporter.statistics.silence();

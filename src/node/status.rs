@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn the_banner_names_the_fastest_growing_mode_whatever_the_reason_says() {
+    fn the_banner_names_the_fastest_growing_mode_for_every_reason() {
         let said = Assessment::new(Status::Squeal, &squeal(), None, None);
         assert_eq!(said.fastest.map(|mode| mode.id), Some(15));
         assert_eq!(said.message, "mode 15 at 3114.6 Hz grows by 636 1/s, the fastest of 2");
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn who_waits_learns_where_and_what_to_start() {
+    fn waiting_names_topic_domain_and_command_to_start() {
         let sources = InputSources {
             topic: Some("/rig/operating_point".to_owned()),
             domain: Some(7),

@@ -250,7 +250,7 @@ fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
                 continue;
             }
         };
-        let mut told = 0;
+        let mut reported = 0;
         loop {
             let (mut raw, before) = (VecDeque::new(), walker.unpacked_bytes());
             let last = loop {
@@ -264,8 +264,8 @@ fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
                     break false;
                 }
             };
-            let damage = located(file, &walker.damage()[told..]).collect();
-            told = walker.damage().len();
+            let damage = located(file, &walker.damage()[reported..]).collect();
+            reported = walker.damage().len();
             if batches.send(Batch { raw, damage }).is_err() {
                 return;
             }

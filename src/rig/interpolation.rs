@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn linear_fields_are_exact_inside_on_edges_and_beside() {
+    fn linear_fields_are_exact_inside_on_edges_and_outside() {
         let points = grid();
         let interpolation = surface(&points, None);
         let field = |p: [f64; 2]| 3.0 + 7.0 * p[0] - 2.0 * p[1];

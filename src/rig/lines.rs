@@ -63,7 +63,7 @@ pub fn refuse(file: &str, line: usize, field: &str, value: String, limit: &str) 
 }
 
 /// `` is `text` ``, with the text truncated after 40 characters, for error messages.
-pub fn told(text: &str) -> String {
+pub fn found(text: &str) -> String {
     match text.char_indices().nth(40) {
         Some((end, _)) => format!("is `{}...`", &text[..end]),
         None => format!("is `{text}`"),

@@ -7,7 +7,7 @@ use std::io::BufRead;
 use faer::sparse::Triplet;
 
 use super::RigError;
-use super::lines::{Lines, refuse, told};
+use super::lines::{Lines, found, refuse};
 use crate::reduction::SparseMatrix;
 
 /// The entries of a matrix file, including those mirrored at the diagonal if its header declares a symmetry.
@@ -101,7 +101,7 @@ pub fn read_entries(
     let (rows, columns, listed) = match (numbers.as_deref(), coordinate) {
         (Some(&[rows, columns, listed]), true) => (rows, columns, listed as u128),
         (Some(&[rows, columns]), false) => (rows, columns, count_of_array(rows, columns, symmetry)),
-        _ => return Err(lines.refuse("size", told(&sizes), size_limit)),
+        _ => return Err(lines.refuse("size", found(&sizes), size_limit)),
     };
     if symmetry != Symmetry::General && rows != columns {
         let limit = "a square matrix, as its header says symmetric";
@@ -115,7 +115,7 @@ pub fn read_entries(
         }
         let refuse = |field: &str, value: String, limit: &str| refuse(file, line, field, value, limit);
         if seen == listed {
-            let value = format!("go on with {}", &told(content)[3..]);
+            let value = format!("go on with {}", &found(content)[3..]);
             return Err(refuse("entries", value, "no more than the size says"));
         }
         seen += 1;
@@ -125,7 +125,7 @@ pub fn read_entries(
             ([Some(row), Some(column), Some(word), None], true) => {
                 let index = |word: &str, limit: usize, what: &str| match word.parse::<usize>() {
                     Ok(index) if (1..=limit).contains(&index) => Ok(index - 1),
-                    _ => Err(refuse(what, told(word), &format!("1 to {limit}"))),
+                    _ => Err(refuse(what, found(word), &format!("1 to {limit}"))),
                 };
                 (index(row, rows, "row")?, index(column, columns, "column")?, word)
             }
@@ -139,14 +139,14 @@ pub fn read_entries(
                 }
                 (position.0, position.1, word)
             }
-            (_, true) => return Err(refuse("entry", told(content), "row, column and value")),
-            (_, false) => return Err(refuse("entry", told(content), "one value")),
+            (_, true) => return Err(refuse("entry", found(content), "row, column and value")),
+            (_, false) => return Err(refuse("entry", found(content), "one value")),
         };
         let value = if integer { word.parse::<i64>().ok().map(|value| value as f64) } else { word.parse::<f64>().ok() };
         let kind = if integer { "an integer" } else { "a finite number" };
         let value = match value {
             Some(value) if value.is_finite() => value,
-            _ => return Err(refuse("value", told(word), kind)),
+            _ => return Err(refuse("value", found(word), kind)),
         };
         let allowed = match symmetry {
             Symmetry::General => true,
@@ -185,7 +185,7 @@ fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
     let words: Vec<String> = header.split_whitespace().take(6).map(str::to_ascii_lowercase).collect();
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
     let &[banner, object, format, field, symmetry] = words.as_slice() else {
-        let value = told(header);
+        let value = found(header);
         return Err((
             "header",
             value,
@@ -193,22 +193,22 @@ fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
         ));
     };
     if banner != "%%matrixmarket" {
-        return Err(("banner", told(banner), "%%MatrixMarket"));
+        return Err(("banner", found(banner), "%%MatrixMarket"));
     }
     if object != "matrix" {
-        return Err(("object", told(object), "matrix"));
+        return Err(("object", found(object), "matrix"));
     }
     let coordinate = match format {
         "coordinate" => true,
         "array" => false,
-        _ => return Err(("format", told(format), "coordinate or array")),
+        _ => return Err(("format", found(format), "coordinate or array")),
     };
     let integer = match field {
         "real" | "double" => false,
         "integer" => true,
-        "complex" => return Err(("field", told(field), "real or integer: complex matrices have no place in a rig")),
-        "pattern" => return Err(("field", told(field), "real or integer: a pattern has no values")),
-        _ => return Err(("field", told(field), "real or integer")),
+        "complex" => return Err(("field", found(field), "real or integer: complex matrices have no place in a rig")),
+        "pattern" => return Err(("field", found(field), "real or integer: a pattern has no values")),
+        _ => return Err(("field", found(field), "real or integer")),
     };
     let symmetry = match symmetry {
         "general" => Symmetry::General,
@@ -217,11 +217,11 @@ fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
         "hermitian" => {
             return Err((
                 "symmetry",
-                told(symmetry),
+                found(symmetry),
                 "general, symmetric or skew-symmetric: hermitian is for complex matrices",
             ));
         }
-        _ => return Err(("symmetry", told(symmetry), "general, symmetric or skew-symmetric")),
+        _ => return Err(("symmetry", found(symmetry), "general, symmetric or skew-symmetric")),
     };
     Ok((coordinate, integer, symmetry))
 }
@@ -284,7 +284,7 @@ mod tests {
     #[test]
     fn errors_name_line_value_and_limit() {
         let head = "%%MatrixMarket matrix";
-        for (text, told) in [
+        for (text, expected) in [
             (
                 "".to_owned(),
                 "a.mtx, line 1: header is ``; expected %%MatrixMarket matrix coordinate|array real|integer general|symmetric|skew-symmetric",
@@ -339,7 +339,7 @@ mod tests {
                 "a.mtx, line 2: size is 2x3; expected a square matrix, as its header says symmetric",
             ),
         ] {
-            assert_eq!(read("a.mtx", text.as_bytes()).unwrap_err().to_string(), told);
+            assert_eq!(read("a.mtx", text.as_bytes()).unwrap_err().to_string(), expected);
         }
     }
 }

@@ -294,7 +294,7 @@ impl Rig {
             path: None,
             content_hash: source.content_hash(),
             files: source.into_files(),
-            contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::told)).collect(),
+            contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::summary)).collect(),
             reduction: raw.reduction,
             basis_tolerance: raw.basis.as_ref().and_then(|basis| basis.tolerance),
             made_for: raw.basis.as_ref().map(|basis| MadeFor {

@@ -95,14 +95,14 @@ fn apart(
     };
     let cutoff_hz = sides.iter().map(|(_, part)| part.cutoff_hz()).fold(f64::INFINITY, f64::min);
     let residual = known.map(|(known, of)| residual::within_band(known, &of, cutoff_hz, settings.band_max_hz));
-    let (flexibility, told) = match residual {
-        Some(residual) => (Some(residual.flexibility), Some((residual.told, residual.band_max_hz))),
+    let (flexibility, description) = match residual {
+        Some(residual) => (Some(residual.flexibility), Some((residual.description, residual.band_max_hz))),
         None => (None, None),
     };
     let (kind, disc) = ("modal substructures (kind 2)", disc.map(|disc| &disc.side));
     let mut built = assemble(file, kind, &pad.side, disc, contact, settings, flexibility)?;
-    if let Some((told, band_max_hz)) = told {
-        built.contents.push(told);
+    if let Some((description, band_max_hz)) = description {
+        built.contents.push(description);
         built.band_max_hz = Some(band_max_hz);
     }
     Ok(built)

@@ -43,7 +43,7 @@ pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<Residual
         let shapes = [vec![triangle(c, 0)], vec![c, c]];
         let mut arrays = vec![];
         for (name, shape) in names.iter().zip(&shapes) {
-            let limit = || format!("({}), by the {c} contact pairs", told(shape));
+            let limit = || format!("({}), by the {c} contact pairs", dimensions(shape));
             arrays.push(archive.array(name, |found| if found == shape { Ok(()) } else { Err(limit()) })?);
         }
         match (&arrays[0], &arrays[1]) {
@@ -143,7 +143,7 @@ fn refuse(file: &str, field: &str, value: &str, limit: &str) -> RigError {
     RigError::Npz { file: file.to_owned(), field: field.to_owned(), value: value.to_owned(), limit: limit.to_owned() }
 }
 
-fn told(shape: &[usize]) -> String {
+fn dimensions(shape: &[usize]) -> String {
     shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ")
 }
 
@@ -191,8 +191,9 @@ impl<'a> Archive<'a> {
         let array = NpyFile::new(head.as_slice()).map_err(|error| unreadable(&error))?;
         let length = |length: &u64| usize::try_from(*length).unwrap_or(usize::MAX);
         let shape: Vec<usize> = array.shape().iter().map(length).collect();
-        let refuse_shape =
-            |value: &str, limit: &str| Err(refuse(file, name, &format!("has shape ({}){value}", told(&shape)), limit));
+        let refuse_shape = |value: &str, limit: &str| {
+            Err(refuse(file, name, &format!("has shape ({}){value}", dimensions(&shape)), limit))
+        };
         let scalar = match array.dtype() {
             DType::Plain(scalar) => scalar,
             other => {
@@ -230,7 +231,7 @@ impl<'a> Archive<'a> {
             values = to_c_order(&shape, &values);
         }
         if let Some((index, &value)) = values.iter().enumerate().find(|(_, value)| !value.is_finite()) {
-            let field = format!("{name}[{}]", told(&position(&shape, index)));
+            let field = format!("{name}[{}]", dimensions(&position(&shape, index)));
             return Err(RigError::NotFinite { file: file.to_owned(), field, value });
         }
         Ok(Some(Array { shape, values }))

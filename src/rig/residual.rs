@@ -27,7 +27,7 @@ pub(super) struct PairResidual {
     /// `[band] max_hz`, at most the cut-off; the cut-off if not given.
     pub band_max_hz: f64,
     /// A line for [`super::Rig::describe`].
-    pub told: String,
+    pub description: String,
 }
 
 /// Residual flexibility and inertia of one side, between x, y and z of its nodes.
@@ -112,7 +112,7 @@ pub(super) fn within_band(
     PairResidual {
         flexibility: ResidualFlexibility { inertia, ..flexibility },
         band_max_hz: asked_hz.min(cutoff_hz),
-        told: format!("residual   of {of}, {inertial}; cut-off {cutoff_hz:.1} Hz{clamped}"),
+        description: format!("residual   of {of}, {inertial}; cut-off {cutoff_hz:.1} Hz{clamped}"),
     }
 }
 

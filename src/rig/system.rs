@@ -17,7 +17,7 @@ struct ReadTerm {
     symmetric: bool,
     law: Law,
     at_reference: f64,
-    told: String,
+    description: String,
 }
 
 /// Transforms the matrix of a term to the coordinates of the model.
@@ -101,8 +101,8 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
         }
         None => format!("modes      all of {n} degrees of freedom"),
     });
-    contents.extend(stiffness.iter().map(|term| format!("stiffness  {}", term.told)));
-    contents.extend(damping.iter().map(|term| format!("damping    {}", term.told)));
+    contents.extend(stiffness.iter().map(|term| format!("stiffness  {}", term.description)));
+    contents.extend(damping.iter().map(|term| format!("damping    {}", term.description)));
     Ok(Built { model, contact: None, contents, shapes: vec![], band_max_hz: settings.band_max_hz })
 }
 
@@ -136,14 +136,14 @@ fn read_terms(
         }
         let matrix = listed.to_sparse(&raw.matrix)?;
         let symmetric = is_symmetric(&matrix);
-        let told = format!(
+        let description = format!(
             "{} times {}, {}, {} entries",
             raw.matrix,
             raw.scale,
             if symmetric { "symmetric" } else { "unsymmetric" },
             matrix.compute_nnz()
         );
-        terms.push(ReadTerm { matrix, symmetric, law, at_reference, told });
+        terms.push(ReadTerm { matrix, symmetric, law, at_reference, description });
     }
     Ok(terms)
 }

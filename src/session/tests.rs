@@ -160,7 +160,7 @@ fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
 /// A charted and a solved prediction at the same conditions: same identities, same level, every value within its error
 /// bound.
 #[test]
-fn a_chart_predicts_what_a_solve_does() {
+fn a_chart_predicts_the_same_as_a_solve() {
     let (mut solved, mut charted) = (with_map(session()), with_map(session()));
     let chart = crate::physics::chart::build::build(&charted.rig.model, &chart_options(&charted.rig), &|_| true);
     charted.step(Event::ChartReady(Arc::new(chart.expect("the rig can be charted")))).unwrap();

@@ -48,7 +48,7 @@ mod tests {
     }
 
     #[test]
-    fn rounding_noise_is_zero_and_what_exceeds_its_bound_is_not() {
+    fn values_within_their_rounding_bound_are_shown_as_zero() {
         assert_eq!(above_error(-1.7e-13, 2e-12, 5), "0");
         assert_eq!(above_error(-0.25, 2e-12, 5), "-0.25000");
         assert_eq!(above_error(1e-13, f64::NAN, 5), "1.00e-13", "without a bound every digit stands");

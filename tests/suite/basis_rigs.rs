@@ -78,13 +78,13 @@ fn what_makes_no_shared_basis_is_refused() {
         let sides = [side("pad", vec![300.0], shape(12, 1, 0.2)), side("disc", vec![omega], shape(12, 1, 1.0))];
         Rig::from_files(&rig_of(more, &sides)).map(|_| ()).unwrap_err().to_string()
     };
-    let told = both("[basis]\nshared = true\n", 301.0);
-    assert!(told.contains("disc.modal") && told.contains("the same coordinates"), "{told}");
-    let told = both("[basis]\nshared = true\nlargest_error = -1.0\n", 300.0);
-    assert!(told.contains("basis.largest_error"), "{told}");
+    let message = both("[basis]\nshared = true\n", 301.0);
+    assert!(message.contains("disc.modal") && message.contains("the same coordinates"), "{message}");
+    let message = both("[basis]\nshared = true\nlargest_error = -1.0\n", 300.0);
+    assert!(message.contains("basis.largest_error"), "{message}");
     let alone = [side("pad", vec![300.0], shape(12, 1, 0.2))];
-    let told = Rig::from_files(&rig_of("[basis]\nshared = true\n", &alone)).map(|_| ()).unwrap_err().to_string();
-    assert!(told.contains("basis.shared") && told.contains("rigid disc"), "{told}");
+    let message = Rig::from_files(&rig_of("[basis]\nshared = true\n", &alone)).map(|_| ()).unwrap_err().to_string();
+    assert!(message.contains("basis.shared") && message.contains("rigid disc"), "{message}");
 }
 
 /// Writes the matrix `n×n` of `entries`, counted from 0.
@@ -124,11 +124,12 @@ fn a_system_on_its_basis_has_the_roots_it_has() {
     )
     .unwrap();
     let to = at("rig.toml");
-    let told = run(["reduce", &text(&full), "--tolerance", "1e-7", "--range", "mu=0:0.8,speed=2:20", "-o", &text(&to)])
-        .exits(0)
-        .says("held-out points")
-        .complains("cut to");
-    eprintln!("{}", told.stdout);
+    let message =
+        run(["reduce", &text(&full), "--tolerance", "1e-7", "--range", "mu=0:0.8,speed=2:20", "-o", &text(&to)])
+            .exits(0)
+            .says("held-out points")
+            .complains("cut to");
+    eprintln!("{}", message.stdout);
     let (whole, rig) = (Rig::load(&text(&full)).unwrap(), Rig::load(&text(&to)).unwrap());
     assert!(rig.model.dimension() < n, "{}", rig.model.dimension());
     let counted = Counted { band_rad_s: 320.0 * TAU, growth_floor_per_s: -20.0 };
@@ -138,12 +139,12 @@ fn a_system_on_its_basis_has_the_roots_it_has() {
         // Not among the points that were held out: the tolerance is what was found at those, not a bound.
         assert!(found.errors.len() > 5 && found.worst() < 1e-6, "{p:?}: {} {:e}", found.errors.len(), found.worst());
     }
-    for (wrong, told) in [
+    for (wrong, message) in [
         (["--range", "mu=1:0"], "ascending order"),
         (["--range", "load=0:5"], "more than 0"),
         (["--range", "mu=0.3:0.6"], "begins at 0.3"),
     ] {
-        run([&["reduce", &text(&full), "-o", &text(&at("no.toml"))], &wrong[..]].concat()).exits(1).complains(told);
+        run([&["reduce", &text(&full), "-o", &text(&at("no.toml"))], &wrong[..]].concat()).exits(1).complains(message);
     }
     run(["reduce", &text(&full), "--range", "rpm=1:2", "-o", &text(&at("no.toml"))]).exits(2).complains("none of mu");
     assert!(!at("no.toml").exists());
@@ -163,8 +164,8 @@ fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
     fs::write(&banded, narrower).unwrap();
     let to = temp.path().join("rig.toml");
     // Compared with the full model below, at points of this test.
-    let told = run(["reduce", &text(&banded), "--range", "mu=0:1", "--points", "0", "-o", &text(&to)]).exits(0);
-    eprintln!("{}{}", told.stderr, told.stdout);
+    let message = run(["reduce", &text(&banded), "--range", "mu=0:1", "--points", "0", "-o", &text(&to)]).exits(0);
+    eprintln!("{}{}", message.stderr, message.stdout);
     run(["check", &text(&to)]).exits(0).says("held-out points").says("shared basis");
     let rig = Rig::load(&text(&to)).unwrap();
     assert!(rig.model.dimension() <= 60, "{}", rig.model.dimension());
@@ -201,8 +202,8 @@ fn a_rig_made_at_one_load_and_used_at_another_is_caught() {
     let verify = |rig: &std::path::Path, code: i32| {
         // To the 1e-6 that the basis was made for.
         let options = ["--points", "2", "--no-windows", "--json"];
-        let told = run([&["verify", &text(rig), "--against", &text(&hertzian)][..], &options].concat()).exits(code);
-        let found = told.json();
+        let message = run([&["verify", &text(rig), "--against", &text(&hertzian)][..], &options].concat()).exits(code);
+        let found = message.json();
         eprintln!("{}", found["certificate"]);
         found["certificate"]["max_relative_error"].as_f64().unwrap()
     };

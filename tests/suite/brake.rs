@@ -111,7 +111,7 @@ fn the_brake_on_150_modes_is_found_out() {
 }
 
 #[test]
-fn the_brake_is_told_what_it_holds() {
+fn check_describes_the_brake() {
     let Some((_folder, rig)) = rig() else { return };
     let started = Instant::now();
     let check = run(["check", &rig]).exits(0).says("150 lowest of 4669 degrees of freedom");

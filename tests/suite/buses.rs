@@ -91,7 +91,7 @@ fn shared_memory_carries_both_ways() {
 }
 
 #[test]
-fn a_slow_shared_memory_reader_sees_what_it_lost() {
+fn a_slow_shared_memory_reader_counts_lost_messages() {
     // Twice what may wait for it.
     const WAITING: u64 = OperatingPointForm::WAITING_SAMPLES as u64;
     const COUNT: u64 = 2 * WAITING;
@@ -278,7 +278,7 @@ fn vibration(k: u64) -> Vibration {
 }
 
 #[test]
-fn both_buses_carry_the_vibration_beside_the_conditions() {
+fn both_buses_carry_vibration_and_conditions() {
     let options = shm("vibration");
     let (vibrations, heard) = unbounded();
     let input = ShmVibrationInput::spawn(&options, into(vibrations.clone())).expect("input");
@@ -401,7 +401,7 @@ fn foreign_node(domain: &Domain, name: &str) -> (ros2_client::Node, tokio::runti
 
 /// Sensor drivers publish best effort, which a reliable subscription refuses.
 #[test]
-fn best_effort_publishers_are_heard_and_reliable_ones_once() {
+fn best_effort_and_reliable_publishers_are_received_once() {
     use ros2_client::{MessageTypeName, Name, QosProfile, qos};
     const COUNT: u64 = 500;
     let domain = Domain::claim();
@@ -596,7 +596,7 @@ fn ros2_parameters_are_judged() {
     assert_eq!(got.values[0].double_value, 0.1);
     let mut accepted = accepted.lock().expect("whole");
     accepted.dedup();
-    assert_eq!(*accepted, [("warn_margin".to_owned(), 0.1)], "initial and refused values are not told");
+    assert_eq!(*accepted, [("warn_margin".to_owned(), 0.1)], "initial and refused values are not passed on");
 }
 
 #[test]

@@ -221,7 +221,7 @@ fn strangers() -> Vec<u8> {
 }
 
 #[test]
-fn recordings_that_unpack_to_far_more_than_they_are_are_refused_in_few_words() {
+fn recordings_that_unpack_beyond_the_limit_are_refused_briefly() {
     let folder = folder();
     let path = folder.path().join("bomb.mcap");
     let file = text(&path);

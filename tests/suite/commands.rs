@@ -487,7 +487,7 @@ fn well_formed(xml: &str) -> BTreeMap<String, usize> {
 }
 
 #[test]
-fn a_sweep_prints_csv_or_writes_what_it_is_asked_for() {
+fn a_sweep_prints_csv_or_writes_the_requested_files() {
     let printed = run(["sweep", "nine-dof", "--mu", "0.3:0.4:0.05"]).exits(0);
     let sweep = read_sweep(&printed.stdout);
     let steps: Vec<f64> = sweep.iter().map(|(mu, _)| *mu).collect();
@@ -643,7 +643,7 @@ fn failures_end_with_1_and_name_the_file() {
     for command in ["predict", "sweep", "critical", "check", "run", "demo"] {
         let failed = run([command, &missing]).exits(1).complains("missing.toml");
         assert_eq!(failed.stdout, "", "{command}");
-        assert_eq!(failed.stderr.matches("os error").count(), 1, "a reason is told once: {}", failed.stderr);
+        assert_eq!(failed.stderr.matches("os error").count(), 1, "the reason appears once: {}", failed.stderr);
         run([command, &broken]).exits(1).complains("broken.toml").complains("surprise");
         // A name that is neither a file nor embedded: the message says which names there are.
         run([command, "nine-dofs"]).exits(1).complains("nine-dofs").complains("nine-dof-case-2");
@@ -651,7 +651,7 @@ fn failures_end_with_1_and_name_the_file() {
     run(["predict", "nine-dof", "--load", "1e999"]).exits(2);
     for command in [&["replay", "--verify"][..], &["recover"], &["import", "-o", "x.mcap"]] {
         let failed = run(command.iter().copied().chain([missing.as_str()])).exits(1).complains("missing.toml");
-        assert_eq!(failed.stderr.matches("os error").count(), 1, "a reason is told once: {}", failed.stderr);
+        assert_eq!(failed.stderr.matches("os error").count(), 1, "the reason appears once: {}", failed.stderr);
     }
     run(["replay", "--verify", &broken]).exits(1).complains("broken.toml").complains("MCAP");
     run(["simulate", "--profile", &missing, "--no-ros", "--no-shm"]).exits(1).complains("missing.toml");
@@ -759,7 +759,7 @@ fn help_states_units() {
     let conditions = ["--load <N> Normal load in N", "--speed <RAD_S> Disc speed in rad/s"];
     let friction = "--mu <MU> Friction coefficient";
     let seconds = ["--rate <HZ> Measurements per second", "--duration <S> Stop after this many seconds"];
-    for (command, told) in [
+    for (command, expected) in [
         ("predict", &[conditions[0], conditions[1], friction][..]),
         ("sweep", &[conditions[0], conditions[1], "--mu <FROM:TO:STEP> Friction coefficients"]),
         ("critical", &[conditions[0], conditions[1], "--mu-max <MU> Search friction coefficients from 0"]),
@@ -782,7 +782,7 @@ fn help_states_units() {
         ("completions", &["bash", "fish", "zsh"]),
     ] {
         let help = flat(command);
-        for text in told {
+        for text in expected {
             assert!(help.contains(text), "{command} --help says no {text:?}: {help}");
         }
     }

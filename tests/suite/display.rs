@@ -125,7 +125,7 @@ fn nothing_can_be_changed_and_no_other_site_gets_in() {
 }
 
 #[test]
-fn a_state_comes_at_most_thirty_times_a_second_whatever_the_input_rate() {
+fn the_page_gets_at_most_thirty_states_a_second_at_any_input_rate() {
     let _alone = alone();
     let shown = Shown::demo(&["nine-dof-case-2", "--rate", "2000"]);
     let mut lines = BufReader::new(shown.listen()).lines();
@@ -198,9 +198,9 @@ fn browser_ready() -> bool {
     ];
     let missing: Vec<&str> = missing.iter().filter(|(missing, _)| *missing).map(|(_, name)| *name).collect();
     if !missing.is_empty() {
-        let told = format!("no {}: tests/browser/setup.sh installs it", missing.join(", no "));
-        assert!(std::env::var_os("SQUEALCAST_BROWSER_TESTS").is_none_or(|value| value != "required"), "{told}");
-        eprintln!("SKIPPED: {told}");
+        let reason = format!("no {}: tests/browser/setup.sh installs it", missing.join(", no "));
+        assert!(std::env::var_os("SQUEALCAST_BROWSER_TESTS").is_none_or(|value| value != "required"), "{reason}");
+        eprintln!("SKIPPED: {reason}");
     }
     missing.is_empty()
 }
@@ -332,7 +332,7 @@ fn fields(answer: &serde_json::Value) -> Vec<&str> {
 
 /// Made-up answers lead the page into every status; that they are as a node's answers, a demo shows.
 #[test]
-fn the_page_tells_every_status_and_shows_what_squeals_next() {
+fn the_page_shows_every_status_and_the_next_squeal() {
     let _alone = alone();
     if !browser_ready() {
         return;
@@ -552,7 +552,7 @@ fn plateaus(directory: &Path) -> PathBuf {
 
 /// The answer is known by construction: the rig squeals above a friction coefficient of our choice.
 #[test]
-fn a_report_tells_hits_misses_and_false_alarms() {
+fn a_report_lists_hits_misses_and_false_alarms() {
     let run = |arguments: &[&str]| {
         let output = Command::new(env!("CARGO_BIN_EXE_squealcast")).args(arguments).output().unwrap();
         assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -672,7 +672,7 @@ fn pages_do_not_slow_the_node() {
             _ => {}
         }
     }
-    let told: Vec<(usize, f64, f64, f64)> = phases
+    let reason: Vec<(usize, f64, f64, f64)> = phases
         .iter()
         .zip(&mut latencies)
         .map(|((count, ..), latencies)| {
@@ -681,14 +681,14 @@ fn pages_do_not_slow_the_node() {
             (*count, latencies.len() as f64 / PHASE.as_secs_f64(), quantile(0.5), quantile(0.99))
         })
         .collect();
-    for (count, rate, median, p99) in &told {
+    for (count, rate, median, p99) in &reason {
         println!("{count:>2} pages: {rate:.0} predictions/s, latency {median:.0} us median, {p99:.0} us p99");
     }
-    for (count, rate, median, _) in &told {
+    for (count, rate, median, _) in &reason {
         // A machine busy with something else delays some inputs past the end of a phase.
         assert!((950.0..1050.0).contains(rate), "{count} pages: {rate} predictions/s");
         // Twice what it is without a page is more than any machine's noise and less than any wait for a page.
-        assert!(*median < 2.0 * told[0].2 + 100.0, "{count} pages: {median} us, without {} us", told[0].2);
+        assert!(*median < 2.0 * reason[0].2 + 100.0, "{count} pages: {median} us, without {} us", reason[0].2);
     }
 }
 
@@ -730,7 +730,7 @@ fn memory_is_flat_with_pages_attached() {
 
 /// Every path of the Foxglove layout names a topic and a field that there is.
 #[test]
-fn the_foxglove_layout_names_what_there_is() {
+fn the_foxglove_layout_names_existing_topics_and_fields() {
     use squealcast::msgs::schema::Topic;
     let text = include_str!("../../launch/foxglove-layout.json");
     let layout: serde_json::Value = serde_json::from_str(text).unwrap();

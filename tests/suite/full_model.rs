@@ -56,13 +56,13 @@ fn one_node(folder: &Path) -> String {
 }
 
 #[test]
-fn what_is_wrong_is_told_with_file_line_and_value() {
+fn errors_name_file_line_and_value() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let toml = one_node(folder);
     run(["check", &toml]).exits(0).says("3 degrees of freedom").says("disc       rigid");
     let head = "%%MatrixMarket matrix coordinate real";
-    for (file, content, told) in [
+    for (file, content, expected) in [
         (
             "k.mtx",
             format!("{head} general\n3 3 4\n1 1 3\n2 2 4\n3 3 5\n3 1 0.5\n"),
@@ -103,7 +103,7 @@ fn what_is_wrong_is_told_with_file_line_and_value() {
     ] {
         one_node(folder);
         write(folder, file, &content);
-        run(["check", &toml]).exits(1).complains(told);
+        run(["check", &toml]).exits(1).complains(expected);
     }
     one_node(folder);
     std::fs::remove_file(folder.join("m.mtx")).unwrap();
@@ -227,7 +227,7 @@ fn calculix_abaqus_and_matrix_market_give_the_same_modes() {
         assert!(off < of_mesh, "{ours} and {theirs} rad^2/s^2 differ by {off:.1e}, on the finer mesh {finer}");
     }
     // Truncated, out of range, no number.
-    for (file, content, told) in [
+    for (file, content, expected) in [
         ("stored.sti", "1 1 2.0\n2 2\n", "stored.sti, line 2: entry is `2 2`"),
         ("stored.sti", "1 1 2.0\n99999999 2 1.0\n", "stored.sti, line 2: row is `99999999`"),
         ("stored.mas", "1 1 2.0\n1 2 x\n", "stored.mas, line 2: value is `x`"),
@@ -235,7 +235,7 @@ fn calculix_abaqus_and_matrix_market_give_the_same_modes() {
     ] {
         let before = std::fs::read(folder.join(file)).unwrap();
         write(folder, file, content);
-        run(["check", &calculix]).exits(1).complains(told);
+        run(["check", &calculix]).exits(1).complains(expected);
         std::fs::write(folder.join(file), before).unwrap();
     }
 }
@@ -283,7 +283,7 @@ fn labelled_matrices_cut_short_are_refused() {
 
 /// What only a factorisation finds out about a matrix is told with its file.
 #[test]
-fn indefinite_matrices_are_told_with_their_file() {
+fn indefinite_matrices_are_refused_by_file_name() {
     let folder = tempfile::tempdir().unwrap();
     let folder = folder.path();
     let toml = one_node(folder);

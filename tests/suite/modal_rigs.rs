@@ -220,8 +220,8 @@ fn nothing_above_the_cut_off_is_shown() {
         let rig = reduced(more, true);
         let cutoff_hz = 5000.0 / std::f64::consts::TAU;
         assert!((rig.band_max_hz.unwrap() - cutoff_hz).abs() < 1e-9);
-        let told = rig.describe();
-        assert_eq!(told.contains("to which the band of 5000 Hz is cut"), !more.is_empty(), "{told}");
+        let expected = rig.describe();
+        assert_eq!(expected.contains("to which the band of 5000 Hz is cut"), !more.is_empty(), "{expected}");
         let map = mapped(&rig, &mut Solver::new(rig.model.dimension()));
         assert!(map.windows.iter().all(|window| window.frequency_hz <= cutoff_hz), "{:?}", map.windows);
     }
@@ -413,7 +413,7 @@ fn a_universal_file_becomes_modal_data() {
 #[test]
 fn wrong_universal_files_are_refused_with_line_and_value() {
     let refused = |text: &str| uff::read("a.unv", text.as_bytes()).unwrap_err().to_string();
-    for (from, to, told) in [
+    for (from, to, expected) in [
         (
             "  4.00000E+00  1.00000E-02",
             "  0.00000E+00  1.00000E-02",
@@ -476,7 +476,7 @@ fn wrong_universal_files_are_refused_with_line_and_value() {
             // An unknown dataset is passed over.
             assert!(text.contains("nodes are missing; expected a dataset 15 or 2411"), "{text}");
         } else {
-            assert_eq!(text, told);
+            assert_eq!(text, expected);
         }
     }
     let complex = UFF.replace("         1         2         ", "         1         3         ");

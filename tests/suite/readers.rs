@@ -296,7 +296,7 @@ fn commands_take_a_folder_of_sessions() {
 // --- time ------------------------------------------------------------------------------------------------------------------
 
 #[test]
-fn reports_tell_the_time_of_the_stamps() {
+fn reports_use_the_time_of_the_stamps() {
     let folder = folder();
     let ramp = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings/ramp");
     // As if it had been played into a node at ten times the speed, a day later.

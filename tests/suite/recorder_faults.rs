@@ -161,7 +161,7 @@ impl Disk for SmallDisk {
 }
 
 #[test]
-fn a_full_disk_stops_nobody_and_is_told() {
+fn a_full_disk_is_reported_and_predictions_go_on() {
     let temp = TempDir::new().unwrap();
     let disk = Arc::new(SmallDisk(AtomicI64::new(60_000)));
     let config = RecorderConfig {
@@ -300,7 +300,7 @@ impl Disk for HangingDisk {
 
 /// Recording never waits: the disk hangs until more was recorded than the queue holds, and all of that by one thread.
 #[test]
-fn a_disk_that_hangs_holds_nobody_up() {
+fn a_disk_that_hangs_does_not_delay_predictions() {
     let temp = TempDir::new().unwrap();
     let disk = Arc::new(HangingDisk::default());
     let config = RecorderConfig {
@@ -395,7 +395,7 @@ fn messages_are_flushed_and_put_on_the_disk_as_time_passes() {
 }
 
 #[test]
-fn a_recorder_that_panics_is_said_and_what_it_wrote_is_recovered() {
+fn a_recorder_panic_is_reported_and_its_files_are_recovered() {
     let temp = TempDir::new().unwrap();
     let disk = Arc::new(CountingDisk::default());
     let config = RecorderConfig {

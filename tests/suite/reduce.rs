@@ -130,9 +130,10 @@ fn the_rig_file_names_archives_by_their_hash_and_hands_on_the_tables() {
     let to = folder.path().join("out.toml");
     let first = run(["reduce", &path, "--modes", "12+9", "--points", "0", "-o", &text(&to)]).exits(0);
     // Plain lines where nobody looks on: what is done, with time and memory.
-    for told in ["degrees of freedom read", "pad: ordering and analysing", "disc: factored", "GiB]", "out.toml written"]
+    for expected in
+        ["degrees of freedom read", "pad: ordering and analysing", "disc: factored", "GiB]", "out.toml written"]
     {
-        assert!(first.stderr.contains(told), "no {told:?} in {}", first.stderr);
+        assert!(first.stderr.contains(expected), "no {expected:?} in {}", first.stderr);
     }
     assert!(first.stderr.lines().all(|line| line.starts_with('[') && !line.contains('\r')), "{}", first.stderr);
     assert!(
@@ -269,7 +270,7 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
 
 /// Of 3 + 3 modes the unstable ones of the full model are missed: the rig is written, and the exit code says so.
 #[test]
-fn a_rig_that_misses_modes_is_told() {
+fn verify_reports_modes_that_a_rig_misses() {
     let folder = tempfile::tempdir().unwrap();
     let path = tribometer(folder.path(), 5000);
     let to = text(&folder.path().join("few.toml"));

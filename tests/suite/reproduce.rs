@@ -40,8 +40,8 @@ const AT_REST_HZ: [f64; 18] = [
 fn the_paper_s_tables_on_a_small_tribometer() {
     let folder = folder();
     let out = folder.path();
-    let told = run(["reproduce", "--dof", "5000", "-o", &text(out)]).exits(0);
-    eprintln!("{}", told.stderr);
+    let expected = run(["reproduce", "--dof", "5000", "-o", &text(out)]).exits(0);
+    eprintln!("{}", expected.stderr);
     let number = |row: &std::collections::HashMap<String, String>, column: &str| -> f64 {
         row[column].parse().unwrap_or_else(|error| panic!("{column} of {row:?}: {error}"))
     };
@@ -126,9 +126,9 @@ fn the_paper_s_tables_on_a_small_tribometer() {
     let page = std::fs::read_to_string(out.join("index.html")).unwrap();
     let linked: Vec<&str> = page.split("href=\"#").skip(1).filter_map(|rest| rest.split('"').next()).collect();
     assert!(linked.len() > 8 && linked.iter().all(|name| page.contains(&format!("id=\"{name}\""))), "{linked:?}");
-    for told in
+    for expected in
         ["Table 1", "Table 3", "Table 4", "Figure 13", "Figure 14", "Figure 15", "492 Hz", "1705 Hz", "331.44", "12510"]
     {
-        assert!(page.contains(told), "{told}");
+        assert!(page.contains(expected), "{expected}");
     }
 }

@@ -52,8 +52,8 @@ const UNIT: &str = "%%MatrixMarket matrix coordinate real general\n2 2 2\n1 1 1\
 
 fn refused(files: &[RigFile]) -> (RigError, String) {
     let error = Rig::from_files(files).map(|_| ()).unwrap_err();
-    let told = error.to_string();
-    (error, told)
+    let refused = error.to_string();
+    (error, refused)
 }
 
 fn inline(from: &str, to: &str) -> (RigError, String) {
@@ -71,11 +71,11 @@ fn system(from: &str, to: &str, mass: &str, stiffness: &str) -> (RigError, Strin
     refused(&[file("x.toml", SYSTEM.replace(from, to)), file("M.mtx", mass), file("K.mtx", stiffness)])
 }
 
-macro_rules! told {
+macro_rules! refused {
     ($found:expr, $pattern:pat, $text:expr) => {{
-        let (error, told) = $found;
+        let (error, refused) = $found;
         assert!(matches!(error, $pattern), "{error:?}");
-        assert_eq!(told, $text);
+        assert_eq!(refused, $text);
     }};
 }
 
@@ -88,72 +88,72 @@ fn bad_files_of_kind_1() {
     let (error, text) = inline("[pad]", "[pad]\ncolour = 3");
     assert!(matches!(error, RigError::UnknownKey { line: 3, .. }), "{error:?}");
     assert!(text.starts_with("x.toml, line 3: unknown key `colour`; expected one of `mass`, `stiffness`"), "{text}");
-    told!(
+    refused!(
         inline("[0.0, 1.0]]", "[0.0]]"),
         RigError::Shape { .. },
         "x.toml: `pad.mass[1]` has shape 1 values, expected 2, as many as rows"
     );
-    told!(
+    refused!(
         inline("pad_normal = [0.0, -1.0]", "pad_normal = [0.0]"),
         RigError::Shape { .. },
         "x.toml: `contact[0].pad_normal` has shape 1 values, expected one for each of 2 degrees of freedom"
     );
-    told!(
+    refused!(
         inline("0.75], [", "nan], ["),
         RigError::NotFinite { .. },
         "x.toml: `pad.stiffness[0][1]` is NaN, expected a finite number"
     );
-    told!(
+    refused!(
         inline("[[1.0, 0.0], [0.0, 1.0]]", "[[1.0, 0.5], [0.25, 1.0]]"),
         RigError::Reduction { .. },
         "x.toml: pad.mass is not symmetric: entry (1, 0) is 0.25, entry (0, 1) is 0.5; they may differ by 1.000e-12"
     );
-    told!(
+    refused!(
         inline("[[1.0, 0.0], [0.0, 1.0]]", "[[1.0, 2.0], [2.0, 1.0]]"),
         RigError::Reduction { .. },
         "x.toml: pad.mass is not positive definite: its pivot at row 1 is -3.000000e0, expected more than 0.000e0"
     );
-    told!(
+    refused!(
         inline("stiffness_n_per_m = 1.0", "stiffness_n_per_m = -1.0"),
         RigError::Range { .. },
         "x.toml: `contact[0].stiffness_n_per_m` is -1, expected at least 0"
     );
-    told!(
+    refused!(
         inline("[pad]", "[pad]\nmodes = 3"),
         RigError::Reduction { .. },
         "x.toml: pad.modes: 3 modes asked for, expected 1 to 2"
     );
-    told!(
+    refused!(
         inline("[pad]", "[pad]\ndamping_ratio = [0.1]"),
         RigError::Shape { .. },
         "x.toml: `pad.damping_ratio` has shape 1, expected one value or one for each of 2 modes"
     );
-    told!(
+    refused!(
         inline("pad_sliding", "disc_normal = [1.0]\npad_sliding"),
         RigError::Kind { .. },
         "x.toml: `contact[0].disc_normal` is given for a rigid disc; expected [disc], or no row for it"
     );
-    told!(
+    refused!(
         inline("name = \"x\"", "name = \"x\"\n[system]\nmass = \"M.mtx\""),
         RigError::Kind { .. },
         "x.toml: `pad` stands beside [system]; expected either [system] or [pad] with its contact"
     );
-    told!(
+    refused!(
         inline("name = \"x\"", "name = \"x\"\n[band]\nmax_hz = -1"),
         RigError::Range { .. },
         "x.toml: `band.max_hz` is -1, expected more than 0"
     );
-    told!(
+    refused!(
         inline("name = \"x\"", "name = \"x\"\n[limits]\nnormal_load_n = [2.0, 1.0]"),
         RigError::Range { .. },
         "x.toml: `limits.normal_load_n[1]` is 1, expected at least limits.normal_load_n[0] = 2"
     );
-    told!(
+    refused!(
         inline("name = \"x\"\n", ""),
         RigError::MissingKey { .. },
         "x.toml: `name` is missing; expected it in the table of line 1"
     );
-    told!(
+    refused!(
         inline("name = \"x\"", "name = \"x\"\n[friction]\nlateral_damping = true"),
         RigError::Model { .. },
         "x.toml: contact pair 0: radius_m is 0, expected more than 0 for lateral damping"
@@ -164,7 +164,7 @@ fn bad_files_of_kind_1() {
 fn bad_files_of_kind_2() {
     let all = |pad: Vec<u8>| [file("x.toml", MODAL), file("pad.npz", pad), file("disc.npz", side(DISC))];
     Rig::from_files(&all(side(PAD))).unwrap();
-    told!(
+    refused!(
         refused(&all(side(PAD))[..2]),
         RigError::MissingFile { .. },
         "x.toml: disc.modal = \"disc.npz\" cannot be read: it is not among the files given; expected one of pad.npz"
@@ -175,56 +175,56 @@ fn bad_files_of_kind_2() {
         npz_bytes(&[("omega_rad_s", &[1], &[omega]), ("phi", shape, phi), ("nodes_m", &[1, 3], &[0.1, 0.0, 0.01])])
     };
     let zero = [0.0; 6];
-    told!(
+    refused!(
         modal("normal =", "normal =", &with(1.0, &zero, &[1, 3, 2])),
         RigError::Npz { .. },
         "pad.npz: array `phi` has shape (1, 3, 2); expected (1, 3, 1), by nodes_m and omega_rad_s"
     );
-    told!(
+    refused!(
         modal("normal =", "normal =", &npz_bytes(&[("omega_rad_s", &[1], &[1.0]), ("nodes_m", &[1, 3], &zero[..3])])),
         RigError::Npz { .. },
         "pad.npz: array `phi` is missing; expected an array of shape (c, 3, i)"
     );
-    told!(
+    refused!(
         modal("normal =", "normal =", &with(1.0, &[0.0, f64::NAN, 0.0], &[1, 3, 1])),
         RigError::NotFinite { .. },
         "pad.npz: `phi[0, 1, 0]` is NaN, expected a finite number"
     );
-    told!(
+    refused!(
         modal("normal =", "normal =", &with(-1.0, &zero[..3], &[1, 3, 1])),
         RigError::Npz { .. },
         "pad.npz: array `omega_rad_s[0]` is -1; expected at least 0"
     );
-    told!(
+    refused!(
         modal("normal =", "normal =", &side(&[0.1, 0.0, 0.01, 0.3, 0.0, 0.01])),
         RigError::NoPartner { node: 1, .. },
         "x.toml: `contact_patch[0]`: pad node 1 at (0.3, 0, 0.01) m finds no partner on the disc: \
          it lies 1.800000e-1 m beside the surface, expected at most 1.000000e-2 m (search_distance_m)"
     );
-    told!(
+    refused!(
         modal("normal =", "normal =", &side(&[0.0, 0.0, 0.01])),
         RigError::NoTriad { node: 0, .. },
         "x.toml: `contact_patch[0]`: pad node 0 at (0, 0, 0.01) m has no sliding direction: \
          it lies on the axis, expected a node beside the axis"
     );
-    told!(
+    refused!(
         modal("\nnormal = [0.0, 0.0, 1.0]", "\nnormal = [0.0, 0.0, 0.0]", &side(PAD)),
         RigError::Range { .. },
         "x.toml: `contact_patch[0].normal` is [0, 0, 0], expected a direction"
     );
     // The direction of a rim brake: the disc's axis is [0, 0, 1].
-    told!(
+    refused!(
         modal("\nnormal = [0.0, 0.0, 1.0]", "\nnormal = [1.0, 0.0, 0.1]", &side(PAD)),
         RigError::Range { .. },
         "x.toml: `contact_patch[0].normal` is [1.0, 0.0, 0.1], 84 degrees off the axis, expected at most 60 degrees: \
          the pad presses along the axis of the disc"
     );
-    told!(
+    refused!(
         modal("normal =", "pad_nodes = [0, 2]\nnormal =", &side(PAD)),
         RigError::Range { .. },
         "x.toml: `contact_patch[0].pad_nodes[1]` is 2, expected 0 to 1"
     );
-    told!(
+    refused!(
         modal("[disc]", "mass = [[1.0]]\n[disc]", &side(PAD)),
         RigError::Kind { .. },
         "x.toml: `pad.modal` stands beside mass and stiffness; \
@@ -235,7 +235,7 @@ fn bad_files_of_kind_2() {
 #[test]
 fn bad_files_of_kind_3() {
     Rig::from_files(&[file("x.toml", SYSTEM), file("M.mtx", UNIT), file("K.mtx", UNIT)]).unwrap();
-    told!(
+    refused!(
         refused(&[file("x.toml", SYSTEM), file("M.mtx", UNIT)]),
         RigError::MissingFile { .. },
         "x.toml: system.stiffness[0].matrix = \"K.mtx\" cannot be read: it is not among the files given; \
@@ -244,12 +244,12 @@ fn bad_files_of_kind_3() {
     let (error, text) = system("scale", "skale", UNIT, UNIT);
     assert!(matches!(error, RigError::UnknownKey { .. }), "{text}");
     assert!(text.ends_with("unknown key `skale`; expected `matrix` or `scale`"), "{text}");
-    told!(
+    refused!(
         system("x", "x", UNIT, "%%MatrixMarket matrix array real general\n1 1\n3\n"),
         RigError::Shape { .. },
         "x.toml: `system.stiffness[0].matrix` has shape 1x1 (K.mtx), expected 2x2, as system.mass"
     );
-    told!(
+    refused!(
         system("x", "x", UNIT, &UNIT.replace("1 1 1", "1 1 nan")),
         RigError::Line { line: 3, .. },
         "K.mtx, line 3: value is `nan`; expected a finite number"
@@ -270,13 +270,13 @@ fn bad_files_of_kind_3() {
         assert!(text.starts_with("x.toml (M.mtx): system.mass is not positive definite: its pivot at row "), "{text}");
         assert!(text.contains("is -3.000000e0, expected more than "), "{text}");
     }
-    told!(
+    refused!(
         system("friction_coefficient", "mu", UNIT, UNIT),
         RigError::Scale { .. },
         "x.toml: `system.stiffness[0].scale` = \"mu / 0.3 + 1\": unknown name `mu`; \
          expected disc_speed_rad_s, friction_coefficient, normal_load_n"
     );
-    told!(
+    refused!(
         system("/ 0.3", "/ (disc_speed_rad_s - 13)", UNIT, UNIT),
         RigError::Scale { .. },
         "x.toml: `system.stiffness[0].scale` = \"friction_coefficient / (disc_speed_rad_s - 13) + 1\": is inf at the \

@@ -44,9 +44,9 @@ fn a_recording_verifies_and_another_rig_differs() {
         .says("0 predictions identical, 2500 different, 0 missing, 0 extra")
         .says("stability maps or charts differ");
     // The largest differences are told: case 1 against case 2, 1 against 0.7071 rad/s of their first modes alone.
-    let told =
+    let sensitivity =
         other.stdout.split("frequency ").nth(1).expect("largest differences").split(' ').next().expect("a number");
-    assert!(told.parse::<f64>().expect("a number") > 0.3, "{told}");
+    assert!(sensitivity.parse::<f64>().expect("a number") > 0.3, "{sensitivity}");
     other.says("seq 0: recorded");
     drop(folder);
 }
@@ -210,10 +210,12 @@ fn signals_end_the_demo_with_a_finished_recording() {
 }
 
 /// The first sensitivities in a session, finished or not, that know the nearest end of a window.
-fn told_with_an_end(session: &Path) -> Option<squealcast::msgs::Sensitivity> {
+fn sensitivity_with_an_end(session: &Path) -> Option<squealcast::msgs::Sensitivity> {
     let recording = Recording::open(session).ok()?;
     recording.messages().find_map(|entry| match entry.message {
-        Recorded::Known(Payload::Sensitivity(told)) if !told.nearest_window_end.is_nan() => Some(told),
+        Recorded::Known(Payload::Sensitivity(sensitivity)) if !sensitivity.nearest_window_end.is_nan() => {
+            Some(sensitivity)
+        }
         _ => None,
     })
 }
@@ -225,7 +227,7 @@ fn newest(directory: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_node_predicts_what_shared_memory_brings_until_it_is_told_to_end() {
+fn a_node_predicts_inputs_of_shared_memory_until_it_is_stopped() {
     let folder = folder();
     let (prefix, profile) = (
         prefix("run"),
@@ -242,7 +244,7 @@ fn a_node_predicts_what_shared_memory_brings_until_it_is_told_to_end() {
         let before = if directory.exists() { size(&directory) } else { 0 };
         until("the recording to grow", || directory.exists() && size(&directory) > before + 20_000);
         // The first sensitivities may come before the map that knows where windows end; they are told again each second.
-        until("sensitivities with an end of a window", || told_with_an_end(&newest(&directory)).is_some());
+        until("sensitivities with an end of a window", || sensitivity_with_an_end(&newest(&directory)).is_some());
         source.signal(signal).exits(0);
         node.signal(signal).exits(0).says("OK");
     }
@@ -261,9 +263,9 @@ fn a_node_predicts_what_shared_memory_brings_until_it_is_told_to_end() {
             })
             .collect();
         assert!(kinds.contains(&event_kind::CHART) && kinds.contains(&event_kind::STABILITY_MAP), "{kinds:?}");
-        let told = told_with_an_end(&session).expect("it was waited for");
-        assert!((told.nearest_window_end - 0.82001495938185).abs() < 1e-10, "{told:?}");
-        assert_eq!((told.modes.len(), told.nearest_window_end_derivatives.by_normal_load_n), (9, 0.0));
+        let sensitivity = sensitivity_with_an_end(&session).expect("it was waited for");
+        assert!((sensitivity.nearest_window_end - 0.82001495938185).abs() < 1e-10, "{sensitivity:?}");
+        assert_eq!((sensitivity.modes.len(), sensitivity.nearest_window_end_derivatives.by_normal_load_n), (9, 0.0));
         let predictions = recording.messages().filter_map(|entry| match entry.message {
             Recorded::Known(Payload::Prediction(prediction)) if prediction.level != 3 => Some(prediction),
             _ => None,

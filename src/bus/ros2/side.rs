@@ -180,7 +180,7 @@ struct Side {
 impl Side {
     /// Publishes what the node sends and reports the status to it, until the node closes the socket.
     fn serve(mut self, frames: &mut Frames<UnixStream>) {
-        let (mut looked, mut told) = (Instant::now(), None::<Instant>);
+        let (mut looked, mut reported) = (Instant::now(), None::<Instant>);
         let (mut last_status, mut last_beat, mut looks_without_beat) = (Status::default(), 0, 0);
         loop {
             match frames.next::<ToSide>() {
@@ -204,12 +204,12 @@ impl Side {
                 give_up("its thread that hears ROS 2 hangs");
             }
             let status = self.status();
-            let due = told.is_none_or(|told| told.elapsed() >= STATUS_EVERY);
+            let due = reported.is_none_or(|reported| reported.elapsed() >= STATUS_EVERY);
             if due && let Some(resident) = memory::resident_bytes().filter(|&bytes| bytes > RESIDENT_LIMIT) {
                 give_up(&format!("{} MB in memory, more than {} MB", resident >> 20, RESIDENT_LIMIT >> 20));
             }
             if due || status != last_status {
-                told = Some(looked);
+                reported = Some(looked);
                 last_status.clone_from(&status);
                 self.node.send(&FromSide::Status(status));
             }

@@ -188,7 +188,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_log_line_has_time_conditions_and_what_is_predicted() {
+    fn a_log_line_has_time_conditions_and_prediction() {
         let shown = |status| {
             let snapshot = snapshot(status);
             line(&snapshot.assessment(), &snapshot, Some(&InputSources::default()))

@@ -363,7 +363,7 @@ pub mod tests {
     const SIZES: [(u16, u16); 3] = [(80, 24), (40, 24), (200, 60)];
 
     #[test]
-    fn every_status_is_named_and_asserts_only_what_is_known() {
+    fn every_status_is_named_and_asserts_only_known_values() {
         for (width, height) in SIZES {
             for status in Status::ALL {
                 let (lines, ..) = drawn(status, width, height, 0);
@@ -426,7 +426,7 @@ pub mod tests {
     }
 
     #[test]
-    fn nothing_is_cut_where_the_window_is_smaller_than_what_there_is_to_say() {
+    fn no_text_is_cut_in_a_small_window() {
         for (width, height) in [(1, 1), (2, 3), (10, 5), (20, 8)] {
             for status in Status::ALL {
                 drawn(status, width, height, usize::MAX);

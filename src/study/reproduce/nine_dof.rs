@@ -136,8 +136,8 @@ impl Figure {
         };
         let svg = plot::against_full(title, &lines, &dots, &windows, self.mu_max, Unit::RadPerS)?;
         let of = |what: &str, windows: &[Window]| {
-            let told: Vec<String> = windows.iter().map(|w| format!("{:.10}", w.mu_from)).collect();
-            format!("{what} {}", if told.is_empty() { "none".to_owned() } else { told.join(" and ") })
+            let ends: Vec<String> = windows.iter().map(|w| format!("{:.10}", w.mu_from)).collect();
+            format!("{what} {}", if ends.is_empty() { "none".to_owned() } else { ends.join(" and ") })
         };
         let mut text = of("Critical friction coefficients up to the end of the axis: full model", &full_map.windows);
         if self.reduced.is_some() {

@@ -201,8 +201,8 @@ impl Study<'_> {
             }));
         }
         let options = map_options(full.settings.instability_threshold, band_hz);
-        let mut told = |step: FullProgress| hear(Heard::Solving("windows of instability", step));
-        let windows = full_windows(&full.model, solver, &reference, TAU * band_hz, &options, &mut told)?;
+        let mut progress = |step: FullProgress| hear(Heard::Solving("windows of instability", step));
+        let windows = full_windows(&full.model, solver, &reference, TAU * band_hz, &options, &mut progress)?;
         Ok(Truth { at_rest_hz, windows, dots, band_hz })
     }
 

@@ -372,7 +372,7 @@ mod tests {
     /// stress becomes unstable. In-plane motion of the faces changes this by about `(thickness / radius)²`, 3e-4, and the
     /// mesh by `(m spacing)² / 12`.
     #[test]
-    fn the_slower_wave_of_a_thin_disc_stands_still_at_its_critical_speed() {
+    fn the_backward_wave_of_a_thin_disc_has_zero_frequency_at_its_critical_speed() {
         let structure = ring(0.002, 3, 48);
         let Assembled { mass, stiffness, .. } = structure.assemble().unwrap();
         let Turning { gyroscopic, spin, stiffening } = structure.turning(&AXIS).unwrap();

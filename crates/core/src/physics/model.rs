@@ -96,14 +96,14 @@ impl Law {
             Self::LateralFriction => when(sliding, mu * load / p.disc_speed_rad_s.abs()),
             Self::FrictionChebyshev { degree, range } => {
                 let x = p.disc_speed_rad_s.signum() * mu;
-                when(sliding, chebyshev::beside_zero(x, *degree, *range))
+                when(sliding, chebyshev::odd_at_zero(x, *degree, *range))
             }
             Self::DiscSpeed { power } => p.disc_speed_rad_s.powi(i32::from(*power)),
             Self::DiscSpeedInContact { power } => when(closed, p.disc_speed_rad_s.powi(i32::from(*power))),
             Self::DiscSpeedChebyshev { power, degree, range } => {
                 let x = p.disc_speed_rad_s.signum() * mu;
                 let turning = p.disc_speed_rad_s.powi(i32::from(*power));
-                when(sliding, turning * chebyshev::beside_zero(x, *degree, *range))
+                when(sliding, turning * chebyshev::odd_at_zero(x, *degree, *range))
             }
             Self::Custom(custom) => (custom.evaluate)(&if sliding { *p } else { p.with_friction(0.0) }),
         }
@@ -549,7 +549,7 @@ impl Model {
             Law::FrictionChebyshev { degree, range } => match parameter {
                 Friction if value.is_finite() && p.contact_state() == ContactState::Sliding => {
                     let sign = p.disc_speed_rad_s.signum();
-                    sign * chebyshev::beside_zero_slope(sign * p.friction_coefficient, *degree, *range)
+                    sign * chebyshev::odd_at_zero_slope(sign * p.friction_coefficient, *degree, *range)
                 }
                 Friction | Load | Speed | ContactStiffness | ContactDamping => 0.0,
             },

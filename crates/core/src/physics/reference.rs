@@ -448,7 +448,7 @@ mod tests {
 
     /// `√2` to thirty digits gives the exact error of the dense root.
     #[test]
-    fn finds_what_a_double_lacks() {
+    fn refines_beyond_double_precision() {
         // `λ² = -2 ± √2`, `√2 = 1.4142135623730950488016887242097`.
         let (k, c, spectrum) = solved(&constant(mat![[2.0, 2.0], [1.0, 2.0]]), &REFERENCE);
         let (high, low) = (std::f64::consts::SQRT_2, -9.667_293_313_452_913e-17);

@@ -351,7 +351,7 @@ mod tests {
     const JUDGED: Judged = Judged { band_rad_s: 1000.0, instability_threshold: 1e-6, decay_per_s: 20.0 };
 
     #[test]
-    fn missed_and_invented_roots_are_told_apart() {
+    fn missed_and_invented_roots_are_counted_separately() {
         let l = c64::new;
         let full = [l(0.0, 100.0), l(5.0, 300.0), l(-5.0, 300.0), l(0.0, 500.0), l(-50.0, 700.0), l(9.0, 1500.0)];
         let reduced = [l(0.0, 101.0), l(0.0, 298.0), l(0.0, 302.0), l(2.0, 501.0), l(-60.0, 710.0)];
@@ -443,14 +443,14 @@ mod tests {
     }
 
     #[test]
-    fn ends_far_from_what_was_sampled_are_next() {
+    fn the_next_samples_are_at_ends_far_from_earlier_samples() {
         assert_eq!(farthest(&[0.1, 0.3, 0.31, 0.5, 0.9], &[0.0, 0.5, 1.0]), [0.3, 0.1, 0.9]);
         assert_eq!(farthest(&[0.5, 0.5], &[0.0, 0.5, 1.0]), [0.0; 0]);
     }
 
     /// The check between samples covers every root that may become unstable.
     #[test]
-    fn a_projection_that_has_not_seen_everything_is_told() {
+    fn an_incomplete_projection_is_reported() {
         let model = touching(42, 0.0, ContactLaw::default());
         let band = 700.0;
         let mut solver = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();

@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_matrices_are_told_apart() {
+    fn each_kind_of_bad_matrix_has_its_error() {
         let (mass, stiffness) = chain();
         let modes = |m: &Mat<f64>, k: &Mat<f64>| {
             free_interface_modes("pad", m.as_ref(), k.as_ref(), &ModeSelection::All).unwrap_err()
@@ -276,14 +276,14 @@ mod tests {
     #[test]
     fn selections_are_checked() {
         assert_eq!(ModeSelection::Indices(vec![2, 0]).indices("pad.modes", 3).unwrap(), [0, 2]);
-        for (selection, told) in [
+        for (selection, expected) in [
             (ModeSelection::Lowest(0), "pad.modes: 0 modes asked for, expected 1 to 3"),
             (ModeSelection::Lowest(4), "pad.modes: 4 modes asked for, expected 1 to 3"),
             (ModeSelection::Indices(vec![]), "pad.modes: an empty list asked for, expected at least one mode"),
             (ModeSelection::Indices(vec![3]), "pad.modes: mode 3 asked for, expected 0 to 2"),
             (ModeSelection::Indices(vec![1, 1]), "pad.modes: mode 1 twice asked for, expected every mode at most once"),
         ] {
-            assert_eq!(selection.indices("pad.modes", 3).unwrap_err().to_string(), told);
+            assert_eq!(selection.indices("pad.modes", 3).unwrap_err().to_string(), expected);
         }
     }
 

@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_missed_and_invented_roots_are_told_apart() {
+    fn errors_missed_and_invented_roots_are_counted_separately() {
         let root = |sigma: f64, omega: f64| c64::new(sigma, omega);
         let full = [root(1.0, 100.0), root(-3.0, 100.0), root(-500.0, 900.0), root(0.0, 2000.0), root(2.0, 1000.0)];
         let reduced =

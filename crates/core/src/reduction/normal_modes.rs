@@ -161,7 +161,7 @@ impl<'a> Analysed<'a> {
     ) -> Result<SparseModes, ReductionError> {
         let pencil = &self.pencil;
         let (what, n) = (pencil.what, pencil.dimension());
-        let told = |count: usize| Progress::Analysed {
+        let analysing = |count: usize| Progress::Analysed {
             factor_entries: self.factor_entries(),
             bytes: self.held_bytes() + self.bytes_for(count),
         };
@@ -172,7 +172,7 @@ impl<'a> Analysed<'a> {
             _ => Ok(()),
         };
         // Without a known count, check only whether there is memory for the factor that counting needs.
-        let analysed = told(match wanted {
+        let analysed = analysing(match wanted {
             Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
             Wanted::Below(_) => 0,
         });
@@ -183,8 +183,8 @@ impl<'a> Analysed<'a> {
             Wanted::Below(omega_rad_s) => {
                 let modes = self.count_below(omega_rad_s)?;
                 progress(Progress::Counted { modes, below: omega_rad_s * omega_rad_s });
-                progress(told(modes));
-                check(told(modes))?;
+                progress(analysing(modes));
+                check(analysing(modes))?;
                 modes
             }
         };
@@ -458,11 +458,12 @@ mod tests {
         // Between the 17th and the 18th frequency, where a pair ends; rad/s.
         let cutoff = (0.5 * (expected[16] + expected[17])).sqrt();
         let below = expected.iter().filter(|square| **square < cutoff * cutoff).count();
-        let mut told = vec![];
-        let modes = normal_modes("pad", &mass, &stiffness, Wanted::Below(cutoff), None, &mut |p| told.push(p)).unwrap();
+        let mut reports = vec![];
+        let modes =
+            normal_modes("pad", &mass, &stiffness, Wanted::Below(cutoff), None, &mut |p| reports.push(p)).unwrap();
         assert_eq!(modes.omega_squared.len(), below);
         assert!(modes.residuals.iter().all(|residual| *residual < 1e-12));
-        assert!(told.contains(&Progress::Counted { modes: below, below: cutoff * cutoff }), "{told:?}");
+        assert!(reports.contains(&Progress::Counted { modes: below, below: cutoff * cutoff }), "{reports:?}");
         let none = normal_modes("pad", &mass, &stiffness, Wanted::Below(1.0), None, &mut |_| {}).unwrap_err();
         assert_eq!(
             none.to_string(),
@@ -473,12 +474,13 @@ mod tests {
     #[test]
     fn more_memory_than_allowed_is_refused_before_the_work() {
         let (mass, stiffness, _) = membrane(30, 1e-7);
-        let mut told = vec![];
-        let refused = normal_modes("disc", &mass, &stiffness, Wanted::Lowest(40), Some(1 << 20), &mut |p| told.push(p));
+        let mut reports = vec![];
+        let refused =
+            normal_modes("disc", &mass, &stiffness, Wanted::Lowest(40), Some(1 << 20), &mut |p| reports.push(p));
         let Err(ReductionError::Memory { bytes, limit, .. }) = refused else { panic!("{refused:?}") };
         // At least a basis of 3·40 + 48 vectors of 900 numbers.
         assert!(bytes > 168 * 900 * 8 && limit == 1 << 20, "{bytes} {limit}");
-        assert!(matches!(told[..], [Progress::Analysed { .. }]), "{told:?}");
+        assert!(matches!(reports[..], [Progress::Analysed { .. }]), "{reports:?}");
     }
 
     /// `found` without the mode at index `lost`.

@@ -138,8 +138,8 @@ mod tests {
             ),
             (OperatingBox { friction_coefficient: [0.0, f64::NAN], ..BOX }, "friction_coefficient is 0 to NaN"),
         ] {
-            let told = wrong.check().unwrap_err().to_string();
-            assert!(told.contains(what), "{told}");
+            let message = wrong.check().unwrap_err().to_string();
+            assert!(message.contains(what), "{message}");
         }
     }
 }

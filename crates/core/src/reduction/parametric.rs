@@ -730,12 +730,13 @@ mod tests {
     fn a_tolerance_that_cannot_be_held_is_an_error() {
         let full = chains(5.0, LAW);
         let few = ParametricRequest { most_vectors: 9, ..request(1e-6) };
-        let told = parametric_basis(&full, &mut solver(&full), &few, &mut |_| {}).map(|_| ()).unwrap_err().to_string();
-        assert!(told.contains("at most 9 vectors") && told.contains("limit 1.0e-6"), "{told}");
+        let message =
+            parametric_basis(&full, &mut solver(&full), &few, &mut |_| {}).map(|_| ()).unwrap_err().to_string();
+        assert!(message.contains("at most 9 vectors") && message.contains("limit 1.0e-6"), "{message}");
         // A tolerance below the rounding of a dense solve.
         let rarely = ParametricRequest { most_samples: 2, ..request(1e-16) };
-        let told =
+        let message =
             parametric_basis(&full, &mut solver(&full), &rarely, &mut |_| {}).map(|_| ()).unwrap_err().to_string();
-        assert!(told.contains("2 operating points"), "{told}");
+        assert!(message.contains("2 operating points"), "{message}");
     }
 }

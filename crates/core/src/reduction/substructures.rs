@@ -72,16 +72,16 @@ pub fn keep_modes(
             held + needs.iter().copied().max().unwrap_or(0) + (0..parts.len()).map(modes).sum::<usize>()
         };
         let way = ways.into_iter().find(|way| memory_limit_bytes.is_none_or(|limit| bytes(way) <= limit));
-        let told = way.unwrap_or(Plan { at_once: false, inertia_by: InertiaBy::SecondSolve });
-        for (index, need) in needs(told.inertia_by).into_iter().enumerate() {
+        let plan = way.unwrap_or(Plan { at_once: false, inertia_by: InertiaBy::SecondSolve });
+        for (index, need) in needs(plan.inertia_by).into_iter().enumerate() {
             let factor_entries = analysed[index].factor_entries();
             progress(index, Progress::Analysed { factor_entries, bytes: held + need });
         }
         way.ok_or_else(|| {
-            let needs = needs(told.inertia_by);
+            let needs = needs(plan.inertia_by);
             let largest = (0..needs.len()).max_by_key(|&index| needs[index]).unwrap_or(0);
             let what = parts[largest].name.to_owned();
-            ReductionError::Memory { what, bytes: bytes(&told), limit: memory_limit_bytes.unwrap_or(usize::MAX) }
+            ReductionError::Memory { what, bytes: bytes(&plan), limit: memory_limit_bytes.unwrap_or(usize::MAX) }
         })
     };
     let mut wanted: Vec<Wanted> = parts.iter().map(|part| part.wanted).collect();
@@ -145,22 +145,22 @@ fn side_by_side<T: Sync, R: Send>(
         return items.iter().enumerate().map(|(index, item)| work(item, &mut |p| progress(index, p))).collect();
     }
     std::thread::scope(|scope| {
-        let (told, heard) = mpsc::channel();
+        let (sender, receiver) = mpsc::channel();
         let workers: Vec<_> = items
             .iter()
             .enumerate()
             .map(|(index, item)| {
-                let told = told.clone();
+                let sender = sender.clone();
                 // A closed channel means that nobody listens to progress; ignore it.
                 scope.spawn(move || {
                     work(item, &mut |p| {
-                        let _ = told.send((index, p));
+                        let _ = sender.send((index, p));
                     })
                 })
             })
             .collect();
-        drop(told);
-        heard.iter().for_each(|(index, p)| progress(index, p));
+        drop(sender);
+        receiver.iter().for_each(|(index, p)| progress(index, p));
         workers
             .into_iter()
             .map(|worker| worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))

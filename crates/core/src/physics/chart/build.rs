@@ -449,7 +449,7 @@ mod tests {
 
     /// A wrong coefficient and a lost root violate the traces: the chart then gives no roots.
     #[test]
-    fn a_wrong_coefficient_and_a_lost_root_are_told_by_the_traces() {
+    fn the_traces_reveal_a_wrong_coefficient_and_a_lost_root() {
         let model = nine_dof(2.0, 2.0, 5.0);
         let options = options((0.0, 500.0, 13.0), (2.0, 501.0, 14.0), None);
         let chart = build(&model, &options, &|_| true).expect("the chart can be built");

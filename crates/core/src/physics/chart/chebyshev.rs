@@ -152,7 +152,7 @@ fn table(x: f64) -> [f64; MAX_DEGREE + 1] {
 
 /// `x T_k(x / range)`; NaN beyond the range, where the expansion is not valid. A margin of 1e-3 allows differences
 /// across the end of the range.
-pub fn beside_zero(x: f64, degree: usize, range: f64) -> f64 {
+pub fn odd_at_zero(x: f64, degree: usize, range: f64) -> f64 {
     let scaled = x / range;
     if scaled.abs() > 1.0 + 1e-3 {
         return f64::NAN;
@@ -162,8 +162,8 @@ pub fn beside_zero(x: f64, degree: usize, range: f64) -> f64 {
     x * values[degree]
 }
 
-/// Derivative of [`beside_zero`] with respect to `x`: `T_k(y) + k y U_{k-1}(y)`, `y = x / range`.
-pub fn beside_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
+/// Derivative of [`odd_at_zero`] with respect to `x`: `T_k(y) + k y U_{k-1}(y)`, `y = x / range`.
+pub fn odd_at_zero_slope(x: f64, degree: usize, range: f64) -> f64 {
     let y = x / range;
     if y.abs() > 1.0 + 1e-3 {
         return f64::NAN;
@@ -279,8 +279,8 @@ mod tests {
     fn slopes_are_those_of_differences() {
         for degree in 0..6 {
             for x in [-1.7, -0.3, 0.0, 0.9, 1.99] {
-                let [up, down] = [x + 1e-5, x - 1e-5].map(|x| beside_zero(x, degree, 2.0));
-                let slope = beside_zero_slope(x, degree, 2.0);
+                let [up, down] = [x + 1e-5, x - 1e-5].map(|x| odd_at_zero(x, degree, 2.0));
+                let slope = odd_at_zero_slope(x, degree, 2.0);
                 assert!((slope - (up - down) / 2e-5).abs() < 1e-6, "{degree} {x}: {slope}");
             }
         }
