@@ -116,14 +116,14 @@ pub fn basis_of(
         most_samples: MOST_SAMPLES,
         most_vectors: MOST_VECTORS,
     };
-    let basis = parametric_basis(&full.model, solver, &request, &mut |step| tell(steps, step))?;
+    let basis = parametric_basis(&full.model, solver, &request, &mut |step| report(steps, step))?;
     let vectors = &basis.projected.basis;
     solver.held_elsewhere(size_of::<f64>() * vectors.nrows() * vectors.ncols());
     // For conditions on which the model does not depend, the basis is valid over the whole given range.
     Ok((ParametricRequest { range: asked, ..request }, basis))
 }
 
-fn tell(steps: &mut Steps, step: ParametricStep) {
+fn report(steps: &mut Steps, step: ParametricStep) {
     let at = |point: crate::physics::OperatingPoint| {
         format!(
             "{:.4} N, {:.4} rad/s, friction coefficient {:.4}",
@@ -132,7 +132,10 @@ fn tell(steps: &mut Steps, step: ParametricStep) {
     };
     match step {
         ParametricStep::Planned { bytes } => {
-            steps.say(&format!("{:.2} GiB needed beside the matrices, for two operating points", bytes as f64 / GIB));
+            steps.say(&format!(
+                "{:.2} GiB needed in addition to the matrices, for two operating points",
+                bytes as f64 / GIB
+            ));
         }
         ParametricStep::Sampling { point, sample } => {
             steps.say(&format!("sample {sample}: solving the full model at {}", at(point)));

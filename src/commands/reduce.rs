@@ -123,7 +123,7 @@ impl Options {
         let wanted = self.wanted(&full)?;
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
         let kept = full.keep_modes(&wanted, !self.no_residual, room, &mut |part, what| {
-            tell(&mut steps, part, names[part], what)
+            report(&mut steps, part, names[part], what)
         })?;
         for (name, Kept { modes, .. }) in names.iter().zip(&kept) {
             let worst = modes.residuals.iter().copied().fold(0.0, f64::max);
@@ -179,15 +179,15 @@ impl Options {
                 steps.say("not compared: a damping ratio of modes has no meaning for the full model");
             } else {
                 let against = Against { points: self.points, seed: 1, band_hz: None, windows: true };
-                let mut tell = |what: &str, step| steps.full(&format!("compared with the full model, {what}"), step);
+                let mut report = |what: &str, step| steps.full(&format!("compared with the full model, {what}"), step);
                 let compare = || -> anyhow::Result<Verified> {
                     let mut solver = match solver {
                         Some(solver) => solver,
-                        None => {
-                            self::solver(full, room(self.memory_gib, &self.full)?, &mut |step| tell("analysis", step))?
-                        }
+                        None => self::solver(full, room(self.memory_gib, &self.full)?, &mut |step| {
+                            report("analysis", step)
+                        })?,
                     };
-                    verify_against(&rig, full, &mut solver, &against, &mut tell)
+                    verify_against(&rig, full, &mut solver, &against, &mut report)
                 };
                 let found = compare();
                 match found {
@@ -274,11 +274,11 @@ fn remarks(names: &[&str], kept: &[Kept]) -> Vec<String> {
 }
 
 /// Reports the progress of one part.
-pub fn tell(steps: &mut Steps, part: usize, name: &str, what: Progress) {
+pub fn report(steps: &mut Steps, part: usize, name: &str, what: Progress) {
     match what {
         Progress::Analysing => steps.say(&format!("{name}: ordering and analysing")),
         Progress::Analysed { factor_entries, bytes } => steps.say(&format!(
-            "{name}: {:.1} million numbers in the factor, {:.2} GiB needed for this part beside the matrices",
+            "{name}: {:.1} million numbers in the factor, {:.2} GiB needed for this part in addition to the matrices",
             factor_entries as f64 / 1e6,
             bytes as f64 / GIB
         )),

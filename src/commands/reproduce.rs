@@ -5,7 +5,7 @@ use clap::Args;
 
 use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of};
-use super::reduce::tell;
+use super::reduce::report;
 use super::signals::on_stop;
 use super::steps::ProgressOptions;
 use super::{Outcome, positive, write_file};
@@ -14,7 +14,7 @@ use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::files::whole_file::remove_begun;
 use crate::full_model::FullModelFile;
 use crate::reduction::Wanted;
-use crate::study::reproduce::{Heard, Item, MODES, PartModes, Study, index, nine_dof};
+use crate::study::reproduce::{Item, MODES, PartModes, Step, Study, index, nine_dof};
 
 /// Reproduce the paper's tables and figures: CSV, SVG and one page that compares them with the paper's numbers
 ///
@@ -67,7 +67,7 @@ impl Options {
         let most = Wanted::Lowest(MODES.into_iter().max().unwrap_or(0));
         let kept =
             full.keep_modes(&vec![most; names.len()], true, room(self.memory_gib, &toml)?, &mut |part, what| {
-                tell(&mut steps, part, names[part], what);
+                report(&mut steps, part, names[part], what);
             })?;
         // The modes on all coordinates of the parts are no longer needed.
         let modes = PartModes::new(&full, &kept)?;
@@ -75,11 +75,11 @@ impl Options {
         steps.say("ordering and analysing");
         let mut solver = solver(&full, room(self.memory_gib, &toml)?, &mut |step| steps.full("full model", step))?;
         let (_, basis) = basis_of(&full, TOLERANCE, Ranges::default(), &mut solver, &mut steps)?;
-        let mut hear = |heard: Heard<'_>| match heard {
-            Heard::Said(text) => steps.say(text),
-            Heard::Solving(what, step) => steps.full(what, step),
+        let mut report = |event: Step<'_>| match event {
+            Step::Said(text) => steps.say(text),
+            Step::Solving(what, step) => steps.full(what, step),
         };
-        Study { full: &full, modes: &modes, basis: &basis }.items(&mut solver, &mut hear)
+        Study { full: &full, modes: &modes, basis: &basis }.items(&mut solver, &mut report)
     }
 
     fn write(&self, item: &Item) -> anyhow::Result<()> {

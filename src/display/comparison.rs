@@ -253,7 +253,7 @@ mod tests {
     }
 
     /// Measurements every 50 ms between two times, with a tone of 90 dB in the given intervals (s).
-    fn heard(from_s: f64, to_s: f64, tones: &[(f64, f64, f64)]) -> Measurements {
+    fn measured(from_s: f64, to_s: f64, tones: &[(f64, f64, f64)]) -> Measurements {
         let mut measurements = Measurements::new(Criteria::default());
         for k in 0..1200 {
             let time_s = 0.05 * f64::from(k);
@@ -277,7 +277,7 @@ mod tests {
             (39.7, 41.0, 1500.0), // a hit, before the prediction by less than the tolerance
             (50.0, 50.1, 1500.0), // too short: two measurements 0.05 s apart
         ];
-        let found = heard(0.0, 55.0, &tones).compare(&events, 60.0).unwrap();
+        let found = measured(0.0, 55.0, &tones).compare(&events, 60.0).unwrap();
         let verdicts: Vec<Verdict> = found.measured.iter().map(|judged| judged.verdict).collect();
         let Verdict::Hit { event: 1, mode_id: 3, lead_s, frequency_difference } = verdicts[0] else {
             panic!("{verdicts:?}")
@@ -296,7 +296,7 @@ mod tests {
     #[test]
     fn interruptions_are_bridged_and_gaps_are_not() {
         let events = predicted(&[]);
-        let short = heard(0.0, 60.0, &[(5.0, 6.0, 1500.0), (6.2, 7.0, 1500.0), (7.5, 8.0, 1500.0)]);
+        let short = measured(0.0, 60.0, &[(5.0, 6.0, 1500.0), (6.2, 7.0, 1500.0), (7.5, 8.0, 1500.0)]);
         let found = short.compare(&events, 60.0).unwrap();
         let stretches: Vec<(f64, f64)> = found
             .measured

@@ -268,16 +268,16 @@ mod tests {
 
     #[test]
     fn a_bin_holds_the_range_of_the_measured_level_and_where_it_was_loudest() {
-        let heard = |time_ns, frequency_hz, level_db| VibrationSample { time_ns, frequency_hz, level_db };
+        let sample = |time_ns, frequency_hz, level_db| VibrationSample { time_ns, frequency_hz, level_db };
         let mut history = History::coarsening(100, 4);
         for (time_ns, hz, db) in [(0, 10.0, 50.0), (50, 20.0, 90.0), (99, 30.0, 40.0), (100, 40.0, f64::NAN)] {
-            history.push_vibration(&heard(time_ns, hz, db));
+            history.push_vibration(&sample(time_ns, hz, db));
         }
         let known = Vibration { low_db: 40.0, high_db: 90.0, frequency_hz: 20.0 };
         assert_eq!((history.bins()[0].vibration, history.bins()[0].level), (Some(known), None));
         assert_eq!(history.bins()[1].vibration, None);
         for time_ns in [200, 300, 400] {
-            history.push_vibration(&heard(time_ns, 50.0, 30.0));
+            history.push_vibration(&sample(time_ns, 50.0, 30.0));
         }
         assert_eq!((history.bin_ns(), history.bins()[0].vibration), (200, Some(known)));
     }

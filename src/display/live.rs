@@ -170,7 +170,7 @@ impl Source for Live {
 
     fn shape(&self, id: u32, _at_s: Option<f64>) -> Result<String, String> {
         let snapshot = self.watch.snapshot();
-        let input = snapshot.input.ok_or("no conditions were heard yet")?;
+        let input = snapshot.input.ok_or("no conditions were received yet")?;
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
         let shape = shape(&self.rig, &mut solver, snapshot.map.as_deref(), &conditions(&input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())

@@ -130,7 +130,7 @@ impl Recorded {
                     recorded.take(time_ns, input, prediction);
                 }
                 Content::Known(Payload::Vibration(vibration)) => {
-                    let sample = VibrationSample::new(line.beside(vibration.header.stamp, log_ns), &vibration);
+                    let sample = VibrationSample::new(line.of_stamp(vibration.header.stamp, log_ns), &vibration);
                     recorded.history.push_vibration(&sample);
                     recorded.vibration.push(&sample);
                 }

@@ -36,7 +36,7 @@ impl TimeLine {
     }
 
     /// The time of a message that is not an input but has a stamp of the same clock.
-    pub fn beside(&self, stamp: Time, log_ns: i64) -> i64 {
+    pub fn of_stamp(&self, stamp: Time, log_ns: i64) -> i64 {
         if stamp == Time::default() { self.unstamped(log_ns) } else { stamp.as_ns().saturating_add(self.shift_ns) }
     }
 
@@ -61,7 +61,7 @@ mod tests {
         assert_eq!(line.stamped(Time::from_ns(5 * S), 100 * S), 5 * S);
         assert_eq!(line.stamped(Time::from_ns(15 * S), 101 * S), 15 * S);
         assert_eq!(line.unstamped(103 * S), 17 * S);
-        assert_eq!(line.beside(Time::from_ns(16 * S), 101 * S), 16 * S);
+        assert_eq!(line.of_stamp(Time::from_ns(16 * S), 101 * S), 16 * S);
     }
 
     #[test]
@@ -72,7 +72,7 @@ mod tests {
         // Played again, with the same stamps.
         assert_eq!(line.stamped(Time::from_ns(10 * S), 203 * S), 53 * S);
         assert_eq!(line.stamped(Time::from_ns(12 * S), 204 * S), 55 * S);
-        assert_eq!(line.beside(Time::from_ns(12 * S), 204 * S), 55 * S);
+        assert_eq!(line.of_stamp(Time::from_ns(12 * S), 204 * S), 55 * S);
     }
 
     #[test]

@@ -213,7 +213,7 @@ pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -
         LABELS.into_iter().zip(RANGES).map(|(label, range)| (label, COLOURS[0], range)).collect();
     panels[3].1 = COLOURS[1];
     if history.bins().iter().any(|bin| bin.vibration.is_some()) {
-        panels.push(("measured, dB", COLOURS[6], |bin| bin.vibration.map(|heard| (heard.low_db, heard.high_db))));
+        panels.push(("measured, dB", COLOURS[6], |bin| bin.vibration.map(|tone| (tone.low_db, tone.high_db))));
     }
     let bin_s = history.bin_ns() as f64 * 1e-9;
     let at = |index: i64| index as f64 * bin_s - from_s;
@@ -258,12 +258,12 @@ pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -
         };
         let measured = || {
             let loud = |bin: &Bin| {
-                let heard = bin.vibration.filter(|heard| f64::from(heard.high_db) >= threshold_db)?;
-                Some((at(bin.index) + 0.5 * bin_s, f64::from(heard.frequency_hz)))
+                let tone = bin.vibration.filter(|tone| f64::from(tone.high_db) >= threshold_db)?;
+                Some((at(bin.index) + 0.5 * bin_s, f64::from(tone.frequency_hz)))
             };
             history.bins().iter().filter_map(loud).collect::<Vec<_>>()
         };
-        let heights = unstable().into_iter().map(|mode| mode.1).chain(measured().into_iter().map(|heard| heard.1));
+        let heights = unstable().into_iter().map(|mode| mode.1).chain(measured().into_iter().map(|tone| tone.1));
         let (low, high) = padded(range(heights));
         // A least height of the axis, so that a nearly constant frequency appears as a line and not as noise.
         let room = (0.05 * (low + high) - 0.5 * (high - low)).max(0.0);
@@ -451,8 +451,8 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
             ("largest", COLOURS[1], VPos::Bottom, |trial| trial.largest_error),
         ] {
             let line: Vec<_> = trials.iter().map(|trial| (at(trial.factor), height(of(trial)))).collect();
-            let beside = Pos::new(HPos::Left, side);
-            let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(beside).color(&colour);
+            let position = Pos::new(HPos::Left, side);
+            let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(position).color(&colour);
             let away = if matches!(side, VPos::Top) { -0.015 } else { 0.015 } * (y.1 - y.0);
             let place = (line[0].0 + 0.01 * (x.1 - x.0), line[0].1 + away);
             chart.draw_series([Text::new(name, place, text)]).map_err(failed)?;

@@ -45,13 +45,13 @@ impl ChartFile {
         let key = key(content_hash, &BUILDER);
         let short = hex(&key[..8]);
         let name = |stem: &str| format!("{stem}.{short}.chart");
-        let beside = rig_file.and_then(|file| {
+        let next_to_rig = rig_file.and_then(|file| {
             let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
             let writable = rustix::fs::access(folder, rustix::fs::Access::WRITE_OK).is_ok();
             Some(folder.join(name(&file.file_stem()?.to_string_lossy()))).filter(|_| writable)
         });
         let cached = || Some(cache_folder()?.join(name(&rig_name.replace(['/', '\\'], "_"))));
-        beside.or_else(cached).map(|path| Self { path, key })
+        next_to_rig.or_else(cached).map(|path| Self { path, key })
     }
 
     /// Path of the file.

@@ -105,7 +105,7 @@ impl FullModelFile {
         let refuse_beside_system = |field: &str| RigError::Kind {
             file: toml.clone(),
             field: field.to_owned(),
-            value: "stands beside [system]".to_owned(),
+            value: "cannot be combined with [system]".to_owned(),
             limit: "either [system] or [pad] with its contact".to_owned(),
         };
         let missing = |field: &str, limit: &str| RigError::MissingKey {

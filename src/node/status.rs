@@ -162,7 +162,7 @@ pub struct Assessment {
 impl Assessment {
     /// The assessment before the first input.
     pub fn waiting() -> Self {
-        let message = "no input was heard yet".to_owned();
+        let message = "no input was received yet".to_owned();
         Self { status: Status::Waiting, message, fastest: None, next: None }
     }
 

@@ -36,7 +36,7 @@ pub(super) fn build(
         Err(RigError::Kind { file, field, value, limit })
     };
     let Some(disc) = disc else {
-        return refuse("basis.shared", "is true beside a rigid disc", "[disc], or no [basis]");
+        return refuse("basis.shared", "is true together with a rigid disc", "[disc], or no [basis]");
     };
     for (name, part) in [("pad", pad), ("disc", disc)] {
         if part.selected.len() != part.data.omega_rad_s.len() {
@@ -50,7 +50,11 @@ pub(super) fn build(
             );
         }
         if part.data.residual.is_some() {
-            return refuse(&format!("{name}.modal"), "holds a residual beside a shared basis", "modes of the part");
+            return refuse(
+                &format!("{name}.modal"),
+                "holds a residual, which cannot be combined with a shared basis",
+                "modes of the part",
+            );
         }
     }
     let omega_rad_s = &pad.side.modes.omega_rad_s;
@@ -98,7 +102,7 @@ pub(super) fn build(
             contact.damping_n_s_per_m.iter().sum::<f64>()
         ),
         match law.exponent {
-            0.0 => "stiffness  of the contact whatever the load".to_owned(),
+            0.0 => "stiffness  of the contact, independent of the load".to_owned(),
             exponent => format!("stiffness  of the contact times (load / {} N)^{exponent}", law.reference_n),
         },
     ];

@@ -77,7 +77,7 @@ pub(super) fn assemble(
             pairs.damping_n_s_per_m.iter().sum::<f64>()
         ),
         match contact_law.exponent {
-            0.0 => "stiffness  of the contact whatever the load".to_owned(),
+            0.0 => "stiffness  of the contact, independent of the load".to_owned(),
             exponent => format!("stiffness  of the contact times (load / {} N)^{exponent}", contact_law.reference_n),
         },
     ];

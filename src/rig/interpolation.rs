@@ -98,7 +98,7 @@ impl Interpolation {
         let points: Vec<[f64; 2]> = near.iter().map(|(_, relative)| *relative).collect();
         let local = match inside(&points) {
             Some(weights) => weights,
-            None => self.beside(&points)?,
+            None => self.extrapolated(&points)?,
         };
         let farthest = local.iter().map(|&(node, _)| length(points[node])).fold(0.0, f64::max);
         let limit = FARTHEST * self.spacing.max(self.search);
@@ -112,11 +112,11 @@ impl Interpolation {
     }
 
     /// Weights for the origin if it lies outside the convex hull of `points`: extrapolation from the nearest triangle.
-    fn beside(&self, points: &[[f64; 2]]) -> Result<Vec<(usize, f64)>, (String, String)> {
+    fn extrapolated(&self, points: &[[f64; 2]]) -> Result<Vec<(usize, f64)>, (String, String)> {
         let clamped = nearest_on_hull(points);
         if length(clamped) > self.search {
             return Err((
-                format!("it lies {:.6e} m beside the surface", length(clamped)),
+                format!("it lies {:.6e} m outside the surface", length(clamped)),
                 format!("at most {:.6e} m (search_distance_m)", self.search),
             ));
         }
@@ -304,7 +304,7 @@ mod tests {
     fn too_far_is_refused_with_the_distance() {
         let interpolation = surface(&grid(), Some(0.002));
         let (value, limit) = interpolation.weights([0.06, 0.02, 0.02]).unwrap_err();
-        assert_eq!(value, "it lies 1.000000e-2 m beside the surface");
+        assert_eq!(value, "it lies 1.000000e-2 m outside the surface");
         assert_eq!(limit, "at most 2.000000e-3 m (search_distance_m)");
         let (value, _) = interpolation.weights([0.02, 0.02, 0.03]).unwrap_err();
         assert_eq!(value, "the nearest node along the normal is 1.000000e-2 m away");

@@ -46,7 +46,12 @@ pub(super) fn build(
     let mut built = if shared {
         if given.is_some() {
             let (field, limit) = ("residual".to_owned(), "modes of the parts, or none".to_owned());
-            return Err(RigError::Kind { file, field, value: "stands beside a shared basis".to_owned(), limit });
+            return Err(RigError::Kind {
+                file,
+                field,
+                value: "cannot be combined with a shared basis".to_owned(),
+                limit,
+            });
         }
         basis::build(&file, &pad, disc.as_ref(), &pairs, values, settings)?
     } else {
@@ -172,7 +177,8 @@ fn given(
     let file = source.rig_file.clone();
     for (name, part) in std::iter::once(("pad", pad)).chain(disc.map(|disc| ("disc", disc))) {
         if part.data.residual.is_some() {
-            let (field, value) = (format!("{name}.modal"), "holds a residual beside [residual]".to_owned());
+            let (field, value) =
+                (format!("{name}.modal"), "holds a residual, which cannot be combined with [residual]".to_owned());
             return Err(RigError::Kind { file, field, value, limit: "one of the two".to_owned() });
         }
         if part.selected.len() != part.data.omega_rad_s.len() {

@@ -153,7 +153,7 @@ fn pairs(
             Err(RigError::NoTriad { file, field, node: pad_node, position_m: Box::new(position_m), value, limit })
         };
         if radius_m <= 1e-9 * norm(minus(position_m, raw.axis_point_m)).max(f64::MIN_POSITIVE) {
-            return no_triad("it lies on the axis".to_owned(), "a node beside the axis");
+            return no_triad("it lies on the axis".to_owned(), "a node off the axis");
         }
         let sliding = scaled(moving, 1.0 / radius_m);
         let lateral = cross(normal, sliding);

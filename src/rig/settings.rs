@@ -142,7 +142,7 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
             ("contact_patch", raw.contact_patch.is_some()),
         ];
         if let Some((field, _)) = other.iter().find(|(_, present)| *present) {
-            return mixed(field, "stands beside [system]", "either [system] or [pad] with its contact");
+            return mixed(field, "cannot be combined with [system]", "either [system] or [pad] with its contact");
         }
         let friction_or_load = [
             ("friction.slope_s_per_m", raw.friction.slope_s_per_m != 0.0),
@@ -150,13 +150,13 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
             ("load.exponent", raw.load.exponent != 0.0),
         ];
         if let Some((field, _)) = friction_or_load.iter().find(|(_, set)| *set) {
-            return mixed(field, "has nothing to act on beside [system]", "a scale of a matrix instead");
+            return mixed(field, "has nothing to act on in a rig with [system]", "a scale of a matrix instead");
         }
         if raw.residual.is_some() {
-            return mixed("residual", "stands beside [system]", "[pad] and [disc] with modal");
+            return mixed("residual", "cannot be combined with [system]", "[pad] and [disc] with modal");
         }
         if raw.basis.as_ref().is_some_and(|basis| basis.shared) {
-            return mixed("basis.shared", "is true beside [system]", "[pad] and [disc] with modal");
+            return mixed("basis.shared", "is true together with [system]", "[pad] and [disc] with modal");
         }
         return Ok(Kind::System(system));
     }
@@ -165,29 +165,33 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
     };
     let modal = pad.modal.is_some();
     if !modal && raw.residual.is_some() {
-        return mixed("residual", "stands beside inline substructures", "[pad] and [disc] with modal");
+        return mixed("residual", "cannot be combined with inline substructures", "[pad] and [disc] with modal");
     }
     if !modal && raw.basis.is_some() {
-        return mixed("basis", "stands beside inline substructures", "[pad] and [disc] with modal, or [system]");
+        return mixed(
+            "basis",
+            "cannot be combined with inline substructures",
+            "[pad] and [disc] with modal, or [system]",
+        );
     }
     for (side, substructure) in [("pad", Some(pad)), ("disc", raw.disc.as_ref())] {
         let Some(substructure) = substructure else { continue };
         let inline = substructure.mass.is_some() || substructure.stiffness.is_some();
         if substructure.modal.is_some() && (inline || !modal) {
             let limit = "mass and stiffness on both sides, or modal on both sides";
-            return mixed(&format!("{side}.modal"), "stands beside mass and stiffness", limit);
+            return mixed(&format!("{side}.modal"), "cannot be combined with mass and stiffness", limit);
         }
         if modal && inline {
             let limit = "mass and stiffness on both sides, or modal on both sides";
-            return mixed(&format!("{side}.mass"), "stands beside a modal pad", limit);
+            return mixed(&format!("{side}.mass"), "cannot be combined with a modal pad", limit);
         }
         if modal && substructure.modal.is_none() {
             return missing(&format!("{side}.modal"), "an .npz, .unv or .uff file");
         }
     }
     match (modal, &raw.contact, &raw.contact_patch) {
-        (true, Some(_), _) => mixed("contact", "stands beside modal substructures", "[[contact_patch]]"),
-        (false, _, Some(_)) => mixed("contact_patch", "stands beside inline substructures", "[[contact]]"),
+        (true, Some(_), _) => mixed("contact", "cannot be combined with modal substructures", "[[contact_patch]]"),
+        (false, _, Some(_)) => mixed("contact_patch", "cannot be combined with inline substructures", "[[contact]]"),
         (true, None, Some(patches)) if !patches.is_empty() => Ok(Kind::Modal { pad, disc: raw.disc.as_ref(), patches }),
         (false, Some(contacts), None) if !contacts.is_empty() => {
             Ok(Kind::Inline { pad, disc: raw.disc.as_ref(), contacts })

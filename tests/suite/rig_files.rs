@@ -136,7 +136,7 @@ fn bad_files_of_kind_1() {
     refused!(
         inline("name = \"x\"", "name = \"x\"\n[system]\nmass = \"M.mtx\""),
         RigError::Kind { .. },
-        "x.toml: `pad` stands beside [system]; expected either [system] or [pad] with its contact"
+        "x.toml: `pad` cannot be combined with [system]; expected either [system] or [pad] with its contact"
     );
     refused!(
         inline("name = \"x\"", "name = \"x\"\n[band]\nmax_hz = -1"),
@@ -199,13 +199,13 @@ fn bad_files_of_kind_2() {
         modal("normal =", "normal =", &side(&[0.1, 0.0, 0.01, 0.3, 0.0, 0.01])),
         RigError::NoPartner { node: 1, .. },
         "x.toml: `contact_patch[0]`: pad node 1 at (0.3, 0, 0.01) m finds no partner on the disc: \
-         it lies 1.800000e-1 m beside the surface, expected at most 1.000000e-2 m (search_distance_m)"
+         it lies 1.800000e-1 m outside the surface, expected at most 1.000000e-2 m (search_distance_m)"
     );
     refused!(
         modal("normal =", "normal =", &side(&[0.0, 0.0, 0.01])),
         RigError::NoTriad { node: 0, .. },
         "x.toml: `contact_patch[0]`: pad node 0 at (0, 0, 0.01) m has no sliding direction: \
-         it lies on the axis, expected a node beside the axis"
+         it lies on the axis, expected a node off the axis"
     );
     refused!(
         modal("\nnormal = [0.0, 0.0, 1.0]", "\nnormal = [0.0, 0.0, 0.0]", &side(PAD)),
@@ -227,7 +227,7 @@ fn bad_files_of_kind_2() {
     refused!(
         modal("[disc]", "mass = [[1.0]]\n[disc]", &side(PAD)),
         RigError::Kind { .. },
-        "x.toml: `pad.modal` stands beside mass and stiffness; \
+        "x.toml: `pad.modal` cannot be combined with mass and stiffness; \
          expected mass and stiffness on both sides, or modal on both sides"
     );
 }

@@ -198,7 +198,7 @@ mod tests {
             "2023-11-14T22:13:20.250000Z  SQUEAL   seq 7  mu 0.4312  load 500.00 N  speed 13.000 rad/s  margin -0.05570  \
              mode 15 at 3114.6 Hz grows by 636 1/s, the fastest of 2"
         );
-        assert_eq!(shown(Status::Waiting), "WAITING  no input was heard yet  it listens to no bus");
+        assert_eq!(shown(Status::Waiting), "WAITING  no input was received yet  it listens to no bus");
         assert!(
             shown(Status::Fault).ends_with("normal_load_n is -5, expected 0 to 1000000"),
             "{}",

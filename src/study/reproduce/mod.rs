@@ -6,7 +6,7 @@ mod tribometer;
 use crate::figures::html::{figure, page, section};
 
 pub use nine_dof::nine_dof;
-pub use tribometer::{Heard, MODES, PartModes, Study};
+pub use tribometer::{MODES, PartModes, Step, Study};
 
 /// A reproduced table or figure of the paper.
 #[derive(Clone, Debug)]
@@ -26,7 +26,7 @@ pub struct Item {
 /// A page with all items, as HTML.
 pub fn index(items: &[Item]) -> String {
     let mut body = "<h1>The paper's tables and figures, made again</h1>\n\
-         <p class=\"lead\">Every number is computed; the paper's own stand beside. Each table and figure is also a file of \
+         <p class=\"lead\">Every number is computed; the paper's own are given next to them. Each table and figure is also a file of \
          its own, beside this page.</p>\n"
         .to_owned();
     let entry = |item: &Item| format!("<li><a href=\"#{}\">{}</a></li>\n", item.name, item.title);

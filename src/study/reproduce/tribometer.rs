@@ -92,7 +92,7 @@ pub struct Study<'a> {
 }
 
 /// A progress report.
-pub enum Heard<'a> {
+pub enum Step<'a> {
     Said(&'a str),
     /// The full model is being solved for this purpose.
     Solving(&'a str, FullProgress),
@@ -124,13 +124,13 @@ struct Mapped {
 
 impl Study<'_> {
     /// Reproduces Tables 3 and 4, Figs. 13 to 15 and the critical friction coefficients. `solver` solves the full
-    /// model; `hear` receives progress reports.
+    /// model; `report` receives progress reports.
     ///
     /// # Errors
     /// A model that cannot be solved, a figure that cannot be drawn.
-    pub fn items(&self, solver: &mut FullSolver<'_>, hear: &mut dyn FnMut(Heard<'_>)) -> anyhow::Result<Vec<Item>> {
-        let truth = self.truth(solver, hear)?;
-        let mut say = |text: &str| hear(Heard::Said(text));
+    pub fn items(&self, solver: &mut FullSolver<'_>, report: &mut dyn FnMut(Step<'_>)) -> anyhow::Result<Vec<Item>> {
+        let truth = self.truth(solver, report)?;
+        let mut say = |text: &str| report(Step::Said(text));
         say("identifying contact stiffnesses");
         let (mut paper, mut fits) = (vec![], vec![]);
         for (k, &modes) in MODES.iter().enumerate() {
@@ -174,13 +174,13 @@ impl Study<'_> {
 
     /// Results of the full model: natural frequencies at rest, windows of instability, and modes at `DOTS + 1` friction
     /// coefficients.
-    fn truth(&self, solver: &mut FullSolver<'_>, hear: &mut dyn FnMut(Heard<'_>)) -> anyhow::Result<Truth> {
+    fn truth(&self, solver: &mut FullSolver<'_>, report: &mut dyn FnMut(Step<'_>)) -> anyhow::Result<Truth> {
         let (full, reference) = (self.full, self.full.settings.reference);
         let band_hz = full.settings.band_max_hz.context("the full model has no band")?;
-        let mut roots = |what: &str, p: &OperatingPoint, hear: &mut dyn FnMut(Heard<'_>)| {
-            solver.roots(p, TAU * band_hz, FullVectors::None, &mut |step| hear(Heard::Solving(what, step)))
+        let mut roots = |what: &str, p: &OperatingPoint, report: &mut dyn FnMut(Step<'_>)| {
+            solver.roots(p, TAU * band_hz, FullVectors::None, &mut |step| report(Step::Solving(what, step)))
         };
-        let at_rest = roots("at rest", &self.at_rest(), hear)?;
+        let at_rest = roots("at rest", &self.at_rest(), report)?;
         let at_rest_hz: Vec<f64> =
             at_rest.roots.iter().map(|root| root.lambda.im / TAU).filter(|hz| *hz > 0.0).take(FREQUENCIES).collect();
         let count = at_rest_hz.len();
@@ -192,7 +192,7 @@ impl Study<'_> {
         let mut dots = vec![];
         for k in 0..=DOTS {
             let mu = MU_MAX * k as f64 / DOTS as f64;
-            let found = roots(&format!("friction coefficient {mu}"), &reference.with_friction(mu), hear)?;
+            let found = roots(&format!("friction coefficient {mu}"), &reference.with_friction(mu), report)?;
             dots.extend(found.roots.iter().filter(|root| root.lambda.im > 0.0).enumerate().map(|(id, root)| Point {
                 mu,
                 id: id as u32,
@@ -201,7 +201,7 @@ impl Study<'_> {
             }));
         }
         let options = map_options(full.settings.instability_threshold, band_hz);
-        let mut progress = |step: FullProgress| hear(Heard::Solving("windows of instability", step));
+        let mut progress = |step: FullProgress| report(Step::Solving("windows of instability", step));
         let windows = full_windows(&full.model, solver, &reference, TAU * band_hz, &options, &mut progress)?;
         Ok(Truth { at_rest_hz, windows, dots, band_hz })
     }

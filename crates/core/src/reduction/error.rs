@@ -49,7 +49,7 @@ pub enum ReductionError {
     #[error("{what}: shifts covered the band up to {covered:.6e} rad/s only, expected {band:.6e} rad/s")]
     NotCovered { what: String, covered: f64, band: f64 },
     #[error(
-        "{what}: it needs {:.2} GiB of memory beside what is held already, more than the {:.2} GiB allowed",
+        "{what}: it needs {:.2} GiB of memory in addition to what is already in use, more than the {:.2} GiB allowed",
         *bytes as f64 / GIB, *limit as f64 / GIB
     )]
     Memory { what: String, bytes: usize, limit: usize },

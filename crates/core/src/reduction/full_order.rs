@@ -188,7 +188,7 @@ impl<'a> FullSolver<'a> {
     /// Checks the memory limit for solves with `roots` roots in the band, drops factors that no longer fit, and returns
     /// the bytes needed with one factor.
     ///
-    /// `beside` bytes are held by the caller during a solve; `other` bytes are needed between solves. As many factors
+    /// `held_by_caller` bytes are held by the caller during a solve; `other` bytes are needed between solves. As many factors
     /// are kept as the limit allows.
     ///
     /// # Errors
@@ -197,12 +197,12 @@ impl<'a> FullSolver<'a> {
         &mut self,
         vectors: FullVectors,
         roots: usize,
-        beside: usize,
+        held_by_caller: usize,
         other: usize,
     ) -> Result<usize, ReductionError> {
         let PartBytes { held, factors, factoring } = self.factor_bytes();
         let held = held + self.elsewhere_bytes;
-        let work = (factoring.max(self.vector_bytes(vectors, roots)) + beside).max(other);
+        let work = (factoring.max(self.vector_bytes(vectors, roots)) + held_by_caller).max(other);
         let bytes = held + factors + work;
         self.most_kept = MOST_KEPT;
         if let Some(limit) = self.memory_limit_bytes {

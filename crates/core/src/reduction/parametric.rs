@@ -195,8 +195,8 @@ pub fn parametric_basis(
         let mut worst = 0.0_f64;
         for point in request.range.spread(first, request.held_out) {
             let band_rad_s = BAND_MARGIN * request.counted.band_rad_s;
-            let hear = &mut |step| progress(ParametricStep::Solving(step));
-            let full = build.solver.roots(&point, band_rad_s, FullVectors::None, hear)?;
+            let report = &mut |step| progress(ParametricStep::Solving(step));
+            let full = build.solver.roots(&point, band_rad_s, FullVectors::None, report)?;
             let roots = full.roots.iter().map(|root| root.lambda).filter(|lambda| lambda.im > 0.0).collect::<Vec<_>>();
             let reduced = oscillating(&build.solve(&model, &point, Vectors::None)?);
             let comparison = match_roots(&roots, &reduced, request.counted);
@@ -318,8 +318,8 @@ impl Building<'_, '_> {
         let span = self.span.ncols() + columns;
         let extended = 2 * span + 5 * columns;
         let estimated = 2 * span + ESTIMATING * 4 * ROOTS_TOGETHER;
-        let (beside, other) = (3 * span * column, (4 * span).max(extended).max(estimated) * column);
-        self.solver.make_room(FullVectors::Both, self.most_roots, beside, other)
+        let (held_by_caller, other) = (3 * span * column, (4 * span).max(extended).max(estimated) * column);
+        self.solver.make_room(FullVectors::Both, self.most_roots, held_by_caller, other)
     }
 
     /// Solves the full model at `point` and adds its vectors to the span. `estimates` are the reduced roots at that
@@ -337,8 +337,8 @@ impl Building<'_, '_> {
             band_rad_s: BAND_MARGIN * counted.band_rad_s,
             growth_floor_per_s: counted.growth_floor_per_s - (FLOOR_MARGIN - 1.0) * counted.growth_floor_per_s.abs(),
         };
-        let hear = &mut |step| progress(ParametricStep::Solving(step));
-        let spectrum = self.solver.roots(&point, wanted.band_rad_s, FullVectors::Both, hear)?;
+        let report = &mut |step| progress(ParametricStep::Solving(step));
+        let spectrum = self.solver.roots(&point, wanted.band_rad_s, FullVectors::Both, report)?;
         let roots: Vec<c64> = spectrum.roots.iter().map(|root| root.lambda).collect();
         let chosen: Vec<usize> = (0..roots.len()).filter(|&k| wanted.counts(roots[k])).collect();
         let counting: Vec<c64> = chosen.iter().map(|&k| roots[k]).collect();
@@ -438,7 +438,7 @@ impl Building<'_, '_> {
         self.snapshots.push(all);
         drop(weighted);
         let before = std::mem::replace(&mut self.span, Mat::new());
-        self.span = beside(before.as_ref(), added.as_ref());
+        self.span = hstack(before.as_ref(), added.as_ref());
         Ok(())
     }
 
@@ -656,7 +656,7 @@ fn solve_failed(source: crate::physics::SolveError) -> ReductionError {
 }
 
 /// `[a b]`.
-fn beside(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
+fn hstack(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
     let mut both = Mat::zeros(a.nrows(), a.ncols() + b.ncols());
     both.subcols_mut(0, a.ncols()).copy_from(a);
     both.subcols_mut(a.ncols(), b.ncols()).copy_from(b);

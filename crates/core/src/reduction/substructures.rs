@@ -45,8 +45,8 @@ pub fn keep_modes(
     memory_limit_bytes: Option<usize>,
     progress: &mut dyn FnMut(usize, Progress),
 ) -> Result<Vec<Kept>, ReductionError> {
-    let analysed: Vec<Analysed<'_>> = side_by_side(parts, true, progress, &|part, hear| {
-        hear(Progress::Analysing);
+    let analysed: Vec<Analysed<'_>> = side_by_side(parts, true, progress, &|part, report| {
+        report(Progress::Analysing);
         Analysed::new(part.name, part.mass, part.stiffness)
     })?;
     let held: usize = analysed.iter().map(Analysed::held_bytes).sum();
@@ -88,10 +88,10 @@ pub fn keep_modes(
     let mut way = plan(&wanted, progress)?;
     if wanted.iter().any(|wanted| matches!(wanted, Wanted::Below(_))) {
         let indices: Vec<usize> = (0..parts.len()).collect();
-        wanted = side_by_side(&indices, way.at_once, progress, &|&index, hear| match parts[index].wanted {
+        wanted = side_by_side(&indices, way.at_once, progress, &|&index, report| match parts[index].wanted {
             Wanted::Below(below_rad_s) => {
                 let modes = analysed[index].count_below(below_rad_s)?;
-                hear(Progress::Counted { modes, below: below_rad_s * below_rad_s });
+                report(Progress::Counted { modes, below: below_rad_s * below_rad_s });
                 Ok(Wanted::Counted { modes, below_rad_s })
             }
             wanted => Ok(wanted),
@@ -99,16 +99,16 @@ pub fn keep_modes(
         way = plan(&wanted, progress)?;
     }
     let indices: Vec<usize> = (0..parts.len()).collect();
-    side_by_side(&indices, way.at_once, progress, &|&index, hear| {
+    side_by_side(&indices, way.at_once, progress, &|&index, report| {
         // Its memory need has been reported already.
-        let mut hear = |p: Progress| {
+        let mut report = |p: Progress| {
             if !matches!(p, Progress::Analysed { .. }) {
-                hear(p);
+                report(p);
             }
         };
-        let modes = analysed[index].modes(wanted[index], None, &mut hear)?;
+        let modes = analysed[index].modes(wanted[index], None, &mut report)?;
         let residual = if with_residual {
-            Some(analysed[index].residual(&modes, parts[index].rows, way.inertia_by, &mut hear)?)
+            Some(analysed[index].residual(&modes, parts[index].rows, way.inertia_by, &mut report)?)
         } else {
             None
         };
