@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use bus::{answer, into, next, point, shm, wait_until};
 use crossbeam_channel::{Receiver, Sender, unbounded};
-use squealcast::bus::heard::Heard;
+use squealcast::bus::received::Received;
 use squealcast::bus::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource};
 use squealcast::msgs::{OperatingPoint, Prediction};
 use squealcast::node::{Incoming, Node, Outputs, Shortcut, Watch, session_chart};
@@ -47,11 +47,11 @@ impl NodeOnShm {
         let mut outputs = Outputs { shm: Some(ShmOutput::new(options).expect("output")), ..Default::default() };
         let shortcut = Shortcut::new(sender.clone());
         let inputs = shortcut.clone();
-        let input = ShmInput::spawn_with_backlog(options, move |heard, more_waits| {
-            assert!(inputs.input(heard, more_waits), "the queue is full");
+        let input = ShmInput::spawn_with_backlog(options, move |received, more_waits| {
+            assert!(inputs.input(received, more_waits), "the queue is full");
         });
         outputs.shm_input = Some(input.expect("input"));
-        // Between its blocks nothing is heard, and that is no fault.
+        // Between its blocks nothing is received, and that is no fault.
         let settings = Settings { silence_timeout_s: 1e6, ..Settings::for_rig(&rig) };
         let watch = Watch::default();
         let node = Node::new(rig, settings, outputs, sender.clone(), watch.clone()).with_shortcut(&shortcut);
@@ -88,16 +88,16 @@ fn wave(seq: u64) -> OperatingPoint {
 /// Who sends conditions to a bus and hears what becomes of them.
 struct Asker {
     source: ShmSource,
-    heard: Receiver<Heard<Prediction>>,
+    received: Receiver<Received<Prediction>>,
     sink: ShmSink,
     seq: u64,
 }
 
 impl Asker {
     fn new(options: &ShmOptions) -> Self {
-        let (predictions, heard) = unbounded();
+        let (predictions, received) = unbounded();
         let sink = ShmSink::spawn(options, into(predictions)).expect("sink");
-        Self { source: ShmSource::new(options).expect("source"), heard, sink, seq: 0 }
+        Self { source: ShmSource::new(options).expect("source"), received, sink, seq: 0 }
     }
 
     /// One round trip, from before the condition is written to when its prediction is taken off the bus.
@@ -105,7 +105,7 @@ impl Asker {
         self.seq += 1;
         let sent_ns = clock::monotonic_ns();
         self.source.publish(&wave(self.seq)).expect("published");
-        let answered = next(&self.heard);
+        let answered = next(&self.received);
         assert_eq!(answered.message.input_seq, self.seq);
         Duration::from_nanos(answered.at.monotonic_ns - sent_ns)
     }
@@ -168,8 +168,8 @@ fn main() {
     let (node_bus, bare_bus) = (shm("speed-node"), shm("speed-bare"));
     let node = NodeOnShm::start(&node_bus, rig.clone(), Some(chart));
     let bare = ShmOutput::new(&bare_bus).expect("output");
-    let _echo = ShmInput::spawn(&bare_bus, move |heard: Heard<OperatingPoint>| {
-        bare.publish(&answer(&heard.message)).expect("published");
+    let _echo = ShmInput::spawn(&bare_bus, move |received: Received<OperatingPoint>| {
+        bare.publish(&answer(&received.message)).expect("published");
     })
     .expect("input");
     let (mut ask_node, mut ask_bare) = (Asker::new(&node_bus), Asker::new(&bare_bus));
@@ -203,8 +203,8 @@ fn main() {
     for k in 0..COUNT {
         let due = Duration::from_micros(100 * k);
         while begun.elapsed() < due {
-            match ask_node.heard.recv_timeout(due.saturating_sub(begun.elapsed())) {
-                Ok(heard) => take(heard.message),
+            match ask_node.received.recv_timeout(due.saturating_sub(begun.elapsed())) {
+                Ok(received) => take(received.message),
                 Err(_) => break,
             }
         }
@@ -212,8 +212,8 @@ fn main() {
         ask_node.source.publish(&wave(ask_node.seq + 1 + k)).expect("published");
     }
     let sent_in = begun.elapsed();
-    while let Ok(heard) = ask_node.heard.recv_timeout(Duration::from_secs(1)) {
-        take(heard.message);
+    while let Ok(received) = ask_node.received.recv_timeout(Duration::from_secs(1)) {
+        take(received.message);
     }
     drop(building);
     println!("10 kHz while a chart is built: {COUNT} sent in {sent_in:.1?}, {answered} answered, {missing} missing");

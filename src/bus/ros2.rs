@@ -7,13 +7,13 @@
 //! and never blocks. A killed peer is only forgotten after its lease, so receivers should check sequence numbers.
 
 mod discovery;
-mod ears;
 mod frame;
 mod link;
 mod loopback;
 pub mod process;
 mod qos_conflicts;
 pub mod side;
+mod subscriptions;
 
 use std::env;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ use thiserror::Error;
 
 use self::discovery::Discovery;
 use self::link::{Durability, Link, MAX_UNANSWERED};
-use super::heard::{Bus, Counts, Heard};
+use super::received::{Bus, Counts, Received};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
 use crate::msgs::schema::Topic;
 use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
@@ -171,8 +171,8 @@ impl Ros2 {
     pub fn start(
         options: &Ros2Options,
         parameters: Parameters,
-        sink: impl FnMut(Heard<OperatingPoint>) + Send + 'static,
-        vibration: impl FnMut(Heard<Vibration>) + Send + 'static,
+        sink: impl FnMut(Received<OperatingPoint>) + Send + 'static,
+        vibration: impl FnMut(Received<Vibration>) + Send + 'static,
     ) -> Result<Self, Ros2Error> {
         Self::start_with(options, parameters, MAX_UNANSWERED, sink, vibration)
     }
@@ -183,8 +183,8 @@ impl Ros2 {
         options: &Ros2Options,
         parameters: Parameters,
         max_unanswered: i32,
-        sink: impl FnMut(Heard<OperatingPoint>) + Send + 'static,
-        vibration: impl FnMut(Heard<Vibration>) + Send + 'static,
+        sink: impl FnMut(Received<OperatingPoint>) + Send + 'static,
+        vibration: impl FnMut(Received<Vibration>) + Send + 'static,
     ) -> Result<Self, Ros2Error> {
         let started = Arc::new(AtomicBool::new(false));
         let mut link = Link::join(options, NODE_NAME, parameters.declare(Arc::clone(&started)))?;
@@ -339,7 +339,7 @@ impl Ros2Source {
     /// Invalid names, or an error of DDS.
     pub fn start(
         options: &Ros2Options,
-        sink: impl FnMut(Heard<Prediction>) + Send + 'static,
+        sink: impl FnMut(Received<Prediction>) + Send + 'static,
     ) -> Result<Self, Ros2Error> {
         let node_options = Parameters::none().declare(Arc::new(AtomicBool::new(true)));
         let mut link = Link::join(options, SOURCE_NODE_NAME, node_options)?;
@@ -418,6 +418,6 @@ async fn beat(beats: &AtomicU64) {
 }
 
 /// A message received over ROS 2 now.
-fn heard<M>(message: M) -> Heard<M> {
-    Heard::now(Bus::Ros2, message)
+fn received<M>(message: M) -> Received<M> {
+    Received::now(Bus::Ros2, message)
 }

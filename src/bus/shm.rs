@@ -25,7 +25,7 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use iceoryx2::waitset::{WaitSetAttachmentError, WaitSetCreateError};
 use thiserror::Error;
 
-use super::heard::{Bus, Counters, Counts, Gaps, Heard};
+use super::received::{Bus, Counters, Counts, Gaps, Received};
 use super::shm_place;
 use crate::msgs::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
 
@@ -200,9 +200,9 @@ impl<F: Form> ShmReader<F> {
     /// Errors of iceoryx2.
     pub fn spawn(
         options: &ShmOptions,
-        mut sink: impl FnMut(Heard<F::Message>) + Send + 'static,
+        mut sink: impl FnMut(Received<F::Message>) + Send + 'static,
     ) -> Result<Self, ShmError> {
-        Self::spawn_with_backlog(options, move |heard, _| sink(heard))
+        Self::spawn_with_backlog(options, move |received, _| sink(received))
     }
 
     /// As [`ShmReader::spawn`]; `sink` is also told whether more samples are waiting. A sink that takes long for a
@@ -212,7 +212,7 @@ impl<F: Form> ShmReader<F> {
     /// Errors of iceoryx2.
     pub fn spawn_with_backlog(
         options: &ShmOptions,
-        sink: impl FnMut(Heard<F::Message>, bool) + Send + 'static,
+        sink: impl FnMut(Received<F::Message>, bool) + Send + 'static,
     ) -> Result<Self, ShmError> {
         let node = new_node(options)?;
         let Services { service, topic, event } = Services::<F>::open(&node, options)?;
@@ -273,7 +273,7 @@ struct Reading<F: Form, S> {
     node: Node<Ipc>,
 }
 
-impl<F: Form, S: FnMut(Heard<F::Message>, bool)> Reading<F, S> {
+impl<F: Form, S: FnMut(Received<F::Message>, bool)> Reading<F, S> {
     fn run(mut self, listener: &Listener<Ipc>, ready: &crossbeam_channel::Sender<Result<(), ShmError>>) {
         let wait_set = match WaitSetBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled).create::<Ipc>() {
             Ok(wait_set) => wait_set,
@@ -331,9 +331,9 @@ impl<F: Form, S: FnMut(Heard<F::Message>, bool)> Reading<F, S> {
             let missed = self.gaps.note(publisher, form.seq());
             match form.to_message() {
                 Ok(message) => {
-                    self.counters.heard(missed);
+                    self.counters.received(missed);
                     let more_waits = self.subscriber.has_samples().unwrap_or(true);
-                    (self.sink)(Heard::now(Bus::Shm, message), more_waits);
+                    (self.sink)(Received::now(Bus::Shm, message), more_waits);
                 }
                 Err(_) => self.counters.malformed(),
             }

@@ -7,7 +7,7 @@ use super::buses::BusOptions;
 use super::run::{Listening, NodeOptions, serve};
 use super::simulate::{Measuring, VibrationOption, period, rate_hz};
 use super::{Outcome, not_negative};
-use crate::bus::heard::{Bus, Heard};
+use crate::bus::received::{Bus, Received};
 use crate::bus::ros_args::RosArgs;
 use crate::node::{self, Incoming};
 use crate::rig::{EMBEDDED, Rig};
@@ -56,10 +56,10 @@ impl Options {
                 let due = started + Duration::from_secs_f64(time_s);
                 std::thread::sleep(due.saturating_duration_since(Instant::now()));
                 let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
-                let conditions = Incoming::Input(Heard::now(Bus::Simulator, conditions));
-                let vibration = vibration.map(|heard| Incoming::Vibration(Heard::now(Bus::Simulator, heard)));
-                for heard in std::iter::once(conditions).chain(vibration) {
-                    if measurements.send(heard).is_err() {
+                let conditions = Incoming::Input(Received::now(Bus::Simulator, conditions));
+                let vibration = vibration.map(|received| Incoming::Vibration(Received::now(Bus::Simulator, received)));
+                for received in std::iter::once(conditions).chain(vibration) {
+                    if measurements.send(received).is_err() {
                         return;
                     }
                 }

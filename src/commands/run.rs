@@ -10,7 +10,7 @@ use crossbeam_channel::{Receiver, Sender};
 use super::buses::BusOptions;
 use super::display::{DisplayOptions, ThresholdOption};
 use super::{Outcome, live, signals};
-use crate::bus::heard::Heard;
+use crate::bus::received::Received;
 use crate::bus::ros_args::RosArgs;
 use crate::bus::ros2::NODE_NAME;
 use crate::bus::ros2::process::{Ros2Process, Sinks};
@@ -202,8 +202,8 @@ fn hear<M>(
     listening: Listening,
     sender: &Sender<Incoming>,
     lost: &Arc<AtomicU64>,
-    incoming: fn(Heard<M>) -> Incoming,
-) -> impl FnMut(Heard<M>) + Send + use<M> {
+    incoming: fn(Received<M>) -> Incoming,
+) -> impl FnMut(Received<M>) + Send + use<M> {
     let (sender, lost) = (sender.clone(), lost.clone());
     move |heard| {
         if listening == Listening::ToTheBuses && sender.try_send(incoming(heard)).is_err() {

@@ -104,7 +104,7 @@ impl Followed {
         let bins: Vec<_> = if with_bins { self.history.since(self.sent).collect() } else { vec![] };
         let state = State {
             time_s,
-            age_s: snapshot.heard.map(|heard| heard.elapsed().as_secs_f64()),
+            age_s: snapshot.received.map(|received| received.elapsed().as_secs_f64()),
             rate_hz: Some(self.ticks.iter().map(|tick| tick.1).sum::<usize>() as f64),
             assessment,
             prediction: snapshot.prediction.as_ref().map(|p| Shown::new(snapshot.input.as_ref(), p)),

@@ -30,7 +30,7 @@ pub use sensitivity::end_derivatives;
 pub use shortcut::Shortcut;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
-use crate::bus::heard::{Bus, Heard};
+use crate::bus::received::{Bus, Received};
 use crate::files::chart_file::ChartFile;
 use crate::full_model::certificate::Certificate;
 use crate::msgs::{self, Header, RigInfo, SessionEvent, Time, event_kind};
@@ -68,9 +68,9 @@ const SENSITIVITY_EVERY: Duration = Duration::from_secs(1);
 #[derive(Clone, Debug)]
 pub enum Incoming {
     /// An operating point received over a bus.
-    Input(Heard<msgs::OperatingPoint>),
+    Input(Received<msgs::OperatingPoint>),
     /// A measured vibration received over a bus. It is recorded and shown, and does not affect predictions.
-    Vibration(Heard<msgs::Vibration>),
+    Vibration(Received<msgs::Vibration>),
     /// A changed setting; its value is already validated.
     Parameter { name: String, value: f64 },
     /// The requested stability map, or why it could not be computed.
@@ -99,10 +99,10 @@ pub struct Node {
     mapper: Mapper,
     statistics: Statistics,
     watch: Watch,
-    heard_before: Remembered,
-    vibration_heard_before: Remembered,
+    received_before: Remembered,
+    vibration_received_before: Remembered,
     /// When the latest input was received. `None` before the first: silence is only a FAULT after an input.
-    last_heard: Option<Instant>,
+    last_received: Option<Instant>,
     /// Whether the current silence has been published.
     silent: bool,
     /// Items taken from the channel and not yet handled.
@@ -132,9 +132,9 @@ impl Node {
             outputs,
             statistics: Statistics::default(),
             watch,
-            heard_before: Remembered::new(REMEMBERED),
-            vibration_heard_before: Remembered::new(VIBRATIONS_REMEMBERED),
-            last_heard: None,
+            received_before: Remembered::new(REMEMBERED),
+            vibration_received_before: Remembered::new(VIBRATIONS_REMEMBERED),
+            last_received: None,
             silent: false,
             backlog: VecDeque::new(),
             inputs_waiting: 0,
@@ -198,11 +198,11 @@ impl Node {
             match self.backlog.pop_front() {
                 None => break,
                 Some(Incoming::Stop) => return Next::Stop,
-                Some(Incoming::Input(heard)) => {
+                Some(Incoming::Input(received)) => {
                     self.inputs_waiting -= 1;
-                    self.input(heard);
+                    self.input(received);
                 }
-                Some(Incoming::Vibration(heard)) => self.vibration(heard),
+                Some(Incoming::Vibration(received)) => self.vibration(received),
                 Some(Incoming::Parameter { name, value }) => self.parameter(name, value),
                 Some(Incoming::Map { point, map }) => self.map(point, map),
                 Some(Incoming::Ends { map, ends }) => self.ends(&map, ends),
@@ -234,14 +234,14 @@ impl Node {
     /// The first input, and the first after a silence, are queued instead: they wake the node's thread, which then
     /// watches for the next silence.
     fn answers_at_once(&self, input: &msgs::OperatingPoint) -> bool {
-        let heard_lately = self.last_heard.is_some() && !self.silent;
-        self.backlog.is_empty() && heard_lately && self.session.answers_at_once(&conditions(input))
+        let received_lately = self.last_received.is_some() && !self.silent;
+        self.backlog.is_empty() && received_lately && self.session.answers_at_once(&conditions(input))
     }
 
     /// Predicts for an input on the thread that received it.
-    fn answer(&mut self, heard: Heard<msgs::OperatingPoint>) {
-        if self.is_new(&heard) {
-            self.input(heard);
+    fn answer(&mut self, received: Received<msgs::OperatingPoint>) {
+        if self.is_new(&received) {
+            self.input(received);
         }
     }
 
@@ -259,8 +259,8 @@ impl Node {
     /// Appends an item to the backlog. Duplicates from the other bus are dropped here: once queued, a duplicate would
     /// count as a newer input, and the original would be passed over for it.
     fn admit(&mut self, next: Incoming) {
-        if let Incoming::Input(heard) = &next {
-            if !self.is_new(heard) {
+        if let Incoming::Input(received) = &next {
+            if !self.is_new(received) {
                 return;
             }
             self.inputs_waiting += 1;
@@ -269,29 +269,29 @@ impl Node {
     }
 
     /// Whether the input has not already come over the other bus.
-    fn is_new(&mut self, heard: &Heard<msgs::OperatingPoint>) -> bool {
-        let is_new = self.heard_before.is_new(heard.bus, heard.message.header.stamp, heard.message.seq);
+    fn is_new(&mut self, received: &Received<msgs::OperatingPoint>) -> bool {
+        let is_new = self.received_before.is_new(received.bus, received.message.header.stamp, received.message.seq);
         self.statistics.duplicates += u64::from(!is_new);
         is_new
     }
 
     /// Predicts for an input. If it is too old, or too many inputs wait behind it, it is recorded but passed over.
-    fn input(&mut self, heard: Heard<msgs::OperatingPoint>) {
-        self.last_heard = Some(Instant::now());
+    fn input(&mut self, received: Received<msgs::OperatingPoint>) {
+        self.last_received = Some(Instant::now());
         self.silent = false;
-        self.statistics.heard(heard.bus);
+        self.statistics.received(received.bus);
         let started = clock::monotonic_ns();
-        let age = Duration::from_nanos(started.saturating_sub(heard.at.monotonic_ns));
+        let age = Duration::from_nanos(started.saturating_sub(received.at.monotonic_ns));
         let too_many = self.prediction_times.least() * self.inputs_waiting as u32 > CATCH_UP;
         self.passing_over = self.inputs_waiting > 0 && (self.passing_over || too_many || age > LATEST);
         if self.passing_over {
             self.statistics.passed_over += 1;
-            self.outputs.record(heard.at, Payload::OperatingPoint(heard.message));
+            self.outputs.record(received.at, Payload::OperatingPoint(received.message));
             return;
         }
-        let point = conditions(&heard.message);
+        let point = conditions(&received.message);
         let worked_before = self.session.counters().worked();
-        self.step(Event::Input(heard.message.clone()), Some(heard));
+        self.step(Event::Input(received.message.clone()), Some(received));
         let took = Duration::from_nanos(clock::monotonic_ns().saturating_sub(started));
         self.statistics.predicted(took);
         self.sensitivity_due(point);
@@ -302,13 +302,14 @@ impl Node {
 
     /// Shows and records a measured vibration. The session does not get it, so predictions are the same with and
     /// without.
-    fn vibration(&mut self, heard: Heard<msgs::Vibration>) {
+    fn vibration(&mut self, received: Received<msgs::Vibration>) {
         // A vibration has no sequence number. The copies that come over both buses have the same stamp and the same
         // frequency bit by bit.
-        let vibration = heard.message;
-        if self.vibration_heard_before.is_new(heard.bus, vibration.header.stamp, vibration.frequency_hz.to_bits()) {
-            self.watch.vibration(heard.at.wall_ns, &vibration);
-            self.outputs.record(heard.at, Payload::Vibration(vibration));
+        let vibration = received.message;
+        if self.vibration_received_before.is_new(received.bus, vibration.header.stamp, vibration.frequency_hz.to_bits())
+        {
+            self.watch.vibration(received.at.wall_ns, &vibration);
+            self.outputs.record(received.at, Payload::Vibration(vibration));
         }
     }
 
@@ -400,7 +401,7 @@ impl Node {
     /// When the current silence exceeds its timeout; `None` before the first input and once the silence is published.
     fn silence_deadline(&self) -> Option<Instant> {
         let timeout = Duration::try_from_secs_f64(self.session.settings().silence_timeout_s).ok()?;
-        self.last_heard.filter(|_| !self.silent)?.checked_add(timeout)
+        self.last_received.filter(|_| !self.silent)?.checked_add(timeout)
     }
 
     fn silence(&mut self) {
@@ -420,15 +421,15 @@ impl Node {
 
     /// Feeds an event to the session; `input` is the received message if the event is one. The prediction is first sent
     /// over shared memory, since a reader waits for it there. Then input and prediction are recorded, in this order.
-    fn step(&mut self, event: Event, input: Option<Heard<msgs::OperatingPoint>>) {
+    fn step(&mut self, event: Event, input: Option<Received<msgs::OperatingPoint>>) {
         match self.session.step(event) {
             Ok(effects) => {
                 if let Some(prediction) = effects.publish {
                     self.statistics.published(prediction.level);
                     self.outputs.prediction_to_shm(prediction);
-                    if let Some(heard) = input {
-                        self.watch.input(&heard.message);
-                        self.outputs.record(heard.at, Payload::OperatingPoint(heard.message));
+                    if let Some(received) = input {
+                        self.watch.input(&received.message);
+                        self.outputs.record(received.at, Payload::OperatingPoint(received.message));
                     }
                     self.outputs.prediction(prediction);
                     self.watch.prediction(prediction);
@@ -550,24 +551,24 @@ mod tests {
 
     #[test]
     fn a_bus_may_repeat_itself_but_not_another() {
-        let mut heard = Remembered::new(4);
+        let mut received = Remembered::new(4);
         let stamp = Time::from_ns(1);
-        assert!(heard.is_new(Bus::Shm, stamp, 1));
-        assert!(!heard.is_new(Bus::Ros2, stamp, 1), "answered over shared memory already");
-        assert!(heard.is_new(Bus::Shm, stamp, 1), "a recording played again");
-        assert!(!heard.is_new(Bus::Ros2, stamp, 1));
+        assert!(received.is_new(Bus::Shm, stamp, 1));
+        assert!(!received.is_new(Bus::Ros2, stamp, 1), "answered over shared memory already");
+        assert!(received.is_new(Bus::Shm, stamp, 1), "a recording played again");
+        assert!(!received.is_new(Bus::Ros2, stamp, 1));
     }
 
     #[test]
     fn old_inputs_are_forgotten_and_their_memory_reused() {
-        let mut heard = Remembered::new(100);
-        let room = (heard.bus.capacity(), heard.order.capacity());
+        let mut received = Remembered::new(100);
+        let room = (received.bus.capacity(), received.order.capacity());
         for seq in 0..100_000 {
-            assert!(heard.is_new(Bus::Shm, Time::from_ns(0), seq));
-            assert_eq!(seq >= 100, heard.is_new(Bus::Ros2, Time::from_ns(0), seq.saturating_sub(100)), "{seq}");
+            assert!(received.is_new(Bus::Shm, Time::from_ns(0), seq));
+            assert_eq!(seq >= 100, received.is_new(Bus::Ros2, Time::from_ns(0), seq.saturating_sub(100)), "{seq}");
         }
         // Slots of removed entries reduce the capacity that a map reports.
-        assert!(heard.bus.capacity() <= room.0 && heard.order.capacity() == room.1);
+        assert!(received.bus.capacity() <= room.0 && received.order.capacity() == room.1);
     }
 
     #[test]
@@ -585,7 +586,7 @@ mod tests {
                 friction_coefficient: 0.3 + 1e-6 * seq as f64,
             };
             for bus in [Bus::Ros2, Bus::Shm] {
-                sender.try_send(Incoming::Input(Heard::now(bus, message.clone()))).expect("room");
+                sender.try_send(Incoming::Input(Received::now(bus, message.clone()))).expect("room");
             }
         }
         sender.try_send(Incoming::Stop).expect("room");
@@ -624,7 +625,7 @@ mod tests {
                 disc_speed_rad_s,
                 friction_coefficient: 0.3 + 1e-6 * seq as f64,
             };
-            assert!(shortcut.input(Heard::now(Bus::Shm, message), seq % 7 == 0));
+            assert!(shortcut.input(Received::now(Bus::Shm, message), seq % 7 == 0));
             seq += 1;
             at_once += u32::from(watch.snapshot().prediction.is_some_and(|answer| answer.input_seq == seq - 1));
             // Only a few inputs wait, so that none is passed over. Now and then none waits, so that the next can be
@@ -684,7 +685,7 @@ mod tests {
                 disc_speed_rad_s: 13.0,
                 friction_coefficient: 0.2,
             };
-            sender.send(Incoming::Input(Heard::now(Bus::Shm, point))).expect("it runs");
+            sender.send(Incoming::Input(Received::now(Bus::Shm, point))).expect("it runs");
         };
         // Several times the silence timeout.
         std::thread::sleep(Duration::from_millis(200));
@@ -703,7 +704,7 @@ mod tests {
     fn old_inputs_are_passed_over_but_for_the_newest() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
         let (sender, receiver) = channel();
-        let mut old = Heard::now(Bus::Shm, msgs::OperatingPoint::default());
+        let mut old = Received::now(Bus::Shm, msgs::OperatingPoint::default());
         while clock::monotonic_ns().saturating_sub(old.at.monotonic_ns) <= LATEST.as_nanos() as u64 {
             std::thread::sleep(Duration::from_millis(10));
         }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
-use crate::bus::heard::Counts;
+use crate::bus::received::Counts;
 use crate::bus::ros2::NODE_NAME;
 use crate::bus::ros2::process::{Health, Ros2Process};
 use crate::bus::shm::{ShmInput, ShmOutput, ShmSensitivity, ShmVibrationInput};

@@ -81,7 +81,7 @@ fn conditions(seq: u64) -> msgs::OperatingPoint {
 }
 
 fn heard_now(seq: u64) -> Incoming {
-    Incoming::Input(Heard::now(Bus::Shm, conditions(seq)))
+    Incoming::Input(Received::now(Bus::Shm, conditions(seq)))
 }
 
 fn inputs(recorded: &[Payload]) -> Vec<u64> {
@@ -124,9 +124,9 @@ fn inputs_that_waited_too_long_are_passed_over_and_recorded() {
         std::thread::sleep(Duration::from_millis(10));
     }
     let aged = |seq, age: Duration| {
-        let mut heard = Heard::now(Bus::Shm, conditions(seq));
-        heard.at.monotonic_ns -= age.as_nanos() as u64;
-        Incoming::Input(heard)
+        let mut received = Received::now(Bus::Shm, conditions(seq));
+        received.at.monotonic_ns -= age.as_nanos() as u64;
+        Incoming::Input(received)
     };
     let old = |seq| aged(seq, LATEST + LATEST / 10);
     let node = Recorded9Dof::start(|_| (), vec![old(0), old(1), old(2)]);

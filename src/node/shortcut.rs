@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use crossbeam_channel::Sender;
 
 use super::{Incoming, Node};
-use crate::bus::heard::Heard;
+use crate::bus::received::Received;
 use crate::msgs;
 
 /// Holds the node while it runs; whoever has the lock may use it.
@@ -35,18 +35,18 @@ impl Shortcut {
     /// Predicts for an input on this thread if it needs no dense solve, the node is idle, and no input waits in the
     /// channel or on the bus (`more_waits`). Otherwise queues it. Never blocks. False if the channel is full and the
     /// input is lost.
-    pub fn input(&self, heard: Heard<msgs::OperatingPoint>, more_waits: bool) -> bool {
+    pub fn input(&self, received: Received<msgs::OperatingPoint>, more_waits: bool) -> bool {
         // Items are only taken out of the channel under this lock. If the channel is empty here, no input can be
         // overtaken.
         if !more_waits
             && let Ok(mut place) = self.place.0.try_lock()
             && self.queue.is_empty()
             && let Some(node) = place.as_mut()
-            && node.answers_at_once(&heard.message)
+            && node.answers_at_once(&received.message)
         {
-            node.answer(heard);
+            node.answer(received);
             return true;
         }
-        self.queue.try_send(Incoming::Input(heard)).is_ok()
+        self.queue.try_send(Incoming::Input(received)).is_ok()
     }
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::Outputs;
 use super::status::{Inputs, Status};
-use crate::bus::heard::{Bus, Counts};
+use crate::bus::received::{Bus, Counts};
 use crate::msgs::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
 use crate::physics::Chart;
 use crate::recording::recorder::State;
@@ -22,9 +22,9 @@ mod diagnostic_level {
 /// Counts since the start, and prediction times since the last report.
 #[derive(Default)]
 pub struct Statistics {
-    heard_shm: u64,
-    heard_ros2: u64,
-    heard_simulator: u64,
+    received_shm: u64,
+    received_ros2: u64,
+    received_simulator: u64,
     pub duplicates: u64,
     pub passed_over: u64,
     pub maps: u64,
@@ -94,12 +94,12 @@ impl Lost {
 }
 
 impl Statistics {
-    pub fn heard(&mut self, bus: Bus) {
+    pub fn received(&mut self, bus: Bus) {
         self.inputs.came();
         match bus {
-            Bus::Shm => self.heard_shm += 1,
-            Bus::Ros2 => self.heard_ros2 += 1,
-            Bus::Simulator => self.heard_simulator += 1,
+            Bus::Shm => self.received_shm += 1,
+            Bus::Ros2 => self.received_ros2 += 1,
+            Bus::Simulator => self.received_simulator += 1,
         }
     }
 
@@ -181,9 +181,9 @@ impl Statistics {
             self.times.get(index).map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)
         };
         let mut values = vec![
-            pair("inputs_from_shm", self.heard_shm),
-            pair("inputs_from_ros2", self.heard_ros2),
-            pair("inputs_from_simulator", self.heard_simulator),
+            pair("inputs_from_shm", self.received_shm),
+            pair("inputs_from_ros2", self.received_ros2),
+            pair("inputs_from_simulator", self.received_simulator),
             pair("inputs_twice", self.duplicates),
             pair("inputs_passed_over", self.passed_over),
             pair("inputs_lost", outputs.lost_inputs.load(Ordering::Relaxed)),
@@ -291,7 +291,7 @@ mod tests {
             (level::SQUEAL, diagnostic_level::WARN, "SQUEAL"),
             (level::FAULT, diagnostic_level::ERROR, "FAULT"),
         ] {
-            reporter.statistics.heard(Bus::Shm);
+            reporter.statistics.received(Bus::Shm);
             reporter.statistics.published(level);
             assert_eq!(reporter.report(), (expected, name.to_owned()));
         }
@@ -303,7 +303,7 @@ mod tests {
     #[test]
     fn losses_and_failures_raise_the_level_once() {
         let mut reporter = Reporter::new();
-        reporter.statistics.heard(Bus::Ros2);
+        reporter.statistics.received(Bus::Ros2);
         reporter.statistics.published(level::OK);
         let quiet = (diagnostic_level::OK, "OK".to_owned());
         assert_eq!(reporter.report(), quiet);
@@ -322,7 +322,7 @@ mod tests {
     #[test]
     fn what_a_bus_missed_or_could_not_read_is_a_loss() {
         let lost = |missed, malformed, failures| Lost {
-            buses: vec![("ros2", Counts { heard: 9, missed, malformed, failures, incompatible: 0 })],
+            buses: vec![("ros2", Counts { received: 9, missed, malformed, failures, incompatible: 0 })],
             ..Lost::default()
         };
         let words = lost(4, 2, 1).since(&lost(1, 1, 0));

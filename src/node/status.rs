@@ -28,14 +28,14 @@ pub enum Status {
 /// Whether inputs arrive.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Inputs {
-    heard: bool,
+    received: bool,
     silent: bool,
 }
 
 impl Inputs {
     /// Takes note of an input.
     pub fn came(&mut self) {
-        *self = Self { heard: true, silent: false };
+        *self = Self { received: true, silent: false };
     }
 
     /// Takes note of a silence.
@@ -45,7 +45,7 @@ impl Inputs {
 
     /// Takes note of a prediction. Unless a silence was noted, it implies an input, even if that was not seen.
     pub fn predicted(&mut self) {
-        self.heard |= !self.silent;
+        self.received |= !self.silent;
     }
 }
 
@@ -56,8 +56,8 @@ impl Status {
     /// The status for the latest prediction's `level`; `None` before the first prediction.
     pub fn new(level: Option<u8>, inputs: Inputs) -> Self {
         match (level, inputs) {
-            (None, _) | (_, Inputs { heard: false, silent: true }) => Self::Waiting,
-            (_, Inputs { heard: true, silent: true }) => Self::NoData,
+            (None, _) | (_, Inputs { received: false, silent: true }) => Self::Waiting,
+            (_, Inputs { received: true, silent: true }) => Self::NoData,
             (Some(level::OK), _) => Self::Ok,
             (Some(level::WARN), _) => Self::Warn,
             (Some(level::SQUEAL), _) => Self::Squeal,
@@ -248,18 +248,18 @@ mod tests {
     use crate::rig::Rig;
     use crate::session::map_options;
 
-    fn inputs(heard: bool, silent: bool) -> Inputs {
-        Inputs { heard, silent }
+    fn inputs(received: bool, silent: bool) -> Inputs {
+        Inputs { received, silent }
     }
 
     #[test]
     fn silence_is_not_a_fault_and_each_level_has_its_own_status() {
-        let heard = inputs(true, false);
-        let of = |level| Status::new(Some(level), heard);
+        let received = inputs(true, false);
+        let of = |level| Status::new(Some(level), received);
         let levels = [level::OK, level::WARN, level::SQUEAL, level::FAULT];
         assert_eq!(levels.map(of), [Status::Ok, Status::Warn, Status::Squeal, Status::Fault]);
         assert_eq!(Status::new(None, Inputs::default()), Status::Waiting);
-        assert_eq!(Status::new(None, heard), Status::Waiting, "heard, not predicted yet");
+        assert_eq!(Status::new(None, received), Status::Waiting, "received, not predicted yet");
         assert_eq!(Status::new(Some(level::FAULT), inputs(false, true)), Status::Waiting);
         assert_eq!(Status::new(Some(level::FAULT), inputs(true, true)), Status::NoData);
     }

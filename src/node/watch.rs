@@ -18,7 +18,7 @@ pub struct Snapshot {
     pub input: Option<OperatingPoint>,
     pub prediction: Option<Prediction>,
     /// When the last input was received.
-    pub heard: Option<Instant>,
+    pub received: Option<Instant>,
     /// Whether inputs arrive.
     pub inputs: Inputs,
     pub map: Option<Arc<StabilityMap>>,
@@ -193,7 +193,7 @@ impl Watch {
     /// Takes note of an input.
     pub fn input(&self, input: &OperatingPoint) {
         self.with(|watched| {
-            watched.snapshot.heard = Some(Instant::now());
+            watched.snapshot.received = Some(Instant::now());
             watched.input = Some(input.clone());
             watched.is_new = true;
         });

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use crate::bus::{PATIENCE, answer, into, next, point, shm, wait_until};
 use crate::domain::Domain;
 use crossbeam_channel::unbounded;
-use squealcast::bus::heard::{Bus, Heard};
+use squealcast::bus::received::{Bus, Received};
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::bus::shm::{
@@ -65,9 +65,9 @@ fn shared_memory_carries_both_ways() {
     let (points, heard_points) = unbounded();
     let (predictions, heard_predictions) = unbounded();
     let answering = Arc::clone(&output);
-    let input = ShmInput::spawn(&options, move |heard: Heard<OperatingPoint>| {
-        answering.lock().expect("whole").publish(&answer(&heard.message)).expect("published");
-        points.send(heard).expect("test is there");
+    let input = ShmInput::spawn(&options, move |received: Received<OperatingPoint>| {
+        answering.lock().expect("whole").publish(&answer(&received.message)).expect("published");
+        points.send(received).expect("test is there");
     })
     .expect("input");
     let sink = ShmSink::spawn(&options, into(predictions)).expect("sink");
@@ -82,7 +82,7 @@ fn shared_memory_carries_both_ways() {
         assert_eq!(next(&heard_points).message, point(seq));
     }
     for counts in [input.counts(), sink.counts()] {
-        assert_eq!((counts.heard, counts.missed, counts.malformed, counts.failures), (1000, 0, 0, 0));
+        assert_eq!((counts.received, counts.missed, counts.malformed, counts.failures), (1000, 0, 0, 0));
     }
     let stopping = Instant::now();
     input.stop();
@@ -96,9 +96,9 @@ fn a_slow_shared_memory_reader_counts_lost_messages() {
     const WAITING: u64 = OperatingPointForm::WAITING_SAMPLES as u64;
     const COUNT: u64 = 2 * WAITING;
     let options = shm("slow");
-    let (sender, heard) = unbounded();
+    let (sender, received) = unbounded();
     let (gate, opened) = unbounded::<()>();
-    let input = ShmInput::spawn(&options, move |point: Heard<OperatingPoint>| {
+    let input = ShmInput::spawn(&options, move |point: Received<OperatingPoint>| {
         if point.message.seq == 0 {
             let _ = opened.recv();
         }
@@ -115,8 +115,8 @@ fn a_slow_shared_memory_reader_counts_lost_messages() {
     }
     assert!(publishing.elapsed() < PATIENCE, "a writer does not wait for readers");
     drop(gate);
-    wait_until("the newest", || input.counts().heard + input.counts().missed == COUNT);
-    let seqs: Vec<u64> = heard.try_iter().map(|heard| heard.message.seq).collect();
+    wait_until("the newest", || input.counts().received + input.counts().missed == COUNT);
+    let seqs: Vec<u64> = received.try_iter().map(|received| received.message.seq).collect();
     assert_eq!(seqs.last(), Some(&(COUNT - 1)), "the oldest are lost, not the newest");
     assert!(input.counts().missed >= COUNT - WAITING - 1, "{:?}", input.counts());
 }
@@ -128,11 +128,11 @@ fn a_late_shared_memory_reader_gets_the_latest() {
     for seq in 0..100 {
         source.publish(&point(seq)).expect("published");
     }
-    let (sender, heard) = unbounded();
+    let (sender, received) = unbounded();
     let _input = ShmInput::spawn(&options, into(sender)).expect("input");
     // iceoryx2 delivers history when the writer next looks at its readers.
     source.publish(&point(100)).expect("published");
-    let seqs: Vec<u64> = (0..17).map(|_| next(&heard).message.seq).collect();
+    let seqs: Vec<u64> = (0..17).map(|_| next(&received).message.seq).collect();
     assert_eq!(seqs, (84..=100).collect::<Vec<_>>());
 }
 
@@ -156,11 +156,11 @@ fn services_with_other_settings_are_taken_as_they_are() {
         .expect("topic");
     let _event = node.service_builder(&name).event().max_listeners(1).max_notifiers(1).create().expect("event");
 
-    let (sender, heard) = unbounded();
+    let (sender, received) = unbounded();
     let _input = ShmInput::spawn(&options, into(sender)).expect("input");
     let source = ShmSource::new(&options).expect("source");
     source.publish(&point(7)).expect("published");
-    assert_eq!(next(&heard).message, point(7));
+    assert_eq!(next(&received).message, point(7));
     assert!(ShmSource::new(&options).is_err(), "its limits are respected, as an error");
     let publishing = Instant::now();
     for seq in 8..1000 {
@@ -188,13 +188,13 @@ fn a_file_prefix_keeps_strangers_apart() {
     let options = shm("apart");
     // The same in every run: iceoryx2 leaves one small file per prefix.
     let apart = ShmOptions { file_prefix: Some("squealcast_test_".to_owned()), ..options.clone() };
-    let (sender, heard) = unbounded();
+    let (sender, received) = unbounded();
     let _input = ShmInput::spawn(&apart, into(sender)).expect("input");
     assert_eq!(ShmSource::new(&options).expect("stranger").publish(&point(1)).expect("published"), 0);
     // It stays: what a writer leaves behind that nobody has connected to yet goes with it.
     let source = ShmSource::new(&apart).expect("source");
     assert_eq!(source.publish(&point(2)).expect("published"), 1);
-    assert_eq!(next(&heard).message, point(2));
+    assert_eq!(next(&received).message, point(2));
     let bad = ShmOptions { file_prefix: Some("a/b".to_owned()), ..options };
     assert!(ShmSource::new(&bad).is_err());
 }
@@ -202,21 +202,21 @@ fn a_file_prefix_keeps_strangers_apart() {
 #[test]
 fn shared_memory_outlives_killed_peers() {
     let options = shm("killed");
-    let (sender, heard) = unbounded();
+    let (sender, received) = unbounded();
     let input = ShmInput::spawn(&options, into(sender)).expect("input");
     let output = ShmOutput::new(&options).expect("output");
     // More peers one after another than the service has room for at once: the dead make room.
     for _ in 0..10 {
         let peer = spawn_peer("peer_on_shared_memory", "SQUEALCAST_TEST_SHM", &options.service_prefix);
-        let first = next(&heard).message;
+        let first = next(&received).message;
         output.publish(&answer(&first)).expect("published");
         drop(peer);
-        while heard.try_recv().is_ok() {}
+        while received.try_recv().is_ok() {}
         output.publish(&answer(&first)).expect("published after the reader was killed");
     }
     let source = ShmSource::new(&options).expect("source");
     source.publish(&point(u64::MAX)).expect("published");
-    while next(&heard).message.seq != u64::MAX {}
+    while next(&received).message.seq != u64::MAX {}
     assert_eq!(input.counts().malformed, 0);
 }
 
@@ -234,11 +234,11 @@ fn peer_on_shared_memory() {
 }
 
 fn echoing_node(options: &Ros2Options, parameters: Parameters) -> Arc<Ros2> {
-    let (points, heard) = unbounded();
+    let (points, received) = unbounded();
     let ros = Arc::new(Ros2::start(options, parameters, into(points), |_| ()).expect("node"));
     let computing = Arc::downgrade(&ros);
     thread::spawn(move || {
-        for point in heard {
+        for point in received {
             let Some(ros) = computing.upgrade() else { return };
             ros.publish_prediction(&answer(&point.message)).expect("published");
         }
@@ -251,7 +251,7 @@ fn ros2_carries_both_ways() {
     let domain = Domain::claim();
     let options = ros_options(&domain);
     let ros = echoing_node(&options, Parameters::none());
-    let (predictions, heard) = unbounded();
+    let (predictions, received) = unbounded();
     let source = Ros2Source::start(&options, into(predictions)).expect("source");
     wait_until("discovery", || {
         source.readers() == READERS
@@ -261,11 +261,11 @@ fn ros2_carries_both_ways() {
     });
     for seq in 0..500 {
         source.publish(&point(seq)).expect("published");
-        let prediction = next(&heard);
+        let prediction = next(&received);
         assert_eq!((prediction.bus, prediction.message), (Bus::Ros2, answer(&point(seq))));
     }
     for counts in [source.counts(), ros.counts()] {
-        assert_eq!((counts.heard, counts.missed, counts.malformed, counts.failures), (500, 0, 0, 0));
+        assert_eq!((counts.received, counts.missed, counts.malformed, counts.failures), (500, 0, 0, 0));
     }
     let stopping = Instant::now();
     source.stop();
@@ -280,15 +280,15 @@ fn vibration(k: u64) -> Vibration {
 #[test]
 fn both_buses_carry_vibration_and_conditions() {
     let options = shm("vibration");
-    let (vibrations, heard) = unbounded();
+    let (vibrations, received) = unbounded();
     let input = ShmVibrationInput::spawn(&options, into(vibrations.clone())).expect("input");
     let source = ShmVibrationSource::new(&options).expect("source");
     for k in 0..100 {
         source.publish(&vibration(k)).expect("published");
-        let found = next(&heard);
+        let found = next(&received);
         assert_eq!((found.bus, found.message), (Bus::Shm, vibration(k)));
     }
-    assert_eq!((input.counts().heard, input.counts().missed), (100, 0), "it has no numbers to miss");
+    assert_eq!((input.counts().received, input.counts().missed), (100, 0), "it has no numbers to miss");
 
     let domain = Domain::claim();
     let options = ros_options(&domain);
@@ -301,11 +301,11 @@ fn both_buses_carry_vibration_and_conditions() {
     for k in 0..100 {
         source.publish_vibration(&vibration(k)).expect("published");
         source.publish(&point(k)).expect("published");
-        let found = next(&heard);
+        let found = next(&received);
         assert_eq!((found.bus, found.message), (Bus::Ros2, vibration(k)));
         assert_eq!(next(&heard_points).message, point(k));
     }
-    assert_eq!(ros.counts().heard, 100, "the vibration is no input");
+    assert_eq!(ros.counts().received, 100, "the vibration is no input");
 }
 
 #[test]
@@ -314,7 +314,7 @@ fn ros2_names_are_remapped() {
     let (args, _) = RosArgs::split(args.split(' ').map(str::to_owned)).expect("well formed");
     let domain = Domain::claim();
     let node_options = Ros2Options { args: args.clone(), ..ros_options(&domain) };
-    let (points, heard) = unbounded();
+    let (points, received) = unbounded();
     let ros = Ros2::start(&node_options, Parameters::none(), into(points), |_| ()).expect("node");
     assert_eq!(ros.full_name(), "/cells/left");
     let args = "--ros-args -r /rig/operating_point:=/cells/point";
@@ -322,7 +322,7 @@ fn ros2_names_are_remapped() {
     let source = Ros2Source::start(&Ros2Options { args, ..ros_options(&domain) }, |_| ()).expect("source");
     wait_until("discovery", || source.readers() == READERS && ros.operating_point_writers() == 1);
     source.publish(&point(3)).expect("published");
-    assert_eq!(next(&heard).message, point(3));
+    assert_eq!(next(&received).message, point(3));
 }
 
 /// Two rigs, each with its node, in one domain.
@@ -333,24 +333,24 @@ fn namespaces_separate_nodes() {
         let args = ["--ros-args".to_owned(), "-r".to_owned(), format!("__ns:=/{cell}")];
         let (args, _) = RosArgs::split(args).expect("well formed");
         let options = Ros2Options { args, ..ros_options(&domain) };
-        let (predictions, heard) = unbounded();
+        let (predictions, received) = unbounded();
         let ros = echoing_node(&options, Parameters::none());
         assert_eq!(ros.full_name(), format!("/{cell}/squealcast"));
-        (ros, Ros2Source::start(&options, into(predictions)).expect("source"), heard)
+        (ros, Ros2Source::start(&options, into(predictions)).expect("source"), received)
     });
     wait_until("discovery", || {
         cells.iter().all(|(ros, source, _)| {
             source.readers() == READERS && source.prediction_writers() == 1 && ros.prediction_readers() > 0
         }) && cells.iter().all(|(ros, ..)| ros.operating_point_writers() == 1)
     });
-    for (first, (_, source, heard)) in (0..).step_by(1000).zip(&cells) {
+    for (first, (_, source, received)) in (0..).step_by(1000).zip(&cells) {
         for seq in first..first + 100 {
             source.publish(&point(seq)).expect("published");
-            assert_eq!(next(heard).message, answer(&point(seq)));
+            assert_eq!(next(received).message, answer(&point(seq)));
         }
     }
-    for (ros, source, heard) in &cells {
-        assert_eq!((ros.counts().heard, source.counts().heard, heard.len()), (100, 100, 0));
+    for (ros, source, received) in &cells {
+        assert_eq!((ros.counts().received, source.counts().received, received.len()), (100, 100, 0));
     }
 }
 
@@ -360,9 +360,9 @@ fn reliable_inputs_that_wait_are_not_lost() {
     const COUNT: u64 = 6000; // 2 kHz for 3 s, the default time between heartbeats of Fast DDS
     let domain = Domain::claim();
     let options = ros_options(&domain);
-    let (sender, heard) = unbounded();
+    let (sender, received) = unbounded();
     let (gate, opened) = unbounded::<()>();
-    let sink = move |point: Heard<OperatingPoint>| {
+    let sink = move |point: Received<OperatingPoint>| {
         if point.message.seq == 0 {
             let _ = opened.recv();
         }
@@ -380,9 +380,9 @@ fn reliable_inputs_that_wait_are_not_lost() {
     }
     drop(gate);
     for seq in 0..COUNT {
-        assert_eq!(heard.recv_timeout(PATIENCE).expect("heard in time"), seq);
+        assert_eq!(received.recv_timeout(PATIENCE).expect("received in time"), seq);
     }
-    assert_eq!((ros.counts().heard, ros.counts().missed), (COUNT, 0));
+    assert_eq!((ros.counts().received, ros.counts().missed), (COUNT, 0));
 }
 
 /// Another node in a domain, made with the library underneath; it spins.
@@ -406,7 +406,7 @@ fn best_effort_and_reliable_publishers_are_received_once() {
     const COUNT: u64 = 500;
     let domain = Domain::claim();
     let options = ros_options(&domain);
-    let (points, heard) = unbounded();
+    let (points, received) = unbounded();
     let ros = Ros2::start(&options, Parameters::none(), into(points), |_| ()).expect("node");
     let (mut node, _runtime) = foreign_node(&domain, "driver");
     let profile = QosProfile::publisher_default().reliability(qos::Reliability::BestEffort);
@@ -425,7 +425,7 @@ fn best_effort_and_reliable_publishers_are_received_once() {
     let mut reliable = Vec::new();
     let mut best_effort = std::collections::BTreeSet::new();
     while reliable.len() < COUNT as usize || !best_effort.contains(&(2 * COUNT - 1)) {
-        let seq = next(&heard).message.seq;
+        let seq = next(&received).message.seq;
         if seq < COUNT {
             reliable.push(seq);
         } else {
@@ -492,14 +492,14 @@ fn a_late_ros2_reader_gets_the_rig() {
         .expect("topic");
     let subscription = node.create_subscription::<RigInfo>(&topic, None).expect("subscription");
     let started = Instant::now();
-    let heard = loop {
+    let received = loop {
         if let Some((message, _)) = subscription.take().expect("taken") {
             break message;
         }
-        assert!(started.elapsed() < PATIENCE, "no rig heard");
+        assert!(started.elapsed() < PATIENCE, "no rig received");
         thread::sleep(Duration::from_millis(10));
     };
-    assert_eq!(heard, rig);
+    assert_eq!(received, rig);
 }
 
 #[test]
@@ -616,7 +616,7 @@ fn malformed_ros2_samples_are_counted() {
     use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, qos};
     let domain = Domain::claim();
     let options = ros_options(&domain);
-    let (points, heard) = unbounded();
+    let (points, received) = unbounded();
     let ros = Ros2::start(&options, Parameters::none(), into(points), |_| ()).expect("node");
     let participant = rustdds::DomainParticipantBuilder::new(options.domain_id)
         .with_only_networks([std::net::Ipv4Addr::LOCALHOST])
@@ -640,7 +640,7 @@ fn malformed_ros2_samples_are_counted() {
         ros.counts().malformed > 0
     });
     source.publish(&point(1)).expect("published");
-    assert_eq!(next(&heard).message, point(1));
+    assert_eq!(next(&received).message, point(1));
 }
 
 #[test]
@@ -650,20 +650,20 @@ fn ros2_outlives_killed_peers() {
     let ros = echoing_node(&options, Parameters::none());
     for seq in 0..2 {
         let peer = spawn_peer("peer_on_ros2", "SQUEALCAST_TEST_DOMAIN", &options.domain_id.to_string());
-        let before = ros.counts().heard;
-        wait_until("the peer", || ros.counts().heard > before + 10);
+        let before = ros.counts().received;
+        wait_until("the peer", || ros.counts().received > before + 10);
         drop(peer);
         // The dead reader still counts and answers nothing; more than RustDDS itself would hold for it.
         for _ in 0..10_000 {
             ros.publish_prediction(&Prediction::default()).expect("published for a killed reader");
         }
-        let (predictions, heard) = unbounded();
+        let (predictions, received) = unbounded();
         let source = Ros2Source::start(&options, into(predictions)).expect("source");
         wait_until("discovery", || source.readers() == READERS && source.prediction_writers() == 1);
         let started = Instant::now();
         loop {
             source.publish(&point(seq)).expect("published");
-            match heard.recv_timeout(Duration::from_millis(100)) {
+            match received.recv_timeout(Duration::from_millis(100)) {
                 Ok(prediction) if prediction.message == answer(&point(seq)) => break,
                 _ => assert!(started.elapsed() < PATIENCE, "no answer after a peer was killed"),
             }

@@ -19,7 +19,7 @@ use crate::domain::Domain;
 use crate::program::{self, PATIENCE, cache_folder, promised, until as wait_until};
 use crossbeam_channel::{Receiver, unbounded};
 use serde_json::Value;
-use squealcast::bus::heard::Heard;
+use squealcast::bus::received::Received;
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::{Ros2Options, Ros2Source};
 use squealcast::bus::shm::{ShmOptions, ShmSink, ShmSource, ShmVibrationSource};
@@ -443,8 +443,8 @@ fn nothing_is_lost_over_a_bad_link(ros: &str) {
         .stdout(Stdio::piped())
         .spawn();
     let mut listener = Killed(listener.expect("started"));
-    let mut heard = BufReader::new(listener.0.stdout.take().expect("piped")).lines();
-    assert_eq!(heard.next().expect("a line").expect("read"), "listening");
+    let mut received = BufReader::new(listener.0.stdout.take().expect("piped")).lines();
+    assert_eq!(received.next().expect("a line").expect("read"), "listening");
 
     let seconds = (COUNT / 500).to_string();
     let pace = ["--rate", "500", "--seconds", &seconds, "--depth", "20000", "--settle", "3", "--drain", "30"];
@@ -457,14 +457,14 @@ fn nothing_is_lost_over_a_bad_link(ros: &str) {
         &[&["--domain", &domain], &pace[..], &only].concat(),
     );
     drop(listener.0.stdin.take());
-    let heard: Value = serde_json::from_str(&heard.next().expect("a line").expect("read")).expect("its account");
+    let received: Value = serde_json::from_str(&received.next().expect("a line").expect("read")).expect("its account");
     node.interrupt();
 
     let content = Content::read(&node.recording());
     let seqs: HashSet<u64> = content.inputs.iter().map(|input| input.seq).collect();
     say(&format!(
         "bad link: {} of {COUNT} inputs recorded, {} missed, {} passed over, {} answered, first answer after {} s, {} silences; \
-         rclpy beside the node: {heard}",
+         rclpy beside the node: {received}",
         seqs.len(),
         content.count("ros2_missed"),
         content.count("inputs_passed_over"),
@@ -527,12 +527,12 @@ fn what_comes_over_both_buses_is_answered_once() {
     let (on_ros, heard_on_ros) = unbounded();
     let (on_shm, heard_on_shm) = unbounded();
     let options = Ros2Options::new(Some(node.domain.id), true, RosArgs::default()).expect("valid");
-    let ros =
-        Ros2Source::start(&options, move |heard: Heard<Prediction>| drop(on_ros.send(heard.message))).expect("joined");
+    let ros = Ros2Source::start(&options, move |received: Received<Prediction>| drop(on_ros.send(received.message)))
+        .expect("joined");
     let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
     let shm = ShmSource::new(&options).expect("joined");
-    let _sink =
-        ShmSink::spawn(&options, move |heard: Heard<Prediction>| drop(on_shm.send(heard.message))).expect("joined");
+    let _sink = ShmSink::spawn(&options, move |received: Received<Prediction>| drop(on_shm.send(received.message)))
+        .expect("joined");
     wait_until("discovery", || ros.readers() > 0 && ros.prediction_writers() == 1);
     // The node's own discovery of us is not to be seen from here: until it is there, inputs of another kind.
     let mut seq = COUNT;
@@ -555,15 +555,15 @@ fn what_comes_over_both_buses_is_answered_once() {
         }
         thread::sleep(Duration::from_millis(2));
     }
-    for (bus, heard) in [("ROS 2", &heard_on_ros), ("shared memory", &heard_on_shm)] {
-        let answered = collect(heard, COUNT);
+    for (bus, received) in [("ROS 2", &heard_on_ros), ("shared memory", &heard_on_shm)] {
+        let answered = collect(received, COUNT);
         assert_eq!(answered.len() as u64, COUNT, "answered over {bus}");
         assert!(answered.values().all(|&count| count == 1), "over {bus}: {answered:?}");
     }
     node.interrupt();
     // Nothing came twice, late: the node has ended.
-    for heard in [&heard_on_ros, &heard_on_shm] {
-        assert!(!heard.try_iter().any(|prediction| answers(&prediction, COUNT)));
+    for received in [&heard_on_ros, &heard_on_shm] {
+        assert!(!received.try_iter().any(|prediction| answers(&prediction, COUNT)));
     }
     let content = Content::read(&node.recording());
     assert_eq!(content.inputs.iter().filter(|input| input.seq < COUNT).count() as u64, COUNT);
@@ -581,8 +581,8 @@ fn a_vibration_over_both_buses_is_recorded_once_and_read_by_others() {
     let mut node = Node::start(RIG, true);
     let (on_ros, heard_on_ros) = unbounded();
     let options = Ros2Options::new(Some(node.domain.id), true, RosArgs::default()).expect("valid");
-    let ros =
-        Ros2Source::start(&options, move |heard: Heard<Prediction>| drop(on_ros.send(heard.message))).expect("joined");
+    let ros = Ros2Source::start(&options, move |received: Received<Prediction>| drop(on_ros.send(received.message)))
+        .expect("joined");
     let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
     let shm = ShmVibrationSource::new(&options).expect("joined");
     wait_until("discovery", || ros.readers() > 0 && ros.vibration_readers() > 0);
@@ -642,10 +642,10 @@ fn answers(prediction: &Prediction, count: u64) -> bool {
 }
 
 /// How often each of the first `count` sequence numbers is answered, until all are.
-fn collect(heard: &Receiver<Prediction>, count: u64) -> HashMap<u64, u32> {
+fn collect(received: &Receiver<Prediction>, count: u64) -> HashMap<u64, u32> {
     let mut answered = HashMap::new();
     while (answered.len() as u64) < count {
-        let Ok(prediction) = heard.recv_timeout(PATIENCE) else { break };
+        let Ok(prediction) = received.recv_timeout(PATIENCE) else { break };
         if answers(&prediction, count) {
             *answered.entry(prediction.input_seq).or_insert(0) += 1;
         }

@@ -8,7 +8,7 @@ use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
 use crate::program::{self, PATIENCE, command, folder, launch, run, text, write};
-use squealcast::bus::heard::Heard;
+use squealcast::bus::received::Received;
 use squealcast::bus::shm::{ShmOptions, ShmReader};
 use squealcast::msgs::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
 use squealcast::msgs::shm::{OperatingPointForm, SensitivityForm};
@@ -432,9 +432,9 @@ fn a_replay_waits_for_readers_and_its_stamps_never_run_backward() {
     let options = ShmOptions { service_prefix: prefix.clone(), ..Default::default() };
     let (inputs, heard_inputs) = mpsc::channel();
     let (sensitivities, heard_sensitivities) = mpsc::channel();
-    let hear_input = move |heard: Heard<OperatingPoint>| drop(inputs.send(heard.message));
+    let hear_input = move |received: Received<OperatingPoint>| drop(inputs.send(received.message));
     let _inputs = ShmReader::<OperatingPointForm>::spawn(&options, hear_input).expect("a reader");
-    let hear_sensitivity = move |heard: Heard<Sensitivity>| drop(sensitivities.send(heard.message));
+    let hear_sensitivity = move |received: Received<Sensitivity>| drop(sensitivities.send(received.message));
     let _sensitivities = ShmReader::<SensitivityForm>::spawn(&options, hear_sensitivity).expect("a reader");
 
     let mut last_ns = 0;
@@ -476,9 +476,9 @@ fn a_replay_over_ros_waits_for_a_node() {
     node.signal("INT").exits(0);
     let recorded =
         program::files_below(Path::new(&out)).into_iter().find(|path| path.extension().is_some_and(|e| e == "mcap"));
-    let heard = payloads(&recorded.expect("a recording")).into_iter().filter_map(|(_, payload)| match payload {
+    let received = payloads(&recorded.expect("a recording")).into_iter().filter_map(|(_, payload)| match payload {
         Payload::OperatingPoint(input) => Some(input.seq),
         _ => None,
     });
-    assert_eq!(heard.collect::<Vec<_>>(), (0..COUNT).collect::<Vec<_>>());
+    assert_eq!(received.collect::<Vec<_>>(), (0..COUNT).collect::<Vec<_>>());
 }

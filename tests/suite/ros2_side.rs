@@ -12,7 +12,7 @@ use crate::bus::{self, into, wait_until};
 use crate::forger::{ALL_FORGED, Forged, Forger, mutate, random};
 use crate::program::{self, command, text};
 use crossbeam_channel::{Receiver, Sender, unbounded};
-use squealcast::bus::heard::Heard;
+use squealcast::bus::received::Received;
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::process::{Ros2Process, Sinks};
 use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
@@ -33,7 +33,7 @@ struct Node {
     folder: TempDir,
     domain: u16,
     shm: ShmSource,
-    predictions: Receiver<Heard<Prediction>>,
+    predictions: Receiver<Received<Prediction>>,
     _shm_sink: ShmSink,
     /// Of the latest input over shared memory, and of the first that was answered.
     seq: u64,
@@ -98,8 +98,8 @@ impl Node {
         self.seq += 1;
         let asked = Instant::now();
         self.shm.publish(&point(self.seq)).expect("published");
-        while let Ok(heard) = self.predictions.recv_timeout(limit.saturating_sub(asked.elapsed())) {
-            if heard.message.input_seq == self.seq {
+        while let Ok(received) = self.predictions.recv_timeout(limit.saturating_sub(asked.elapsed())) {
+            if received.message.input_seq == self.seq {
                 return Some(asked.elapsed());
             }
         }
@@ -169,26 +169,26 @@ fn point(seq: u64) -> OperatingPoint {
 /// A rig's program on ROS 2.
 struct Peer {
     source: Ros2Source,
-    heard: Receiver<Heard<Prediction>>,
+    received: Receiver<Received<Prediction>>,
     seq: u64,
 }
 
 impl Peer {
     fn join(domain: u16) -> Self {
-        let (sender, heard): (Sender<Heard<Prediction>>, _) = unbounded();
+        let (sender, received): (Sender<Received<Prediction>>, _) = unbounded();
         let options = Ros2Options::new(Some(domain), true, RosArgs::default()).expect("a domain");
-        Self { source: Ros2Source::start(&options, into(sender)).expect("joined"), heard, seq: FIRST_OVER_ROS }
+        Self { source: Ros2Source::start(&options, into(sender)).expect("joined"), received, seq: FIRST_OVER_ROS }
     }
 
     /// Publishes an input, and whether some input of this peer was answered since the last call.
     fn is_answered(&mut self) -> bool {
         self.seq += 1;
         self.source.publish(&point(self.seq)).expect("published");
-        self.heard.try_iter().any(|heard| heard.message.input_seq > FIRST_OVER_ROS)
+        self.received.try_iter().any(|received| received.message.input_seq > FIRST_OVER_ROS)
     }
 
     fn forget(&self) {
-        while self.heard.try_recv().is_ok() {}
+        while self.received.try_recv().is_ok() {}
     }
 }
 
@@ -443,7 +443,7 @@ fn a_node_that_is_stopped_for_a_while_loses_no_input() {
     }
     signal(node.process.id(), "CONT");
     node.wait("an answer to the last input", |_| {
-        peer.heard.try_iter().any(|heard| heard.message.input_seq == first + COUNT)
+        peer.received.try_iter().any(|received| received.message.input_seq == first + COUNT)
     });
     assert_eq!(node.falls(), 0, "{}", node.said());
     let (_, recorded) = node.finish();
@@ -481,22 +481,24 @@ fn a_reader_that_does_not_acknowledge_holds_up_no_other() {
         // Its stamps are of today, those of this test of 1970.
         let is_simulated =
             |answer: &Prediction| answer.level != level::FAULT && answer.header.stamp.sec > 1_000_000_000;
-        node.predictions.try_iter().any(|heard| is_simulated(&heard.message))
+        node.predictions.try_iter().any(|received| is_simulated(&received.message))
     });
     let mut peer = Peer::join(node.domain);
     node.wait("an answer over ROS 2", |_| peer.is_answered());
     signal(frozen.id(), "STOP");
     peer.forget();
     let (first, begun) = (node.seq, Instant::now());
-    let (mut heard, mut last_heard, mut longest_pause, mut last_seq) = (0, begun, Duration::ZERO, 0);
+    let (mut received, mut last_received, mut longest_pause, mut last_seq) = (0, begun, Duration::ZERO, 0);
     while last_seq < first + COUNT {
-        for prediction in
-            peer.heard.try_iter().filter(|heard| (first + 1..FIRST_OVER_ROS).contains(&heard.message.input_seq))
+        for prediction in peer
+            .received
+            .try_iter()
+            .filter(|received| (first + 1..FIRST_OVER_ROS).contains(&received.message.input_seq))
         {
-            heard += 1;
+            received += 1;
             last_seq = prediction.message.input_seq;
-            longest_pause = longest_pause.max(last_heard.elapsed());
-            last_heard = Instant::now();
+            longest_pause = longest_pause.max(last_received.elapsed());
+            last_received = Instant::now();
         }
         let due = first + (2000.0 * begun.elapsed().as_secs_f64()) as u64;
         while node.seq < due.min(first + COUNT) {
@@ -505,7 +507,7 @@ fn a_reader_that_does_not_acknowledge_holds_up_no_other() {
         }
         assert!(
             begun.elapsed() < bus::PATIENCE,
-            "{heard} heard, the last {last_seq} of {}: {}",
+            "{received} received, the last {last_seq} of {}: {}",
             first + COUNT,
             node.said()
         );
@@ -514,11 +516,11 @@ fn a_reader_that_does_not_acknowledge_holds_up_no_other() {
     let _ = frozen.kill();
     let _ = frozen.wait();
     eprintln!(
-        "{heard} of {COUNT} heard beside a frozen reader in {:.1?}, longest pause {longest_pause:.1?}",
+        "{received} of {COUNT} received beside a frozen reader in {:.1?}, longest pause {longest_pause:.1?}",
         begun.elapsed()
     );
     // What this reader cannot keep up with at 2 kHz on a busy machine is lost in its own queue.
-    assert!(heard >= COUNT / 2, "{heard}");
+    assert!(received >= COUNT / 2, "{received}");
     // A renewal holds predictions back for 0.1 s; a busy machine adds to it. Without, it is the reader's lease.
     assert!(longest_pause < Duration::from_secs(3), "{longest_pause:?}");
     assert_eq!(node.falls(), 0, "{}", node.said());
@@ -540,9 +542,9 @@ fn the_ros2_side_costs_little_time() {
 
     let echo: Arc<OnceLock<Ros2>> = Arc::default();
     let echoing = echo.clone();
-    let answer = move |heard: Heard<OperatingPoint>| {
+    let answer = move |received: Received<OperatingPoint>| {
         let ros2 = echoing.get().expect("started");
-        ros2.publish_prediction(&bus::answer(&heard.message)).expect("published");
+        ros2.publish_prediction(&bus::answer(&received.message)).expect("published");
     };
     let started = Ros2::start(&inside, Parameters::none(), answer, |_| ()).expect("started");
     assert!(echo.set(started).is_ok());
@@ -550,9 +552,9 @@ fn the_ros2_side_costs_little_time() {
     let apart: Arc<OnceLock<Ros2Process>> = Arc::default();
     let echoing = apart.clone();
     let sinks = Sinks {
-        input: Box::new(move |heard| {
+        input: Box::new(move |received| {
             let ros2 = echoing.get().expect("started");
-            ros2.publish_prediction(&bus::answer(&heard.message)).expect("published");
+            ros2.publish_prediction(&bus::answer(&received.message)).expect("published");
         }),
         vibration: Box::new(|_| ()),
         parameter: Box::new(|_, _| ()),
@@ -562,10 +564,10 @@ fn the_ros2_side_costs_little_time() {
     assert!(apart.set(Ros2Process::start_program(program, &beside, vec![], sinks).expect("started")).is_ok());
 
     let mut askers = [inside, beside].map(|options| {
-        let (sender, heard) = unbounded();
+        let (sender, received) = unbounded();
         let source = Ros2Source::start(&options, into(sender)).expect("joined");
         wait_until("readers", || source.readers() > 0 && source.prediction_writers() > 0);
-        Peer { source, heard, seq: 0 }
+        Peer { source, received, seq: 0 }
     });
     let mut times = [vec![], vec![]];
     for block in 0..BLOCKS {
@@ -575,7 +577,7 @@ fn the_ros2_side_costs_little_time() {
                 let asked = Instant::now();
                 asker.source.publish(&point(asker.seq)).expect("published");
                 // A first answer may be lost while reader and writer find each other.
-                match asker.heard.recv_timeout(if block == 0 { Duration::from_millis(200) } else { bus::PATIENCE }) {
+                match asker.received.recv_timeout(if block == 0 { Duration::from_millis(200) } else { bus::PATIENCE }) {
                     Ok(_) => times.push(asked.elapsed().as_secs_f64() * 1e6),
                     Err(_) => assert_eq!(block, 0, "no answer"),
                 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::Ros2Options;
-use crate::bus::heard::Counts;
+use crate::bus::received::Counts;
 use crate::msgs::{
     self, CdrError, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration,
 };

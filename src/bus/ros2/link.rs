@@ -14,11 +14,11 @@ use tokio::sync::oneshot;
 
 pub(super) use rustdds::policy::Durability;
 
-use super::super::heard::{Counters, Counts, Gaps, Heard};
-use super::ears::{Ears, Refused};
+use super::super::received::{Counters, Counts, Gaps, Received};
 use super::loopback::keep_to_loopback;
 use super::qos_conflicts::QosConflicts;
-use super::{Ros2Error, Ros2Options, heard};
+use super::subscriptions::{Refused, Subscriptions};
+use super::{Ros2Error, Ros2Options, received};
 use crate::msgs::topic;
 
 /// Samples that may wait for the thread that reads a subscription; RustDDS acknowledges samples beyond it and drops
@@ -38,7 +38,7 @@ pub(super) type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
 pub(super) struct Link<M> {
     options: Ros2Options,
     name: NodeName,
-    ears: Option<Arc<Ears<M>>>,
+    subscriptions: Option<Arc<Subscriptions<M>>>,
     conflicts: QosConflicts,
     node: Node,
     context: Context,
@@ -78,7 +78,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
             conflicts: QosConflicts::new(context.domain_participant()),
             context,
             node,
-            ears: None,
+            subscriptions: None,
             counters: Arc::new(Counters::default()),
             running: None,
         })
@@ -109,16 +109,16 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         topic: &'static str,
         kind: MessageTypeName,
         seq: fn(&M) -> u64,
-        sink: impl FnMut(Heard<M>) + Send + 'static,
+        sink: impl FnMut(Received<M>) + Send + 'static,
         aside: Option<Hearing>,
     ) -> Result<(), Ros2Error> {
-        let ears = Arc::new(self.subscribe::<M>(topic, &kind)?);
+        let subscriptions = Arc::new(self.subscribe::<M>(topic, &kind)?);
         let failed = |reason: String| Ros2Error::Topic { name: topic.to_owned(), reason };
         let spinner = self.node.spinner().map_err(|e| failed(e.to_string()))?;
 
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (stop, stopped) = oneshot::channel();
-        self.ears = Some(Arc::clone(&ears));
+        self.subscriptions = Some(Arc::clone(&subscriptions));
         let counters = Arc::clone(&self.counters);
         let conflicts = self.conflicts.clone();
         let thread = thread::Builder::new().name(format!("ros2 {}", self.name.base_name())).spawn(move || {
@@ -137,7 +137,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
                     _ = stopped => (),
                     () = spin => (),
                     () = conflicts.watch(&counters) => (),
-                    () = hear(&ears, seq, sink, &counters) => (),
+                    () = hear(&subscriptions, seq, sink, &counters) => (),
                 }
             });
         })?;
@@ -151,11 +151,11 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         &mut self,
         topic: &'static str,
         kind: MessageTypeName,
-        sink: impl FnMut(Heard<N>) + Send + 'static,
+        sink: impl FnMut(Received<N>) + Send + 'static,
     ) -> Result<Hearing, Ros2Error> {
-        let ears = self.subscribe::<N>(topic, &kind)?;
+        let subscriptions = self.subscribe::<N>(topic, &kind)?;
         Ok(Box::pin(async move {
-            hear(&ears, |_| 0, sink, &Counters::default()).await;
+            hear(&subscriptions, |_| 0, sink, &Counters::default()).await;
         }))
     }
 
@@ -163,7 +163,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         &mut self,
         topic: &'static str,
         kind: &MessageTypeName,
-    ) -> Result<Ears<N>, Ros2Error> {
+    ) -> Result<Subscriptions<N>, Ros2Error> {
         let requested = qos(Durability::Volatile, RELIABLE, MAX_WAITING).build();
         let (reliable, name) = self.topic(topic, kind, &requested)?;
         let least = qos(Durability::Volatile, Reliability::BestEffort, MAX_WAITING).build();
@@ -174,7 +174,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         // The reliable one first: it then knows every publisher that the other one knows.
         let reliable = self.node.create_subscription(&reliable, None).map_err(failed)?;
         let best_effort = self.node.create_subscription(&best_effort, None).map_err(failed)?;
-        Ok(Ears::new((reliable, requested), best_effort, self.context.domain_participant()))
+        Ok(Subscriptions::new((reliable, requested), best_effort, self.context.domain_participant()))
     }
 
     /// The remapped topic, and its name.
@@ -201,7 +201,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
     }
 
     pub(super) fn writers(&self) -> usize {
-        self.ears.as_ref().map_or(0, |ears| ears.publishers(&self.node))
+        self.subscriptions.as_ref().map_or(0, |subscriptions| subscriptions.publishers(&self.node))
     }
 }
 
@@ -222,18 +222,18 @@ impl<M> Drop for Link<M> {
 }
 
 async fn hear<M: DeserializeOwned + 'static>(
-    ears: &Ears<M>,
+    subscriptions: &Subscriptions<M>,
     seq: fn(&M) -> u64,
-    mut sink: impl FnMut(Heard<M>),
+    mut sink: impl FnMut(Received<M>),
     counters: &Counters,
 ) {
     let mut gaps = Gaps::new();
     let mut refused = Refused::new();
     loop {
-        match ears.next(&mut refused).await {
+        match subscriptions.next(&mut refused).await {
             Ok((message, info)) => {
-                counters.heard(gaps.note(info.publisher_gid(), seq(&message)));
-                sink(heard(message));
+                counters.received(gaps.note(info.publisher_gid(), seq(&message)));
+                sink(received(message));
             }
             Err(ros2_client::ReadError::Deserialization { .. } | ros2_client::ReadError::Malformed) => {
                 counters.malformed();

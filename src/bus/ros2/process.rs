@@ -19,7 +19,7 @@ use crossbeam_channel::{Receiver, Sender, bounded, select};
 
 use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide, encode};
 use super::{NOTE, Ros2Error, Ros2Options};
-use crate::bus::heard::{Bus, Counts, Heard};
+use crate::bus::received::{Bus, Counts, Received};
 use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
 /// The command that runs the ROS 2 side of a node.
@@ -52,8 +52,8 @@ type ParameterSink = Box<dyn FnMut(&str, f64) + Send>;
 
 /// Callbacks for what the ROS 2 side receives. They run on a thread that must not block.
 pub struct Sinks {
-    pub input: Box<dyn FnMut(Heard<OperatingPoint>) + Send>,
-    pub vibration: Box<dyn FnMut(Heard<Vibration>) + Send>,
+    pub input: Box<dyn FnMut(Received<OperatingPoint>) + Send>,
+    pub vibration: Box<dyn FnMut(Received<Vibration>) + Send>,
     /// A peer set a parameter.
     pub parameter: ParameterSink,
     /// The ROS 2 side failed, and why; it is being restarted.
@@ -389,8 +389,8 @@ impl Supervisor {
                 }
             }
             FromSide::Refused(_) => {}
-            FromSide::Input { at, message } => (self.sinks.input)(Heard { bus: Bus::Ros2, at, message }),
-            FromSide::Vibration { at, message } => (self.sinks.vibration)(Heard { bus: Bus::Ros2, at, message }),
+            FromSide::Input { at, message } => (self.sinks.input)(Received { bus: Bus::Ros2, at, message }),
+            FromSide::Vibration { at, message } => (self.sinks.vibration)(Received { bus: Bus::Ros2, at, message }),
             FromSide::Parameter { name, value } => {
                 if let Some(parameter) = self.start.parameters.iter_mut().find(|(known, _)| *known == name) {
                     parameter.1 = value;

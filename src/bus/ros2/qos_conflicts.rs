@@ -7,7 +7,7 @@ use std::time::Duration;
 use rustdds::qos::{HasQoSPolicy, QosPolicies};
 use rustdds::{DomainParticipant, GUID, Topic};
 
-use super::super::heard::Counters;
+use super::super::received::Counters;
 use super::NOTE;
 
 /// Interval between checks of the discovered peers.

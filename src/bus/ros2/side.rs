@@ -19,7 +19,7 @@ use serde::Serialize;
 
 use super::frame::{Frames, FromSide, MAX_TO_SIDE, Next, Start, Status, ToSide, encode};
 use super::{Parameters, Ros2, Ros2Error};
-use crate::bus::heard::Heard;
+use crate::bus::received::Received;
 use crate::msgs::Prediction;
 use crate::system::memory;
 
@@ -122,8 +122,8 @@ fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNo
         &start.options,
         parameters,
         MAX_UNANSWERED,
-        move |Heard { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }),
-        move |Heard { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }),
+        move |Received { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }),
+        move |Received { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }),
     )
 }
 
@@ -201,7 +201,7 @@ impl Side {
             looks_without_beat = if beat == last_beat { looks_without_beat + 1 } else { 0 };
             last_beat = beat;
             if looks_without_beat > MAX_LOOKS_WITHOUT_BEAT {
-                give_up("its thread that hears ROS 2 hangs");
+                give_up("its thread that receives from ROS 2 hangs");
             }
             let status = self.status();
             let due = reported.is_none_or(|reported| reported.elapsed() >= STATUS_EVERY);

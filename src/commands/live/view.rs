@@ -64,8 +64,8 @@ impl View<'_> {
         if let Some(inputs) = self.around.inputs.as_ref().filter(|_| said.status == Status::Waiting) {
             lines.extend(wrapped(&inputs.sentence(), 0, width).into_iter().map(Line::from));
         }
-        if let Some(heard) = self.snapshot.heard.filter(|_| said.status == Status::NoData) {
-            lines.push(Line::from(format!("last input {:.1} s ago", heard.elapsed().as_secs_f64())));
+        if let Some(received) = self.snapshot.received.filter(|_| said.status == Status::NoData) {
+            lines.push(Line::from(format!("last input {:.1} s ago", received.elapsed().as_secs_f64())));
         }
         if let Some(input) =
             self.snapshot.input.as_ref().filter(|_| said.status.is_known() || said.status == Status::Fault)

@@ -5,7 +5,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Sender};
-use squealcast::bus::heard::Heard;
+use squealcast::bus::received::Received;
 use squealcast::bus::shm::ShmOptions;
 use squealcast::msgs::{Header, Mode, OperatingPoint, Prediction, Time, level};
 
@@ -35,12 +35,12 @@ pub fn answer(point: &OperatingPoint) -> Prediction {
     }
 }
 
-pub fn into<M: Send + 'static>(sender: Sender<Heard<M>>) -> impl FnMut(Heard<M>) + Send + 'static {
-    move |heard| drop(sender.send(heard))
+pub fn into<M: Send + 'static>(sender: Sender<Received<M>>) -> impl FnMut(Received<M>) + Send + 'static {
+    move |received| drop(sender.send(received))
 }
 
-pub fn next<M>(receiver: &Receiver<Heard<M>>) -> Heard<M> {
-    receiver.recv_timeout(PATIENCE).expect("heard in time")
+pub fn next<M>(receiver: &Receiver<Received<M>>) -> Received<M> {
+    receiver.recv_timeout(PATIENCE).expect("received in time")
 }
 
 pub fn wait_until(what: &str, condition: impl Fn() -> bool) {

@@ -15,7 +15,7 @@ const MAX_PUBLISHERS: usize = 256;
 /// RustDDS keeps the samples of a topic in one cache. The best-effort subscription therefore gets those of reliable
 /// publishers too, immediately and out of order after a loss. They are dropped here, because the reliable subscription
 /// delivers them.
-pub(super) struct Ears<M> {
+pub(super) struct Subscriptions<M> {
     reliable: Subscription<M>,
     best_effort: Subscription<Tried<M>>,
     /// The quality of service that the reliable subscription requests.
@@ -26,7 +26,7 @@ pub(super) struct Ears<M> {
 /// Publishers looked up so far, and whether the reliable subscription rejects them.
 pub(super) type Refused = HashMap<Gid, bool>;
 
-impl<M: DeserializeOwned + 'static> Ears<M> {
+impl<M: DeserializeOwned + 'static> Subscriptions<M> {
     pub(super) fn new(
         (reliable, requested): (Subscription<M>, QosPolicies),
         best_effort: Subscription<Tried<M>>,

@@ -21,14 +21,14 @@ pub enum Bus {
 
 /// A message received over a bus.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Heard<M> {
+pub struct Received<M> {
     pub bus: Bus,
     /// When it was taken from the bus.
     pub at: Reading,
     pub message: M,
 }
 
-impl<M> Heard<M> {
+impl<M> Received<M> {
     /// A message received now.
     pub fn now(bus: Bus, message: M) -> Self {
         Self { bus, at: Reading::now(), message }
@@ -39,7 +39,7 @@ impl<M> Heard<M> {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
     /// Messages received.
-    pub heard: u64,
+    pub received: u64,
     /// Messages lost on the way, according to gaps in their sequence numbers. A publisher must count by one: numbers
     /// that it skips on purpose cannot be distinguished from losses.
     pub missed: u64,
@@ -55,7 +55,7 @@ impl Counts {
     /// The sum of these counts and those of a receiver that replaced the first.
     pub(super) fn plus(self, others: Self) -> Self {
         Self {
-            heard: self.heard + others.heard,
+            received: self.received + others.received,
             missed: self.missed + others.missed,
             malformed: self.malformed + others.malformed,
             failures: self.failures + others.failures,
@@ -67,7 +67,7 @@ impl Counts {
 /// The counters behind [`Counts`], shared with the receiving thread.
 #[derive(Debug, Default)]
 pub(super) struct Counters {
-    heard: AtomicU64,
+    received: AtomicU64,
     missed: AtomicU64,
     malformed: AtomicU64,
     failures: AtomicU64,
@@ -75,8 +75,8 @@ pub(super) struct Counters {
 }
 
 impl Counters {
-    pub(super) fn heard(&self, missed: u64) {
-        self.heard.fetch_add(1, Ordering::Relaxed);
+    pub(super) fn received(&self, missed: u64) {
+        self.received.fetch_add(1, Ordering::Relaxed);
         self.missed.fetch_add(missed, Ordering::Relaxed);
     }
 
@@ -94,7 +94,7 @@ impl Counters {
 
     pub(super) fn counts(&self) -> Counts {
         Counts {
-            heard: self.heard.load(Ordering::Relaxed),
+            received: self.received.load(Ordering::Relaxed),
             missed: self.missed.load(Ordering::Relaxed),
             malformed: self.malformed.load(Ordering::Relaxed),
             failures: self.failures.load(Ordering::Relaxed),
