@@ -278,8 +278,8 @@ pub struct Agreement {
     pub solved: usize,
     /// Number of modes compared.
     pub modes: usize,
-    /// Number of charted modes whose identity disagrees: the solved mode of the same identity is missing, or is neither
-    /// the nearest one nor within the bounds of both. A difference in the number of modes counts too.
+    /// Number of charted modes whose identity disagrees: no solved mode of the same identity lies within the error
+    /// bounds of both. A difference in the number of modes counts too.
     pub different: usize,
     /// Number of solved modes with another identity by shape. Modes closer than 1e-3, relative, to another are left
     /// out.
@@ -322,10 +322,10 @@ pub fn compare(
             found.different += dense.modes.len().abs_diff(on_chart.modes.len());
             for mode in &on_chart.modes {
                 let same = dense.modes.iter().find(|other| other.id == mode.id);
-                let off = |other: &Mode| (mode.root.square - other.root.square).norm();
-                let nearest = dense.modes.iter().map(off).fold(f64::INFINITY, f64::min);
-                let limit = |other: &Mode| mode.root.error.square + other.root.error.square;
-                let agrees = |other: &Mode| off(other) <= nearest || off(other) <= limit(other);
+                let agrees = |other: &Mode| {
+                    let limit = mode.root.error.square + other.root.error.square;
+                    (mode.root.square - other.root.square).norm() <= limit
+                };
                 found.different += usize::from(!same.is_some_and(agrees));
             }
             let (by_shape, ids) = (map.identify(&spectrum), map.ids(&spectrum));
