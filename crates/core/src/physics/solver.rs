@@ -514,6 +514,31 @@ mod tests {
         assert_eq!(solve(Vectors::None), Ok(9));
     }
 
+    /// Finite terms whose sum overflows: every kind of problem is given up, whatever vectors are asked for.
+    #[test]
+    fn matrices_that_overflow_do_not_converge() {
+        let term = |matrix: Mat<f64>, law: Law| Term { matrix, law };
+        let constant = || term(Mat::identity(5, 5), Law::Constant);
+        let symmetric = Mat::from_fn(5, 5, |i, j| if i.abs_diff(j) == 1 { 1e300 } else { 0.0 });
+        let unsymmetric = Mat::from_fn(5, 5, |i, j| if j == i + 1 { 1e300 } else { 0.0 });
+        let huge = |matrix| term(matrix, Law::FrictionStiffness);
+        for (stiffness, damping) in [
+            (huge(symmetric.clone()), vec![]),
+            (huge(unsymmetric.clone()), vec![]),
+            (huge(symmetric), vec![constant()]),
+            (huge(unsymmetric), vec![constant()]),
+        ] {
+            // The state of a damped model also has the velocities.
+            let dimension = if damping.is_empty() { 5 } else { 10 };
+            let model = Model::new(5, vec![constant(), stiffness], damping, ContactLaw::default(), None).unwrap();
+            for vectors in [Vectors::None, Vectors::Right, Vectors::Both] {
+                let solve = |mu| Solver::new(5).solve(&model, &REFERENCE.with_friction(mu), vectors);
+                assert_eq!(solve(1e10).err(), Some(SolveError::NoConvergence { dimension }));
+                assert!(solve(1e-300).is_ok());
+            }
+        }
+    }
+
     /// A root is unstable if its growth rate exceeds the threshold times `|λ|`.
     #[test]
     fn the_threshold_of_instability() {
