@@ -1,14 +1,14 @@
 //! Every reader of bytes from outside against mutations of sound files: it must answer each within 256 MiB and 10 s.
 //!
 //! Each reader has a process of its own, whose allocations are counted; as many run at a time as there are processors.
-//! Mutations are drawn from a seeded generator and not guided by coverage: that needs every crate compiled again, which
-//! takes as long as all other tests; `tests/fuzz` does it. `SQUEALCAST_FUZZ_S` is how many seconds each reader gets, and
-//! `SQUEALCAST_FUZZ_SEED` the seed. Arguments name readers; `--corpus FOLDER` writes the sound files instead.
+//! Mutations are drawn from a seeded generator and not guided by coverage, which needs a compiler that instruments every
+//! crate. `SQUEALCAST_FUZZ_S` is how many seconds each reader gets, and `SQUEALCAST_FUZZ_SEED` the seed. Arguments name
+//! readers.
 
 #[allow(dead_code)]
 #[path = "suite/program/mod.rs"]
 mod program;
-#[path = "fuzz/targets.rs"]
+#[path = "mutations/targets.rs"]
 mod targets;
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -69,10 +69,6 @@ fn main() -> ExitCode {
         [CHILD, name] => {
             let target = TARGETS.iter().find(|target| target.name == *name).expect("a reader");
             mutate(target);
-            ExitCode::SUCCESS
-        }
-        ["--corpus", folder] => {
-            write_corpus(Path::new(folder));
             ExitCode::SUCCESS
         }
         names => {
@@ -228,7 +224,7 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
             ];
             vec![program::npz_bytes(&side), program::npz_bytes(&pairs)]
         }
-        "uff" => text(&[include_str!("fuzz/modes.unv")]),
+        "uff" => text(&[include_str!("mutations/modes.unv")]),
         "matrix_market" => ["mass", "stiffness", "friction", "damping-1"]
             .map(|name| project(&format!("launch/rigs/hulten-{name}.mtx")))
             .into_iter()
@@ -293,14 +289,4 @@ fn plain_recording() -> Vec<u8> {
     writer.finish().expect("memory");
     drop(writer);
     output.into_inner()
-}
-
-fn write_corpus(folder: &Path) {
-    for target in &TARGETS {
-        let folder = folder.join(target.name);
-        std::fs::create_dir_all(&folder).expect("the folder of the corpus");
-        for (k, seed) in seeds(target.name).iter().enumerate() {
-            std::fs::write(folder.join(format!("seed-{k}")), seed).expect("the folder of the corpus");
-        }
-    }
 }

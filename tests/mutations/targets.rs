@@ -1,8 +1,6 @@
 //! Every reader of bytes from outside, as a function that must return for any bytes: with a value or an error, never a panic,
 //! and within the ceilings of `squealcast::files::input_file`.
 
-#![allow(dead_code)] // the seeds are used in one of the two programs only
-
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
