@@ -1,4 +1,4 @@
-//! SIGINT, SIGTERM and SIGHUP end a command cleanly. A second signal within 2 s is ignored; any later one ends it at once.
+//! SIGINT, SIGTERM and SIGHUP end a command cleanly. Further signals within 2 s are ignored; any later one ends it at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// A second signal within this time belongs to the same request: a Ctrl-C reaches a launcher's whole process group, and
-/// the launcher then sends its own signal.
+/// Signals within this time of the first belong to the same request: a Ctrl-C reaches a launcher's whole process group,
+/// the launcher then sends its own signals, and people press it more than once. A recording is finished within this time.
 const SAME_REQUEST: Duration = Duration::from_secs(2);
 
 /// Sleeps until `moment` or until `stopped` is set, which is checked ten times a second.
@@ -22,7 +22,7 @@ pub fn wait_until(moment: Instant, stopped: &AtomicBool) {
     }
 }
 
-/// Calls `stop` once at the first signal. A second signal within [`SAME_REQUEST`] is ignored; any later one ends the
+/// Calls `stop` once at the first signal. Further signals within [`SAME_REQUEST`] are ignored; any later one ends the
 /// process. SIGHUP is ignored if it was ignored when the process started (`nohup`).
 ///
 /// # Errors
@@ -43,12 +43,16 @@ pub fn on_stop(stop: impl FnOnce() + Send + 'static) -> anyhow::Result<()> {
             any(&mut signals).await;
             stop();
             let first = Instant::now();
-            any(&mut signals).await;
-            if first.elapsed() < SAME_REQUEST {
-                note!("finishing; another signal ends this at once, and what was begun is not finished");
+            let mut said = false;
+            loop {
                 any(&mut signals).await;
+                if first.elapsed() >= SAME_REQUEST {
+                    std::process::exit(130);
+                }
+                if !std::mem::replace(&mut said, true) {
+                    note!("finishing; a signal after 2 s ends this at once, and what was begun is not finished");
+                }
             }
-            std::process::exit(130);
         });
     });
     Ok(())

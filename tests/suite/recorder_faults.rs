@@ -558,12 +558,13 @@ fn a_hangup_that_is_ignored_from_the_start_stays_ignored() {
 
 /// A Ctrl-C reaches a launcher and the node alike, and the launcher passes its own on.
 #[test]
-fn two_quick_signals_end_a_recording_cleanly() {
-    for signal in ["INT", "TERM"] {
+fn quick_signals_end_a_recording_cleanly_however_many() {
+    for (more, signal) in [(0, "INT"), (0, "TERM"), (1, "TERM"), (10, "INT")] {
         let folder = folder();
         let running = Running::start(command(demo(folder.path(), 100)));
         grows(folder.path());
         running.send("INT");
+        (0..more).for_each(|_| running.send("INT"));
         running.signal(signal).exits(0).complains("recorded ");
         check_finished(folder.path());
     }
