@@ -50,6 +50,13 @@ fn embedded_rigs_are_listed_and_completed() {
         let script = run(["completions", shell]).exits(0).stdout;
         assert!(names.iter().all(|name| script.contains(name)), "{shell}");
     }
+    // Where a rig is expected, zsh offers files as well: the list of rigs is in one function only.
+    let script = run(["completions", "zsh"]).exits(0).stdout;
+    assert_eq!(script.matches("((tribometer\\:").count(), 1, "{script}");
+    assert!(
+        script.contains("'files:rig file:_files'") && script.matches(":_squealcast_rigs'").count() >= 5,
+        "{script}"
+    );
 }
 
 #[test]
