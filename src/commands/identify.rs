@@ -1,4 +1,4 @@
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use anyhow::{Context, anyhow, bail};
 use clap::Args;
@@ -7,10 +7,11 @@ use serde::Serialize;
 use super::{Outcome, RigName, positive, print, write_file};
 use crate::figures::plot;
 use crate::files::input_file;
+use crate::files::whole_file::{folder_of, write_together};
 use crate::import::tribometer_log::decode_text;
 use crate::physics::identification::{IdentificationError, Identified, identify};
 use crate::physics::{OperatingPoint, Solver, Vectors};
-use crate::rig::Rig;
+use crate::rig::{Rig, RigFile};
 
 /// The stiffness counts as poorly determined if the error stays within twice its minimum over more than this factor.
 const WELL_DETERMINED: f64 = 2.0;
@@ -30,6 +31,9 @@ pub struct Options {
     /// Normal load in N [default: the rig's reference]
     #[arg(long, value_name = "N", value_parser = positive)]
     load: Option<f64>,
+    /// Write the rig with the stiffness found, together with the archives it refers to
+    #[arg(short, long, value_name = "RIG.toml")]
+    output: Option<PathBuf>,
     /// Draw the error over the stiffness factor into this file
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
@@ -82,6 +86,9 @@ impl Options {
             write_file(path, plot::identification(&title, &found, stiffness)?.as_bytes())?;
         }
         let factor = found.best.factor;
+        if let Some(path) = &self.output {
+            write_rig(&rig, factor, &self.targets, path)?;
+        }
         let stiffness = [low, high].map(|k| factor * k);
         if self.json {
             let report = Report {
@@ -102,6 +109,57 @@ impl Options {
         }
         Ok(Outcome::Done)
     }
+}
+
+/// Writes `rig` with the stiffness of every contact pair multiplied by `factor`. The name of the rig is that of its file. A
+/// comparison with a full model (`[reduction]`) is left out, since it was made with the former stiffness. Archives are
+/// written beside the rig unless they are there already.
+fn write_rig(rig: &Rig, factor: f64, targets: &Path, path: &Path) -> anyhow::Result<()> {
+    let fitted = rig.with_contact_stiffness_times(factor)?;
+    let Some((rig_file, archives)) = fitted.files.split_first() else { bail!("{}: has no rig file", rig.name) };
+    let mut table: toml::Table = std::str::from_utf8(&rig_file.bytes)?.parse()?;
+    table.remove("reduction");
+    if let Some(name) = path.file_stem().filter(|_| path != Path::new("-")) {
+        table.insert("name".to_owned(), name.to_string_lossy().into_owned().into());
+    }
+    let text = format!(
+        "# {} with {factor} times its contact stiffness, fitted to {} by squealcast {}\n{table}",
+        rig.name.escape_debug(),
+        targets.display().to_string().escape_debug(),
+        env!("CARGO_PKG_VERSION")
+    );
+    // What cannot be read again is not written.
+    let mut files = vec![RigFile { name: rig_file.name.clone(), bytes: text.into_bytes() }];
+    files.extend_from_slice(archives);
+    Rig::from_files(&files)?;
+    if path == Path::new("-") {
+        if let Some(archive) = archives.first() {
+            bail!("{} refers to {}: --output needs a file, whose folder takes it", rig.name, archive.name);
+        }
+        return write_file(path, &files[0].bytes);
+    }
+    let mut written = vec![];
+    for archive in archives {
+        let place = folder_of(path).join(&archive.name);
+        match std::fs::read(&place) {
+            Ok(there) if there == archive.bytes => continue,
+            Ok(_) => bail!("{}: is there with another content than {} of {}", place.display(), archive.name, rig.name),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => return Err(error).with_context(|| place.display().to_string()),
+        }
+        if !Path::new(&archive.name).components().all(|part| matches!(part, Component::Normal(_))) {
+            bail!(
+                "{} refers to {}, which is outside its folder: write the rig into its own folder",
+                rig.name,
+                archive.name
+            );
+        }
+        std::fs::create_dir_all(folder_of(&place)).with_context(|| place.display().to_string())?;
+        written.push((place, archive.bytes.as_slice()));
+    }
+    // The rig file last: it refers to the others.
+    written.push((path.to_owned(), files[0].bytes.as_slice()));
+    Ok(write_together(written)?)
 }
 
 /// Natural frequencies without sliding, with the stiffness of every contact pair multiplied by `factor`, Hz.

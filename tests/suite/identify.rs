@@ -41,6 +41,17 @@ fn the_stiffness_behind_known_frequencies_is_found() {
     run(["identify", &rig, "--targets", &mixed]).exits(1).complains("line 2: frequency_hz is `1.234,5`");
 
     run(["identify", &rig, "--targets", &targets]).exits(0).says("1.000000e0 N/m a pair").says("0.8749");
+
+    // Written, the rig has the stiffness found and fits as it is; on standard output it is the same but for its name.
+    let stiffer = text(&temp.path().join("stiffer.toml"));
+    assert_eq!(json(["identify", &rig, "--targets", &targets, "--json", "-o", &stiffer]), found);
+    let fitted = json(["identify", &stiffer, "--targets", &targets, "--json"]);
+    assert!((number(&fitted, "stiffness_factor") - 1.0).abs() < 1e-6, "{fitted}");
+    let [softer, stiffer] = [&rig, &stiffer].map(|rig| Rig::load(rig).expect("a rig"));
+    let of = |rig: &Rig| rig.contact_stiffness_n_per_m();
+    assert!(of(&stiffer).iter().zip(of(&softer)).all(|(k, before)| (k / before - 8.0).abs() < 1e-6));
+    assert_eq!((stiffer.name.as_str(), stiffer.limits), ("stiffer", softer.limits));
+    run(["identify", &rig, "--targets", &targets, "--json", "-o", "-"]).exits(0).says("times its contact stiffness");
     let few = json(["identify", &rig, "--targets", &targets, "--json", "--first", "5"]);
     assert!((number(&few, "stiffness_factor") - 8.0).abs() < 1e-5, "{few}");
 
@@ -115,6 +126,21 @@ fn the_stiffness_of_a_full_model_is_found_on_a_rig_with_residuals() {
     // Against the rig's own frequencies the error falls linearly to 0: rounding of 1e-12 and the last bracket are left.
     let own = json(["identify", &rig_file, "--targets", &list("own.csv", &reduced), "--json"]);
     assert!((number(&own, "stiffness_factor") / FACTOR - 1.0).abs() < 1e-7, "{own}");
+    // Written into another folder, the rig brings its archives along; archives with another content are not replaced.
+    let folder = temp.path().join("fitted");
+    fs::create_dir(&folder).unwrap();
+    let targets = text(&temp.path().join("own.csv"));
+    let fitted_file = text(&folder.join("fitted.toml"));
+    let write_fitted = ["identify", &rig_file, "--targets", &targets, "-o", &fitted_file];
+    run(write_fitted).exits(0);
+    run(write_fitted).exits(0);
+    let fitted = Rig::load(&fitted_file).unwrap();
+    let ratio = |(a, b): (f64, f64)| (a / b - 1.0).abs() < 1e-7;
+    assert!(fitted.contact_stiffness_n_per_m().into_iter().zip(rig.contact_stiffness_n_per_m()).all(ratio));
+    assert_eq!(fitted.files[1..], rig.files[1..]);
+    assert!(!fitted.files[1..].is_empty());
+    fs::write(folder.join(&fitted.files[1].name), "another").unwrap();
+    run(write_fitted).exits(1).complains("is there with another content");
 }
 
 /// Frequencies that two stiffnesses fit about as well say so.
