@@ -57,6 +57,8 @@ pub struct Event {
     pub input_seq: u64,
     /// Frequency ranges of its unstable modes; of each prediction the fastest growing ones are included.
     pub modes: Vec<ModeRange>,
+    /// Why there was no prediction at the onset of a fault or silence; `null` for a squeal.
+    pub reason: Option<Box<str>>,
     /// The first prediction.
     pub onset: EventMoment,
     /// The prediction with the largest growth rate; `null` for faults and silences.
@@ -180,6 +182,7 @@ impl Events {
             interruptions: 0,
             input_seq: sample.input_seq,
             modes: vec![],
+            reason: sample.fault.clone(),
             onset: EventMoment::new(sample),
             peak: None,
         };
@@ -201,7 +204,8 @@ impl Events {
         self.count
     }
 
-    /// The events as CSV. The header contains the units, times are ISO 8601, onset and peak have separate columns.
+    /// The events as CSV. The header contains the units, times are ISO 8601, onset and peak have separate columns, and
+    /// the last column is the reason of a fault.
     pub fn to_csv(&self) -> String {
         let mut header: Vec<String> =
             ["number", "kind", "onset_utc", "end_utc", "duration_s", "interruptions", "input_seq"]
@@ -212,6 +216,7 @@ impl Events {
             let columns = EventMoment::COLUMNS.iter().skip(usize::from(when == "onset"));
             header.extend(columns.map(|column| format!("{when}_{column}")));
         }
+        header.push("reason".to_owned());
         let mut text = header.join(",") + "\r\n";
         for event in &self.events {
             let [onset_utc, onset @ ..] = event.onset.cells();
@@ -226,11 +231,17 @@ impl Events {
             ];
             cells.extend(onset);
             cells.extend(event.peak.map_or_else(Default::default, |peak| peak.cells()));
+            cells.push(event.reason.as_deref().map_or_else(String::new, quoted));
             text += &cells.join(",");
             text += "\r\n";
         }
         text
     }
+}
+
+/// A text as a quoted CSV cell (RFC 4180).
+fn quoted(text: &str) -> String {
+    format!("\"{}\"", text.replace('"', "\"\""))
 }
 
 fn cell<T: ToString>(value: Option<T>) -> String {
@@ -290,6 +301,7 @@ pub(super) mod tests {
                 None,
                 None,
             ],
+            fault: (status == Status::Fault).then(|| "normal_load_n is -5, expected 0 to \"1e6\"".into()),
         }
     }
 
@@ -365,11 +377,19 @@ pub(super) mod tests {
         assert_eq!(
             lines[1],
             "1,SQUEAL,2023-11-14T22:13:20.000000Z,2023-11-14T22:13:21.250000Z,1.250000,0,1700000000000000000,\
-             3,1500,1,500,13,0.5,0.4,2023-11-14T22:13:20.000000Z,3,1500,1,500,13,0.5,0.4"
+             3,1500,1,500,13,0.5,0.4,2023-11-14T22:13:20.000000Z,3,1500,1,500,13,0.5,0.4,"
         );
-        assert_eq!(lines[2], "2,FAULT,2023-11-14T22:13:21.250000Z,,,0,1700000001250000000,,,,500,13,,0.4,,,,,,,,");
+        assert_eq!(
+            lines[2],
+            "2,FAULT,2023-11-14T22:13:21.250000Z,,,0,1700000001250000000,,,,500,13,,0.4,,,,,,,,,\
+             \"normal_load_n is -5, expected 0 to \"\"1e6\"\"\""
+        );
         let columns: Vec<&str> = lines[0].split(',').collect();
-        assert!(lines.iter().all(|line| line.split(',').count() == columns.len()));
+        assert_eq!((columns.len(), columns.last()), (23, Some(&"reason")));
+        let rows =
+            csv::Reader::from_reader(csv.as_bytes()).into_records().map(|row| row.expect("as wide as the header"));
+        let reasons: Vec<String> = rows.map(|row| row[22].to_owned()).collect();
+        assert_eq!(reasons, ["", "normal_load_n is -5, expected 0 to \"1e6\""]);
         for (column, unit) in
             [("growth_rate", "_per_s"), ("normal_load", "_n"), ("disc_speed", "_rad_s"), ("duration", "_s")]
         {

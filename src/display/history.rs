@@ -254,11 +254,11 @@ mod tests {
         let mut history = History::new(100, 3);
         let mut slow = sample(0, 0.5, Status::Squeal);
         slow.max_growth_rate_per_s = 0.1;
-        let mut fast = slow;
+        let mut fast = slow.clone();
         fast.max_growth_rate_per_s = 2.0;
         fast.unstable[0].as_mut().unwrap().frequency_hz = 77.0;
-        for sample in [slow, fast, slow] {
-            history.push(&sample);
+        for sample in [&slow, &fast, &slow] {
+            history.push(sample);
         }
         assert_eq!(history.bins()[0].unstable, [Some((77.0, 1.0)), None, None, None]);
         let json = serde_json::to_value(&history.bins()[0]).unwrap();

@@ -179,7 +179,8 @@ fn events(events: &Events, from_s: f64) -> String {
         "<th>mode</th><th>frequency, Hz</th><th>growth, 1/s</th><th>μ</th><th>load, N</th><th>speed, rad/s</th>";
     let mut html = format!(
         "<table><thead><tr><th rowspan=\"2\">no.</th><th rowspan=\"2\">event</th><th rowspan=\"2\">end, s</th>\
-         <th rowspan=\"2\">duration, s</th><th colspan=\"7\">onset</th><th colspan=\"7\">fastest growth</th></tr>\n\
+         <th rowspan=\"2\">duration, s</th><th colspan=\"7\">onset</th><th colspan=\"7\">fastest growth</th>\
+         <th rowspan=\"2\">reason</th></tr>\n\
          <tr><th>after, s</th>{of_moment}<th>after, s</th>{of_moment}</tr></thead><tbody>\n"
     );
     for event in events.iter().take(LISTED) {
@@ -190,7 +191,8 @@ fn events(events: &Events, from_s: f64) -> String {
             event.end_s.map_or_else(|| "–".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s)),
         ];
         let peak = event.peak.map_or_else(|| vec!["–".to_owned(); 7], |peak| event_moment(&peak, from_s));
-        let cells = cells.into_iter().chain(event_moment(&event.onset, from_s)).chain(peak);
+        let reason = event.reason.as_deref().map_or_else(|| "–".to_owned(), escaped);
+        let cells = cells.into_iter().chain(event_moment(&event.onset, from_s)).chain(peak).chain([reason]);
         let cells: String = cells.map(|cell| format!("<td>{cell}</td>")).collect();
         let class = match event.kind {
             EventKind::Squeal => "squeal",

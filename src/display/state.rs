@@ -72,12 +72,14 @@ pub struct CountersShown {
     pub reused: u64,
     pub faults: u64,
     pub passed_over: u64,
+    /// Number of restarts of the ROS 2 side.
+    pub ros2_falls: u64,
 }
 
 impl CountersShown {
-    pub fn new(counters: Counters, passed_over: u64) -> Self {
+    pub fn new(counters: Counters, passed_over: u64, ros2_falls: u64) -> Self {
         let Counters { solved, charted, reused, faults, .. } = counters;
-        Self { solved, charted, reused, faults, passed_over }
+        Self { solved, charted, reused, faults, passed_over, ros2_falls }
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::Instant;
 use serde::Serialize;
 
 use super::status::{Assessment, Inputs, Status};
-use crate::msgs::{OperatingPoint, Prediction, Vibration};
+use crate::msgs::{OperatingPoint, Prediction, Vibration, level};
 use crate::physics::{Ends, NextWindow, StabilityMap};
 use crate::session::{Counters, conditions};
 use crate::system::clock;
@@ -59,7 +59,7 @@ pub const SAMPLE_MODES: usize = 4;
 const MOST_SAMPLES: usize = 1 << 16;
 
 /// The outcome of one input, compact enough to keep many.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Sample {
     /// Time of the prediction, ns since the epoch.
     pub time_ns: i64,
@@ -77,6 +77,8 @@ pub struct Sample {
     pub friction_margin: f64,
     /// The fastest growing unstable modes, in descending order of growth rate.
     pub unstable: [Option<UnstableMode>; SAMPLE_MODES],
+    /// Why there is no prediction; `None` unless the level is FAULT.
+    pub fault: Option<Box<str>>,
 }
 
 /// An unstable mode.
@@ -125,6 +127,7 @@ impl Sample {
             critical_friction: prediction.critical_friction,
             friction_margin: prediction.friction_margin,
             unstable: fastest_modes(prediction),
+            fault: (prediction.level == level::FAULT).then(|| prediction.reason.as_str().into()),
         }
     }
 }
@@ -259,7 +262,7 @@ impl Watch {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::msgs::{Mode, level};
+    use crate::msgs::Mode;
 
     fn prediction(growth: &[f64], unstable_modes: u32) -> Prediction {
         let mode =
@@ -278,6 +281,11 @@ mod tests {
             "one is unstable"
         );
         assert!(sample.normal_load_n.is_nan());
+        assert_eq!(sample.fault, None);
+        let reason = "normal_load_n is -5, expected 0 to 1e6".to_owned();
+        let faulty = Prediction { level: level::FAULT, reason, ..Prediction::default() };
+        let sample = Sample::new(0, None, &faulty, Inputs::default());
+        assert_eq!(sample.fault.as_deref(), Some("normal_load_n is -5, expected 0 to 1e6"));
     }
 
     /// A node without inputs is WAITING before the first and NO DATA after the last, never FAULT.

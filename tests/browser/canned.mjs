@@ -85,7 +85,8 @@ function predicted(mu, seq) {
 /** Nothing is known of a moment. */
 const blank = (level, reason) => ({ level, reason, seq: 40, stamp_s: NOW, reused: false, load: null, speed: null, mu: null, critical: null, margin: null, growth: null, worst_hz: null, unstable: 0, modes: [], fastest: null, next: null, spread: null, trend_per_s: null });
 
-const COUNTERS = { solved: 12, charted: 5003, reused: 201, faults: 0, passed_over: 0 };
+const FAULT = "normal load -5 N is below its limit of 0 N";
+const COUNTERS = { solved: 12, charted: 5003, reused: 201, faults: 0, passed_over: 0, ros2_falls: 0 };
 const state = (what) => ({ time_s: NOW, age_s: 0.02, rate_hz: 200, warn_margin: 0.05, map: 1, events: 1, counters: COUNTERS, simulated: false, ...what });
 
 export const SITUATIONS = {
@@ -93,8 +94,8 @@ export const SITUATIONS = {
   warn: state(predicted(0.641, 5216)),
   squeal: state(predicted(0.72, 5216)),
   worst: state(predicted(0.93, 5216)),
-  fault: state({ ...blank(3, "normal load -5 N is below its limit of 0 N"), status: "fault", message: "normal load -5 N is below its limit of 0 N", load: -5, speed: 13.04, mu: 0.42 }),
-  waiting: state({ age_s: null, rate_hz: 0, map: 0, events: 0, status: "waiting", message: "no operating point was heard yet", counters: { solved: 0, charted: 0, reused: 0, faults: 1, passed_over: 0 }, spread: null, trend_per_s: null, fastest: null, next: null }),
+  fault: state({ ...blank(3, FAULT), status: "fault", message: FAULT, load: -5, speed: 13.04, mu: 0.42 }),
+  waiting: state({ age_s: null, rate_hz: 0, map: 0, events: 0, status: "waiting", message: "no operating point was heard yet", counters: { solved: 0, charted: 0, reused: 0, faults: 1, passed_over: 0, ros2_falls: 0 }, spread: null, trend_per_s: null, fastest: null, next: null }),
   no_data: state({ ...blank(3, "no input for 1 s"), age_s: 5.4, rate_hz: 0, status: "no_data", message: "operating points came and stopped" }),
 };
 
@@ -121,7 +122,8 @@ const moment = (time_s, mu) => {
   const { fastest, load, speed, critical } = predicted(mu, 0);
   return { time_s, mode_id: fastest.id, frequency_hz: fastest.frequency_hz, growth_rate_per_s: fastest.growth_rate_per_s, normal_load_n: load, disc_speed_rad_s: speed, friction_coefficient: mu, critical_friction: critical };
 };
-const events = () => [{ number: 1, kind: "SQUEAL", onset_s: NOW - 80, end_s: NOW - 60, interruptions: 0, input_seq: 1200, modes: [{ id: 1, low_hz: 739, high_hz: 741 }], onset: moment(NOW - 80, 0.664), peak: moment(NOW - 71, 0.75) }];
+const nothing = (time_s) => ({ time_s, mode_id: null, frequency_hz: null, growth_rate_per_s: null, normal_load_n: null, disc_speed_rad_s: null, friction_coefficient: null, critical_friction: null });
+const events = () => [{ number: 1, kind: "SQUEAL", onset_s: NOW - 80, end_s: NOW - 60, interruptions: 0, input_seq: 1200, modes: [{ id: 1, low_hz: 739, high_hz: 741 }], reason: null, onset: moment(NOW - 80, 0.664), peak: moment(NOW - 71, 0.75) }, { number: 2, kind: "FAULT", onset_s: NOW - 40, end_s: NOW - 39, interruptions: 0, input_seq: 9200, modes: [], reason: FAULT, onset: { ...nothing(NOW - 40), normal_load_n: -5, disc_speed_rad_s: 13.04, friction_coefficient: 0.42 }, peak: null }];
 
 const about = { kind: "live", rig: "tribometer", content_hash: "0".repeat(64), version: "0.1.0", band_max_hz: 4000, mu_max: 1, warn_margin: 0.05, instability_threshold: 1e-6, vibration_threshold_db: 70, span_s: null, notes: [], simulated: false, inputs: { topic: "/rig/operating_point", domain: 0, service: "rig/operating_point", start: "squealcast simulate" } };
 

@@ -514,6 +514,11 @@ fn a_recording_of_faults_is_not_called_quiet() {
     run(&["report", session.to_str().unwrap(), "-o", out]);
     let html = std::fs::read_to_string(Path::new(out).join("report.html")).unwrap();
     assert!(html.contains("20 of 20 predictions are faults") && !html.contains("No squeal was predicted"));
+    // Table and CSV file say why.
+    let csv = std::fs::read_to_string(Path::new(out).join("events.csv")).unwrap();
+    for text in [&html, &csv] {
+        assert!(text.contains("normal_load_n is 2000000"), "{text}");
+    }
 }
 
 #[test]

@@ -40,7 +40,7 @@ export class Events {
     const values = [
       event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, moment(event.onset_s),
       ends ? moment(event.end_s) : event.end_s === null ? "lasts" : NONE, ends ? fixed(event.end_s - event.onset_s, 2) : NONE, shown.mode_id ?? NONE, this.#frequency(shown.frequency_hz),
-      this.#friction(event), fixed(shown.normal_load_n, 1), fixed(shown.disc_speed_rad_s, 2),
+      this.#friction(event), fixed(shown.normal_load_n, 1), fixed(shown.disc_speed_rad_s, 2), event.reason ?? "",
     ];
     values.forEach((value, k) => {
       const cell = document.createElement("td");

@@ -91,7 +91,10 @@ export class Status {
     put(at("seq"), known(state.seq) ? String(state.seq) : NONE, state.seq);
     put(at("rate"), fixed(state.rate_hz, 0), state.rate_hz);
     const c = state.counters;
-    if (c) put(at("counters"), `${c.solved} solved, ${c.charted} charted, ${c.reused} reused, ${c.faults} faults, ${c.passed_over} passed over`);
+    if (c) {
+      const falls = c.ros2_falls ? `, ROS 2 started again ${c.ros2_falls}` : "";
+      put(at("counters"), `${c.solved} solved, ${c.charted} charted, ${c.reused} reused, ${c.faults} faults, ${c.passed_over} passed over${falls}`);
+    }
     this.#trend(state);
   }
 
