@@ -49,6 +49,8 @@ pub struct Counts {
     pub failures: u64,
     /// Known peers that cannot be connected because their quality of service is incompatible.
     pub incompatible: u64,
+    /// Known peers that publish predictions on the topic of this node.
+    pub rivals: u64,
 }
 
 impl Counts {
@@ -59,7 +61,9 @@ impl Counts {
             missed: self.missed + others.missed,
             malformed: self.malformed + others.malformed,
             failures: self.failures + others.failures,
-            incompatible: others.incompatible, // not a count: the peers known now
+            // Not counts: the peers known now.
+            incompatible: others.incompatible,
+            rivals: others.rivals,
         }
     }
 }
@@ -72,6 +76,7 @@ pub(super) struct Counters {
     malformed: AtomicU64,
     failures: AtomicU64,
     incompatible: AtomicU64,
+    rivals: AtomicU64,
 }
 
 impl Counters {
@@ -92,6 +97,10 @@ impl Counters {
         self.incompatible.store(peers, Ordering::Relaxed);
     }
 
+    pub(super) fn set_rivals(&self, peers: u64) {
+        self.rivals.store(peers, Ordering::Relaxed);
+    }
+
     pub(super) fn counts(&self) -> Counts {
         Counts {
             received: self.received.load(Ordering::Relaxed),
@@ -99,6 +108,7 @@ impl Counters {
             malformed: self.malformed.load(Ordering::Relaxed),
             failures: self.failures.load(Ordering::Relaxed),
             incompatible: self.incompatible.load(Ordering::Relaxed),
+            rivals: self.rivals.load(Ordering::Relaxed),
         }
     }
 }

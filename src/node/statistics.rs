@@ -157,6 +157,10 @@ impl Statistics {
         if incompatible > 0 {
             warnings.push(format!("peers not connected, their quality of service is incompatible: {incompatible}"));
         }
+        let rivals = lost.buses.iter().map(|(_, counts)| counts.rivals).sum::<u64>();
+        if rivals > 0 {
+            warnings.push(format!("other programs publish predictions on the same topic: {rivals}"));
+        }
         warnings.extend(lost.since(&self.lost_before));
         self.lost_before = lost;
         let status = Status::new(self.level, self.inputs);
@@ -322,7 +326,7 @@ mod tests {
     #[test]
     fn what_a_bus_missed_or_could_not_read_is_a_loss() {
         let lost = |missed, malformed, failures| Lost {
-            buses: vec![("ros2", Counts { received: 9, missed, malformed, failures, incompatible: 0 })],
+            buses: vec![("ros2", Counts { received: 9, missed, malformed, failures, incompatible: 0, rivals: 0 })],
             ..Lost::default()
         };
         let words = lost(4, 2, 1).since(&lost(1, 1, 0));

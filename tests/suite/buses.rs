@@ -456,6 +456,26 @@ fn peers_with_incompatible_quality_of_service_are_counted_while_they_are_there()
     wait_until("it is gone", || ros.counts().incompatible == 0);
 }
 
+/// A second node of one domain and namespace: subscribers cannot tell the predictions of the two apart. In a namespace of its
+/// own it disturbs nobody.
+#[test]
+fn another_publisher_of_predictions_is_counted_while_it_is_there() {
+    let domain = Domain::claim();
+    let start = |name: &str, more: &[&str]| {
+        let arguments = ["--ros-args", "-r", name].into_iter().chain(more.iter().copied()).map(str::to_owned);
+        let (args, _) = RosArgs::split(arguments).expect("well formed");
+        let options = Ros2Options { args, ..ros_options(&domain) };
+        Ros2::start(&options, Parameters::none(), |_| (), |_| ()).expect("node")
+    };
+    let first = start("__node:=first", &[]);
+    let apart = start("__node:=apart", &["-r", "__ns:=/apart"]);
+    let second = start("__node:=second", &[]);
+    wait_until("each is counted by the other", || first.counts().rivals == 1 && second.counts().rivals == 1);
+    assert_eq!(apart.counts().rivals, 0);
+    drop(second);
+    wait_until("it is gone", || first.counts().rivals == 0);
+}
+
 #[test]
 fn bad_ros2_names_are_errors() {
     for bad in ["__node:=a-b", "__node:=a__b", "__ns:=/a//b", "__ns:=/1", "rig/operating_point:=/a//b"] {

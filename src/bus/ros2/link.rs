@@ -98,8 +98,12 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         // Late subscribers get the latest message only.
         let depth = if durability == Durability::TransientLocal { 1 } else { topic::DEPTH };
         let qos = qos(durability, RELIABLE, depth).resource_limits(limits).build();
+        let predicts = name == topic::PREDICTION;
         let (topic, name) = self.topic(name, &kind, &qos)?;
         self.conflicts.published(&topic, &name);
+        if predicts {
+            self.conflicts.predictions(&topic, &name);
+        }
         self.node.create_publisher(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
     }
 

@@ -1,11 +1,11 @@
-//! Finds peers that DDS does not connect because their quality of service is incompatible. DDS reports this to neither
-//! program.
+//! Finds peers that DDS does not connect because their quality of service is incompatible, and peers that publish
+//! predictions on the topic of this node. DDS reports neither.
 
 use std::collections::HashMap;
 use std::time::Duration;
 
 use rustdds::qos::{HasQoSPolicy, QosPolicies};
-use rustdds::{DomainParticipant, GUID, Topic};
+use rustdds::{DomainParticipant, GUID, RTPSEntity, Topic};
 
 use super::super::received::Counters;
 use super::NOTE;
@@ -36,11 +36,13 @@ pub(super) struct QosConflicts {
     participant: DomainParticipant,
     published: Vec<Endpoint>,
     subscribed: Vec<Endpoint>,
+    /// The topic of predictions: its name and its DDS name.
+    predictions: Option<(String, String)>,
 }
 
 impl QosConflicts {
     pub(super) fn new(participant: DomainParticipant) -> Self {
-        Self { participant, published: Vec::new(), subscribed: Vec::new() }
+        Self { participant, published: Vec::new(), subscribed: Vec::new(), predictions: None }
     }
 
     /// Adds a topic that the node publishes.
@@ -48,12 +50,19 @@ impl QosConflicts {
         self.published.push(Endpoint::new(topic, name));
     }
 
+    /// Names the topic that the node publishes predictions on.
+    pub(super) fn predictions(&mut self, topic: &Topic, name: &str) {
+        use rustdds::TopicDescription;
+        self.predictions = Some((name.to_owned(), topic.name()));
+    }
+
     /// Adds a topic that the node subscribes to.
     pub(super) fn subscribed(&mut self, topic: &Topic, name: &str) {
         self.subscribed.push(Endpoint::new(topic, name));
     }
 
-    /// Checks regularly which peers cannot be connected. Counts them and reports each once.
+    /// Checks regularly which peers cannot be connected, and which publish predictions too. Counts them and reports each
+    /// once.
     pub(super) async fn watch(self, counters: &Counters) {
         let mut known = HashMap::new();
         let mut look = tokio::time::interval(LOOK_EVERY);
@@ -61,13 +70,30 @@ impl QosConflicts {
             look.tick().await;
             // With thousands of peers this takes milliseconds, during which inputs would have to wait.
             let looking = self.clone();
-            let Ok(found) = tokio::task::spawn_blocking(move || looking.find()).await else { continue };
+            let found = tokio::task::spawn_blocking(move || (looking.find(), looking.rivals())).await;
+            let Ok((mut found, rivals)) = found else { continue };
             counters.set_incompatible(found.len() as u64);
+            counters.set_rivals(rivals.len() as u64);
+            found.extend(rivals);
             for (_, what) in found.iter().filter(|(peer, _)| !known.contains_key(*peer)).take(MAX_DESCRIBED) {
                 note!("{NOTE}{what}");
             }
             known = found;
         }
+    }
+
+    /// The publishers of other participants on the topic of predictions, and what to do about them.
+    fn rivals(&self) -> HashMap<GUID, String> {
+        let Some((name, dds_name)) = &self.predictions else { return HashMap::new() };
+        let own = self.participant.guid_prefix();
+        let writers = self.participant.discovered_writers().into_iter();
+        let rivals = writers.map(|writer| writer.publication_topic_data);
+        let rivals = rivals.filter(|peer| peer.topic_name == *dds_name && peer.key.prefix != own);
+        let what = format!(
+            "another program publishes on {name} too, whose subscribers get the predictions of all; a namespace \
+             (-r __ns:=/NAME) keeps nodes apart"
+        );
+        rivals.map(|peer| (peer.key, what.clone())).collect()
     }
 
     /// The peers that cannot be connected, and why.
