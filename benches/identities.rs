@@ -5,9 +5,9 @@
 use std::time::{Duration, Instant};
 
 use squealcast::node::session_chart;
-use squealcast::physics::numbering::{Agreement, compare};
-use squealcast::physics::synthetic::{Synthetic, rig};
 use squealcast::physics::{Chart, ContactLaw, MapOptions};
+use squealcast::proof::identities::{Agreement, compare};
+use squealcast::proof::synthetic::{Synthetic, rig};
 use squealcast::rig::{EMBEDDED, Rig};
 use squealcast::session::{chart_options, map_options};
 

@@ -8,8 +8,8 @@ use std::hint::black_box;
 use criterion::{Criterion, criterion_group, criterion_main};
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::chart::build::{ChartOptions, build};
-use squealcast::physics::synthetic::{Synthetic, Uniform, rig};
 use squealcast::physics::{Chart, ContactLaw, Model, OperatingPoint, Root, Solver, Summary, Traces, Vectors};
+use squealcast::proof::synthetic::{Synthetic, Uniform, rig};
 
 const BAND_MAX_HZ: f64 = 5000.0;
 /// More than caches keep of one condition for the next.

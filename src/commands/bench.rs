@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::{Outcome, positive, print, write_file};
 use crate::figures::plot;
-use crate::physics::stress;
+use crate::proof::stress;
 use crate::study::bench::lapack::Lapack;
 use crate::study::bench::{HeldOut, Kind, Offline, Plan, Route, measure};
 

@@ -126,8 +126,8 @@ mod tests {
     use super::*;
     use crate::physics::chart::Scratch;
     use crate::physics::chart::build::{ChartOptions, build};
-    use crate::physics::synthetic::{Synthetic, rig};
     use crate::physics::{OperatingPoint, Traces};
+    use crate::proof::synthetic::{Synthetic, rig};
 
     #[test]
     fn a_chart_of_another_builder_has_another_key() {

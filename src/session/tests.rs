@@ -117,7 +117,7 @@ fn conditions_within_the_dead_band_reuse_the_previous_prediction() {
 /// the margin is within its bound; at those loads the margin is exact.
 #[test]
 fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
-    use crate::physics::synthetic::{Synthetic, rig};
+    use crate::proof::synthetic::{Synthetic, rig};
     let law = crate::physics::ContactLaw { exponent: 0.4, ..Default::default() };
     let model = rig(&Synthetic { modes: 24, pairs: 12, damping_ratio: 0.0, contact_law: law, seed: 1 }).unwrap();
     let like = Rig::load("nine-dof-case-2").expect("embedded");
@@ -342,7 +342,7 @@ fn beyond_the_searched_range_there_is_no_margin() {
 /// While the load changes, new window ends are requested at most ten times per second of stamps.
 #[test]
 fn ends_are_asked_for_at_most_ten_times_a_second() {
-    use crate::physics::synthetic::{Synthetic, rig};
+    use crate::proof::synthetic::{Synthetic, rig};
     let contact_law = ContactLaw { exponent: 0.4, ..Default::default() };
     let model = rig(&Synthetic { modes: 24, pairs: 12, damping_ratio: 0.0, contact_law, seed: 1 }).unwrap();
     let mut session = with_map(of(model));

@@ -1,10 +1,10 @@
-//! Extremes for the numerics: every case of `physics::stress`, and random rigs against what needs no eigenvalue solver.
+//! Extremes for the numerics: every case of `proof::stress`, and random rigs against what needs no eigenvalue solver.
 
 use faer::{Mat, c64};
 use proptest::prelude::*;
-use squealcast::physics::stress::{Checked, cases, follow, scan};
-use squealcast::physics::synthetic::{Synthetic, rig};
 use squealcast::physics::{ContactLaw, Law, Model, OperatingPoint, Solver, Term, Vectors};
+use squealcast::proof::stress::{Checked, cases, follow, scan};
+use squealcast::proof::synthetic::{Synthetic, rig};
 
 #[test]
 fn every_extreme_comes_out_as_it_should() {

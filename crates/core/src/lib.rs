@@ -3,8 +3,12 @@
 //!
 //! The crate is pure: there is no file, clock, bus, log or serialisation in it or in its dependency tree.
 
+mod chebyshev;
 pub mod fem;
 pub mod physics;
+#[cfg(any(test, feature = "proof"))]
+pub mod proof;
 pub mod reduction;
+mod sampling;
 #[cfg(test)]
 mod spoil;

@@ -1,7 +1,7 @@
 //! Run time and error of every route from an operating point to its roots, on synthetic rigs.
 //!
 //! At each operating point all routes are measured in turn, so that other load on the machine affects all of them
-//! alike. Errors are relative errors of `λ²` against roots to thirty digits ([`crate::physics::reference`]) of a seeded
+//! alike. Errors are relative errors of `λ²` against roots to thirty digits ([`crate::proof::reference`]) of a seeded
 //! choice of modes. Where rounding does not separate two roots, they are the errors of the pair's mean and
 //! discriminant. Every answer is checked before it is timed.
 
@@ -15,13 +15,13 @@ use serde::Serialize;
 
 use crate::physics::chart::Scratch;
 use crate::physics::chart::build::{ChartError, ChartOptions, Progress, resume};
-use crate::physics::chart::hold_out::hold_out;
-use crate::physics::reference::{self, Refined};
-use crate::physics::synthetic::{Synthetic, Uniform, rig};
 use crate::physics::{
     Chart, ContactLaw, MapOptions, Model, OperatingPoint, Root, Solver, Spectrum, StabilityMap, Summary, Traces,
     Vectors,
 };
+use crate::proof::held_out::hold_out;
+use crate::proof::reference::{self, Refined};
+use crate::proof::synthetic::{Synthetic, Uniform, rig};
 use lapack::Lapack;
 
 /// Which synthetic rigs are measured.

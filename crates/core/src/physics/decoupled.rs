@@ -187,9 +187,9 @@ mod tests {
     use super::super::model::{ContactLaw, ContactPairs};
     use super::super::solver::Solver;
     use super::super::stability_map::{MapOptions, StabilityMap};
-    use super::super::synthetic::Uniform;
     use super::super::test_models::REFERENCE;
     use super::*;
+    use crate::proof::synthetic::Uniform;
 
     /// Ten modes on three contact pairs. Those in `untouched` have zero contact rows. Mode 8 is free, mode 9
     /// overdamped.

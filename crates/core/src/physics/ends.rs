@@ -352,9 +352,9 @@ impl Search<'_> {
 mod tests {
     use super::super::model::ContactLaw;
     use super::super::stability_map::MapOptions;
-    use super::super::synthetic::{Synthetic, Uniform, rig};
     use super::super::test_models::{REFERENCE, hulten, nine_dof};
     use super::*;
+    use crate::proof::synthetic::{Synthetic, Uniform, rig};
 
     const OPTIONS: MapOptions =
         MapOptions { mu_min: 0.0, mu_max: 2.0, band_max_hz: None, instability_threshold: 1e-6, windows: true };

@@ -21,8 +21,8 @@
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef};
 
-use super::chart::chebyshev;
 use super::model::{ContactPairs, KnownTerm, Law, Model, ModelError};
+use crate::chebyshev;
 
 /// Maximum condition number of `I + K_c R(μ)`.
 const CONDITION_LIMIT: f64 = 1e10;

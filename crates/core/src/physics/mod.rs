@@ -12,16 +12,13 @@ pub mod identification;
 pub mod model;
 pub mod numbering;
 pub mod operating_point;
-pub mod reference;
 pub mod sensitivity;
-mod solver;
+pub(crate) mod solver;
 pub mod spectrum;
 pub mod stability_map;
-pub mod stress;
 pub mod summary;
-pub mod synthetic;
 #[cfg(test)]
-mod test_models;
+pub(crate) mod test_models;
 mod traces;
 pub mod tracking;
 #[cfg(test)]

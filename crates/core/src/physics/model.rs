@@ -9,9 +9,9 @@ use std::sync::Arc;
 
 use faer::{Mat, MatRef};
 
-use super::chart::chebyshev;
 use super::decoupled::Division;
 use super::operating_point::{ContactState, OperatingPoint};
+use crate::chebyshev;
 
 /// A constant matrix times a scalar law of the operating point.
 #[derive(Clone, Debug)]

@@ -431,9 +431,9 @@ mod tests {
     use super::super::operating_point::OperatingPoint;
     use super::super::solver::Solver;
     use super::super::spectrum::Vectors;
-    use super::super::synthetic::{Synthetic, rig};
     use super::super::test_models::{REFERENCE, hulten, nine_dof};
     use super::*;
+    use crate::proof::synthetic::{Synthetic, rig};
 
     fn solve(model: &Model, p: &OperatingPoint) -> Spectrum {
         Solver::new(model.dimension()).solve(model, p, Vectors::Right).expect("it solves")

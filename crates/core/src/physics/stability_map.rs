@@ -151,7 +151,7 @@ impl StabilityMap {
     /// Identities of the roots of `spectrum`, assigned by shape. `spectrum` must be solved at the map's load and
     /// speed or close to them. The search for window ends uses them to follow a pair; modes that are shown get their
     /// identities from [`StabilityMap::ids`].
-    pub(super) fn identify(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
+    pub(crate) fn identify(&self, spectrum: &Spectrum) -> Vec<Option<u32>> {
         let mu = spectrum.point.friction_coefficient;
         let after = self.nodes.partition_point(|node| node.mu() < mu);
         let nearest = match (after.checked_sub(1).and_then(|k| self.nodes.get(k)), self.nodes.get(after)) {
@@ -279,7 +279,7 @@ fn settle_pairs(from: &Node, to: &Spectrum, ids: &mut [Option<u32>]) {
 }
 
 /// The mirror image `-λ̄` of root `j` at the imaginary axis: the other member of an undamped flutter pair.
-pub(super) fn mirror(spectrum: &Spectrum, j: usize) -> Option<usize> {
+pub(crate) fn mirror(spectrum: &Spectrum, j: usize) -> Option<usize> {
     let root = spectrum.roots[j];
     if !root.oscillates() || root.lambda.re == 0.0 {
         return None;

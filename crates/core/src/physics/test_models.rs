@@ -4,7 +4,7 @@ use faer::{Mat, Side, mat};
 
 use super::model::{ContactLaw, ContactPairs, Law, Model, Term};
 use super::operating_point::OperatingPoint;
-use super::synthetic::Uniform;
+use crate::proof::synthetic::Uniform;
 
 pub const REFERENCE: OperatingPoint =
     OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.35 };

@@ -16,10 +16,10 @@ use super::ReductionError;
 use super::full_model::FullModel;
 use super::full_order::{FullProgress, FullSolver, FullSpectrum, FullVectors};
 use super::matching::pair_off;
-use crate::physics::chart::radical_inverse;
 use crate::physics::{
     MapError, MapOptions, Model, ModelError, OperatingPoint, SolveError, Solver, StabilityMap, Vectors, Window,
 };
+use crate::sampling::radical_inverse;
 
 /// Length, relative to the vector, of its component outside the basis below which it is not added. With right and left
 /// vectors in the basis the error of a root is of the order of the square of this.

@@ -2,7 +2,7 @@
 
 use super::ReductionError;
 use crate::physics::OperatingPoint;
-use crate::physics::chart::radical_inverse;
+use crate::sampling::radical_inverse;
 
 /// Ratio of the ends of a range above which it is sampled uniformly in the logarithm.
 const GEOMETRIC_ABOVE: f64 = 3.0;

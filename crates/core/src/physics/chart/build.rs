@@ -10,9 +10,9 @@
 use std::panic::resume_unwind;
 use std::sync::{Mutex, PoisonError};
 
-use super::chebyshev::{Basis, Fit};
-use super::hold_out::within_bounds;
+use super::fit::{Basis, Fit};
 use super::leaf::Branches;
+use super::pairing::within_bounds;
 use super::samples::{Sample, Sampler, follow, spread};
 use super::{Axis, Branch, Chart, Leaf, MAX_AXES, Scratch};
 use crate::physics::model::Model;
@@ -354,11 +354,11 @@ mod tests {
 
     use super::*;
     use crate::physics::chart::NotCharted;
-    use crate::physics::chart::hold_out::{HoldOut, hold_out};
     use crate::physics::model::{ContactLaw, Law, Term};
     use crate::physics::spectrum::Vectors;
-    use crate::physics::synthetic::{Synthetic, Uniform, rig};
     use crate::physics::test_models::nine_dof;
+    use crate::proof::held_out::{HoldOut, hold_out};
+    use crate::proof::synthetic::{Synthetic, Uniform, rig};
 
     fn options(low: (f64, f64, f64), high: (f64, f64, f64), band_max_hz: Option<f64>) -> ChartOptions {
         let point = |(friction_coefficient, normal_load_n, disc_speed_rad_s)| OperatingPoint {

@@ -1,6 +1,6 @@
 //! Expansions of many functions in one basis, evaluated together as a product of the basis values with a matrix.
 
-use super::chebyshev::Basis;
+use super::fit::Basis;
 
 /// Expansions of several functions (channels) on a box.
 #[derive(Clone, Debug)]

@@ -4,9 +4,9 @@
 use faer::{Mat, c64};
 
 use super::build::Builder;
-use super::chebyshev::{Basis, Fit, Fitted};
 use super::cluster::{MAX_SIZE, symmetric_curvatures, symmetric_functions, symmetric_slopes};
 use super::derivatives::pairs;
+use super::fit::{Basis, Fit, Fitted};
 use super::samples::Sample;
 use super::{Channels, Cluster, Leaf, MAX_AXES};
 

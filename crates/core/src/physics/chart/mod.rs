@@ -9,11 +9,11 @@
 
 pub mod build;
 mod channels;
-pub(super) mod chebyshev;
 mod cluster;
 mod derivatives;
-pub mod hold_out;
+mod fit;
 mod leaf;
+pub(crate) mod pairing;
 mod samples;
 mod words;
 
@@ -24,10 +24,11 @@ use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, magnitude, square_root};
 use super::traces::Exact;
 use channels::Channels;
-use chebyshev::Basis;
 use cluster::MAX_SIZE;
+use fit::Basis;
 
-pub(crate) use samples::radical_inverse;
+#[cfg(any(test, feature = "proof"))]
+pub(crate) use leaf::MERGING;
 pub use words::{BUILDER, FORMAT};
 
 /// A condition that a chart depends on, and its coordinate inside a box.

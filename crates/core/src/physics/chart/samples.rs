@@ -11,6 +11,7 @@ use crate::physics::solver::{ROUNDING, Solver};
 use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
 use crate::physics::traces::{Exact, Traces};
 use crate::physics::tracking::{continue_roots, tracked};
+use crate::sampling::radical_inverse;
 
 /// Condition number of a root above which its slope and curvature are too inaccurate to be used.
 const SOUND_CONDITION: f64 = 2e3;
@@ -237,18 +238,6 @@ pub fn spread(axes: usize, taken: &[[f64; MAX_AXES]], count: usize) -> Vec<[f64;
         .collect()
 }
 
-/// The radical inverse of `index`: its digits in `base`, mirrored at the radix point (van der Corput 1935; Halton
-/// 1960).
-pub(crate) fn radical_inverse(mut index: usize, base: usize) -> f64 {
-    let (mut value, mut digit) = (0.0, 1.0 / base as f64);
-    while index > 0 {
-        value += digit * (index % base) as f64;
-        index /= base;
-        digit /= base as f64;
-    }
-    value
-}
-
 /// Connects the roots of all samples to branches, numbered like the roots of `samples[start]`. Each sample is
 /// connected to the nearest sample already done. Returns the root index by `[sample][branch]`, or `None` if a root is
 /// lost.
@@ -286,7 +275,7 @@ pub fn follow(samples: &[&Sample], units: &[[f64; MAX_AXES]], start: usize) -> O
 mod tests {
     use super::*;
     use crate::physics::model::ContactLaw;
-    use crate::physics::synthetic::{Synthetic, rig};
+    use crate::proof::synthetic::{Synthetic, rig};
 
     /// Curvatures compared with central differences of slopes with step `h = 1e-4`. The differences have errors of
     /// order `h²` (truncation) and `1e-11 / h` (rounding), relative to the change of the root.

@@ -1,7 +1,7 @@
 //! Serialisation of a chart as 64-bit words, for storing, comparing and hashing.
 
-use super::chebyshev::Basis;
 use super::cluster::MAX_SIZE;
+use super::fit::Basis;
 use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
 /// Format version: incremented when the meaning of the words or the result of a build changes.
@@ -9,12 +9,12 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 15] = [
+pub const BUILDER: [&str; 17] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
-    include_str!("chebyshev.rs"),
     include_str!("cluster.rs"),
     include_str!("derivatives.rs"),
+    include_str!("fit.rs"),
     include_str!("leaf.rs"),
     include_str!("mod.rs"),
     include_str!("samples.rs"),
@@ -25,6 +25,8 @@ pub const BUILDER: [&str; 15] = [
     include_str!("../model.rs"),
     include_str!("../solver.rs"),
     include_str!("../tracking.rs"),
+    include_str!("../../chebyshev.rs"),
+    include_str!("../../sampling.rs"),
 ];
 
 const AXES: [Axis; 4] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed];

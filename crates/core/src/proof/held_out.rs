@@ -2,16 +2,12 @@
 
 use faer::c64;
 
-use super::build::ChartOptions;
-use super::leaf::MERGING;
-use super::{Chart, NotCharted, Scratch};
-use crate::physics::model::Model;
-use crate::physics::operating_point::OperatingPoint;
-use crate::physics::solver::{ROUNDING, Solver};
-use crate::physics::spectrum::{Root, SolveError, Spectrum, Vectors};
-use crate::physics::synthetic::Uniform;
-use crate::physics::traces::Traces;
+use crate::physics::chart::build::ChartOptions;
+use crate::physics::chart::pairing::{partners, within};
+use crate::physics::chart::{Chart, MERGING, NotCharted, Scratch};
 use crate::physics::tracking::tracked;
+use crate::physics::{Model, OperatingPoint, Root, SolveError, Solver, Spectrum, Traces, Vectors};
+use crate::proof::synthetic::Uniform;
 
 /// Result of a comparison.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -116,31 +112,4 @@ impl HoldOut {
             }
         }
     }
-}
-
-/// For each charted root, the nearest dense root and the difference as a fraction of the sum of both bounds. Each
-/// dense root is used once; `None` if none is left.
-fn partners(modes: &[Root], spectrum: &Spectrum) -> Vec<Option<(usize, f64)>> {
-    let rounding = ROUNDING * f64::EPSILON * spectrum.matrix_norm;
-    let mut left: Vec<usize> = (0..tracked(spectrum)).collect();
-    let partner = |root: &Root| {
-        let off = |k: usize| (spectrum.roots[k].square - root.square).norm();
-        let at = (0..left.len()).min_by(|&a, &b| off(left[a]).total_cmp(&off(left[b])))?;
-        let nearest = left.swap_remove(at);
-        let dense = spectrum.roots[nearest].error.square;
-        let slack = if spectrum.undamped { rounding } else { 2.0 * root.lambda.norm() * rounding };
-        let limit = root.error.square + if dense.is_finite() { dense } else { slack };
-        Some((nearest, if off(nearest) == 0.0 { 0.0 } else { off(nearest) / limit }))
-    };
-    modes.iter().map(partner).collect()
-}
-
-/// Whether an error is within its bound, given as a fraction of it; false for NaN.
-fn within(share: f64) -> bool {
-    share <= 1.0
-}
-
-/// Whether every charted root has a dense root within the bounds of both, each dense root used once.
-pub(super) fn within_bounds(modes: &[Root], spectrum: &Spectrum) -> bool {
-    partners(modes, spectrum).iter().all(|partner| partner.is_some_and(|(_, share)| within(share)))
 }

@@ -17,8 +17,8 @@
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef, c64};
 
-use super::spectrum::Spectrum;
 use super::synthetic::Uniform;
+use crate::physics::Spectrum;
 
 /// An unevaluated sum `high + low` of two floating-point numbers.
 #[derive(Clone, Copy, Debug, Default)]
@@ -424,13 +424,10 @@ fn permutations(items: Vec<Complex>) -> Vec<Vec<Complex>> {
 mod tests {
     use faer::mat;
 
-    use super::super::model::{ContactLaw, Law, Model, Term};
-    use super::super::operating_point::OperatingPoint;
-    use super::super::solver::Solver;
-    use super::super::spectrum::Vectors;
-    use super::super::synthetic::{Synthetic, rig};
-    use super::super::test_models::{REFERENCE, nine_dof, random_rig};
     use super::*;
+    use crate::physics::test_models::{REFERENCE, nine_dof, random_rig};
+    use crate::physics::{ContactLaw, Law, Model, OperatingPoint, Solver, Term, Vectors};
+    use crate::proof::synthetic::{Synthetic, rig};
 
     /// The matrices and the spectrum of a model at an operating point.
     fn solved(model: &Model, p: &OperatingPoint) -> (Mat<f64>, Mat<f64>, Spectrum) {

@@ -21,15 +21,15 @@
 
 use faer::{Mat, c64};
 
-use super::critical::Window;
-use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
-use super::operating_point::OperatingPoint;
 use super::reference::{self, MAX_TOGETHER};
-use super::solver::{ROUNDING, Solver};
-use super::spectrum::{Spectrum, Vectors};
-use super::stability_map::{MapOptions, StabilityMap, mirror};
 use super::synthetic::{Synthetic, Uniform, rig};
-use super::tracking::tracked;
+use crate::physics::solver::ROUNDING;
+use crate::physics::stability_map::mirror;
+use crate::physics::tracking::tracked;
+use crate::physics::{
+    ContactLaw, ContactPairs, Law, MapOptions, Model, ModelError, OperatingPoint, Solver, Spectrum, StabilityMap, Term,
+    Vectors, Window,
+};
 
 /// An extreme case.
 pub struct Case {

@@ -4,7 +4,7 @@
 
 use faer::Mat;
 
-use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
+use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
 
 /// A pseudo-random stream, uniform in `[-1, 1)` (Marsaglia's xorshift, 2003), identical on every machine.
 #[derive(Clone, Debug)]
