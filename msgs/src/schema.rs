@@ -157,7 +157,7 @@ pub fn field_difference(ours: &str, theirs: &str) -> Option<String> {
             return Some(format!("{place} is not there"));
         };
         if let Some(missing) = fields.iter().find(|field| !recorded.contains(field)) {
-            return Some(format!("{place} lacks `{missing}`"));
+            return Some(format!("{place} has no `{missing}`"));
         }
         if let Some(more) = recorded.iter().find(|field| !fields.contains(field)) {
             return Some(format!("{place} has `{more}`"));
@@ -234,7 +234,7 @@ mod tests {
         assert_eq!(field_difference(&ours, &theirs), None);
         assert_eq!(field_difference("std_msgs/msg/Header header\n", "std_msgs/Header   header"), None);
         let without = ours.replace("bool reused\n", "");
-        assert_eq!(field_difference(&ours, &without).as_deref(), Some("the recorded one lacks `bool reused`"));
+        assert_eq!(field_difference(&ours, &without).as_deref(), Some("the recorded one has no `bool reused`"));
         let order = field_difference("float64 a\nfloat64 b", "float64 b\nfloat64 a");
         assert_eq!(order.as_deref(), Some("the recorded one has them in another order"));
     }

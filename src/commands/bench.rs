@@ -210,7 +210,7 @@ fn table(report: &Report) -> String {
     text
 }
 
-/// Runs all stress cases and prints what was done and what resulted; differences if a result is not as expected.
+/// Runs all stress cases and prints their results; reports differences if one fails.
 fn stress_table() -> anyhow::Result<Outcome> {
     let mut outcome = Outcome::Done;
     for case in stress::cases() {

@@ -16,7 +16,7 @@ const DEFAULT_PORT: u16 = 8765;
 /// Number of ports that are tried.
 const PORTS: u16 = 10;
 
-/// Where to show what is going on.
+/// Options of the page.
 #[derive(Clone, Debug, Args)]
 pub struct DisplayOptions {
     /// Serve the page on this address [default: 127.0.0.1:8765, or the next free port]

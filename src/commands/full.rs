@@ -25,7 +25,7 @@ pub struct Options {
     /// Highest frequency in Hz [default: the model's band, else 5000]
     #[arg(long, value_name = "HZ", value_parser = positive)]
     band_hz: Option<f64>,
-    /// Memory that may be used [default: what is available on the machine]
+    /// Memory that may be used [default: the memory available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Print JSON

@@ -112,8 +112,8 @@ impl Options {
 }
 
 /// Writes `rig` with the stiffness of every contact pair multiplied by `factor`. The name of the rig is that of its file. A
-/// comparison with a full model (`[reduction]`) is left out, since it was made with the former stiffness. Archives are
-/// written beside the rig unless they are there already.
+/// comparison with a full model (`[reduction]`) is omitted, since it was made with the former stiffness. Archives are
+/// written to the folder of the rig unless they exist there.
 fn write_rig(rig: &Rig, factor: f64, targets: &Path, path: &Path) -> anyhow::Result<()> {
     let fitted = rig.with_contact_stiffness_times(factor)?;
     let Some((rig_file, archives)) = fitted.files.split_first() else { bail!("{}: has no rig file", rig.name) };

@@ -61,7 +61,7 @@ Examples:
   squealcast rigs                                       the embedded rigs
   squealcast critical tribometer                        where it becomes unstable
   squealcast predict nine-dof-case-2 --mu 0.4           its modes at one operating point
-  squealcast run my-rig.toml --record sessions          the node beside the rig";
+  squealcast run my-rig.toml --record sessions          run the node and record";
 
 /// Predicts friction-induced vibration of a pad-on-disc tribometer, live, from its operating conditions.
 #[derive(Debug, Parser)]

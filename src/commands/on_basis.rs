@@ -49,7 +49,7 @@ pub fn ranges(text: &str) -> Result<Ranges, String> {
             "mu" => &mut ranges.friction_coefficient,
             "load" => &mut ranges.normal_load_n,
             "speed" => &mut ranges.disc_speed_rad_s,
-            other => return wrong(format!("`{other}` is none of mu, load and speed")),
+            other => return wrong(format!("`{other}` is not mu, load or speed")),
         };
         if slot.replace([low, high]).is_some() {
             return wrong(format!("`{}` twice", name.trim()));
@@ -170,7 +170,7 @@ mod tests {
             ("mu", "no `=`"),
             ("mu=a", "invalid float"),
             ("mu=0:1:2", "3 numbers"),
-            ("mass=1", "none of mu, load and speed"),
+            ("mass=1", "not mu, load or speed"),
             ("mu=0,mu=1", "`mu` twice"),
         ] {
             assert!(ranges(text).unwrap_err().contains(expected), "{text}: {}", ranges(text).unwrap_err());

@@ -31,7 +31,7 @@ impl TopicOptions {
     /// Opens a recording and reports what cannot be read.
     ///
     /// # Errors
-    /// There is no recording, or it lacks the requested topics.
+    /// There is no recording, or the requested topics are not in it.
     pub fn open(&self, path: &Path) -> anyhow::Result<Recording> {
         let recording = Recording::open_with(path, ReadOptions { topics: self.read_topics.clone() })?;
         for damage in recording.damage() {
@@ -60,7 +60,7 @@ impl Recordings {
     /// Opens one of [`Recordings::paths`] and reports what cannot be read.
     ///
     /// # Errors
-    /// There is no recording, or it lacks the requested topics.
+    /// There is no recording, or the requested topics are not in it.
     pub fn open(&self, path: &Path) -> anyhow::Result<Recording> {
         self.topics.open(path)
     }

@@ -27,7 +27,7 @@ const CUTOFF: f64 = 2.5;
 /// that grows, or decays by less than 20 1/s, is within a tolerance. With --modes or --cutoff-hz it consists of the
 /// lowest free-interface modes of pad and disc, with the residual flexibility of the truncated modes. The rig is
 /// compared with the full model at held-out operating points, and the rig file contains the result. The arrays are
-/// written beside the rig file under names with their hash, and the rig file last.
+/// written to the folder of the rig file under names with their hash, and the rig file last.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Full model
@@ -54,7 +54,7 @@ pub struct Options {
     /// Held-out operating points at which the rig is compared with the full model; 0 omits the comparison
     #[arg(long, value_name = "N", default_value_t = 3)]
     points: usize,
-    /// Memory that may be used [default: what is available on the machine]
+    /// Memory that may be used [default: the memory available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Rig file to write
@@ -74,7 +74,7 @@ fn mode_counts(text: &str) -> Result<ModeCounts, String> {
         .split('+')
         .map(|count| match count.trim().parse::<usize>() {
             Ok(count) if count > 0 => Ok(count),
-            Ok(_) => Err("0 modes asked for, expected at least 1 of each part".to_owned()),
+            Ok(_) => Err("0 modes requested, expected at least 1 of each part".to_owned()),
             Err(error) => Err(format!("`{count}`: {error}; expected counts such as 80+80")),
         })
         .collect();
@@ -97,7 +97,7 @@ impl Options {
         if self.modes.is_none() && self.cutoff_hz.is_none() {
             if full.geometry.len() == 1 {
                 bail!(
-                    "{}: a pad on a rigid disc has no basis of its own; expected --modes or --cutoff-hz",
+                    "{}: a pad on a rigid disc cannot be reduced on a basis; expected --modes or --cutoff-hz",
                     self.full.display()
                 );
             }
@@ -115,7 +115,7 @@ impl Options {
         let exponent = full.settings.contact_law.exponent;
         if exponent != 0.0 && !self.no_residual {
             bail!(
-                "{}: `load.exponent` is {exponent}: the residual of the modes left out is for contact whose stiffness stays; \
+                "{}: `load.exponent` is {exponent}: residual flexibility requires contact stiffness independent of the load; \
                  expected 0, --no-residual, or a basis (neither --modes nor --cutoff-hz)",
                 self.full.display()
             );
@@ -169,7 +169,7 @@ impl Options {
     ) -> anyhow::Result<Outcome> {
         let make = |known: Option<&Certificate>| -> anyhow::Result<(Vec<RigFile>, Rig)> {
             let files = files_of(known)?;
-            let rig = Rig::from_files(&files).context("what is left of the full model is not a rig")?;
+            let rig = Rig::from_files(&files).context("the reduced model is not a valid rig")?;
             Ok((files, rig))
         };
         let (mut files, mut rig) = make(None)?;
@@ -259,7 +259,7 @@ fn between_pairs(
     Ok(Some(between_patches(file, patches, [&pad.nodes_m, &disc.nodes_m], &known)?))
 }
 
-/// Comments for the head of the rig file: what was kept of each part.
+/// Comments for the head of the rig file: the modes kept of each part.
 fn remarks(names: &[&str], kept: &[Kept]) -> Vec<String> {
     let mut lines = vec![];
     for (name, kept) in names.iter().zip(kept) {
@@ -267,7 +267,7 @@ fn remarks(names: &[&str], kept: &[Kept]) -> Vec<String> {
         lines.push(format!(
             "{name}: {} modes up to {highest:.1} Hz, {}",
             kept.modes.omega_squared.len(),
-            if kept.residual.is_some() { "with the residual of all others" } else { "nothing of the others" }
+            if kept.residual.is_some() { "with the residual of all others" } else { "without residual of the others" }
         ));
     }
     lines

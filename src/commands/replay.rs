@@ -266,13 +266,13 @@ fn frame(path: &Path, recording: &Recording, played: &Arc<AtomicU64>, stopped: &
 /// The rig contained in a recording.
 pub fn recorded_rig(recording: &Recording) -> anyhow::Result<Rig> {
     let hash = recording.session_metadata("rig_content_hash");
-    let hash = hash.context("the recording names no rig; say which with --rig")?;
+    let hash = hash.context("the recording names no rig; name one with --rig")?;
     let files: Vec<RigFile> = recording
         .attachments()
         .iter()
         .map(|attachment| RigFile { name: attachment.name.clone(), bytes: attachment.data.clone() })
         .collect();
-    ensure!(!files.is_empty(), "the recording carries no rig file; say which with --rig");
+    ensure!(!files.is_empty(), "the recording contains no rig file; name one with --rig");
     let rig = Rig::from_files(&files)?;
     if rig.content_hash != hash {
         bail!("the recorded rig has hash {}, expected {hash} of the metadata", rig.content_hash);

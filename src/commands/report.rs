@@ -14,7 +14,7 @@ use crate::display::report::{Origin, report};
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,
-    /// Directory for the report, created if missing. With several recordings, each gets a subdirectory of its own name
+    /// Directory for the report, created if missing. With several recordings, each gets a subdirectory named after it
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Use this rig for stability maps instead of the recorded one
@@ -47,7 +47,7 @@ impl Options {
             version: recording.session_metadata("squealcast_version").map(str::to_owned),
         };
         let html = report(&recorded, &origin)?;
-        std::fs::create_dir_all(directory).with_context(|| format!("{}: cannot make it", directory.display()))?;
+        std::fs::create_dir_all(directory).with_context(|| format!("{}: cannot be created", directory.display()))?;
         write_file(&directory.join("report.html"), html.as_bytes())?;
         write_file(&directory.join("events.csv"), recorded.events.to_csv().as_bytes())?;
         print(&format!("{}\n", directory.join("report.html").display()))?;

@@ -25,7 +25,7 @@ pub struct Options {
     /// Degrees of freedom of the tribometer, at least; the paper's model has 904968
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = clap::value_parser!(u32).range(5_000..=4_000_000))]
     dof: u32,
-    /// Memory that may be used [default: what is available on the machine]
+    /// Memory that may be used [default: the memory available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Folder to write into
@@ -43,7 +43,7 @@ impl Options {
             std::process::exit(130);
         })?;
         std::fs::create_dir_all(&self.output)
-            .with_context(|| format!("{}: cannot make the folder", self.output.display()))?;
+            .with_context(|| format!("{}: the folder cannot be created", self.output.display()))?;
         let mut items = nine_dof()?;
         items.iter().try_for_each(|item| self.write(item))?;
         let of_tribometer = self.tribometer()?;

@@ -144,7 +144,7 @@ pub fn serve(
             parameter: Box::new(move |name, value| {
                 // Does not block, because it runs on the thread that receives from the bus.
                 if changes.try_send(Incoming::Parameter { name: name.to_owned(), value }).is_err() {
-                    note!("parameter {name} = {value} came into a full queue and has no effect");
+                    note!("parameter {name} = {value} is ignored: the node's queue is full");
                 }
             }),
             fell: Box::new(|why| note!("the ROS 2 side fell and is started again: {why}")),

@@ -43,7 +43,7 @@ pub struct Options {
     /// Compare roots only, since the windows of a large damped model take long
     #[arg(long)]
     no_windows: bool,
-    /// Memory that may be used [default: what is available on the machine]
+    /// Memory that may be used [default: the memory available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
     /// Print JSON

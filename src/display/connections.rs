@@ -331,7 +331,7 @@ mod tests {
         for dropped in &mut silent[..17] {
             assert!(is_closed(dropped), "more connections than the bound are open");
         }
-        assert!(is_answered(&mut used), "what was answered stays before what never asked");
+        assert!(is_answered(&mut used), "an answered connection ranks before one without a request");
     }
 
     #[test]

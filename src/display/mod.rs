@@ -1,6 +1,6 @@
 //! Displays for people: a page that shows a node or a recording, and a report.
 //!
-//! The pure modules convert data to what is shown: [`history`], [`events`] and [`curves`] use samples and stability
+//! The pure modules convert data for display: [`history`], [`events`] and [`curves`] use samples and stability
 //! maps, [`comparison`] a measured vibration, [`shape`] and [`change`] a spectrum, [`state`] a snapshot. [`live`] and
 //! [`recorded`] provide the data; [`server`] serves browsers. Nothing here can affect a node: a node only updates its
 //! [`crate::node::Watch`], whether or not it is displayed. Text is only encoded while a page is connected.

@@ -256,7 +256,7 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
         html,
         "<p>A <em>measured squeal</em> is a stretch of measurements of at least {} dB, with interruptions shorter than \
          0.25 s, that lasts at least {} s; its frequency is that of its loudest measurement. A <em>predicted squeal</em> \
-         is a SQUEAL event of this report; its frequencies are those over which its unstable modes went. They match where \
+         is a SQUEAL event of this report; its frequencies are the range of its unstable modes' frequencies. They match where \
          they overlap in time, the prediction widened by {} s at both ends, and where the measured frequency is within \
          {} % of one of those frequencies. A measured squeal with a match is a <em>hit</em>, one without a \
          <em>miss</em>; a predicted squeal without a match is a <em>false alarm</em>. The lead is negative where the \
@@ -389,7 +389,7 @@ fn skipped(recorded: &Recorded) -> String {
     let counted = recorded.counted.iter().flat_map(|counted| &counted.status).flat_map(|status| &status.values);
     let counted: Vec<(&str, &str)> = counted.map(|pair| (&*pair.key, &*pair.value)).collect();
     if !counted.is_empty() {
-        html += "<p>What the node counted by the end:</p>\n";
+        html += "<p>Counters of the node at the end:</p>\n";
         html += &facts(counted);
     }
     if recorded.damage.is_empty() {

@@ -170,7 +170,7 @@ fn record(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricB
     table
 }
 
-/// Comment lines at the top of the rig file: what the rig was made of.
+/// Comment lines at the top of the rig file: the full model and the basis.
 fn remarks(full: &FullModelFile, request: &ParametricRequest, basis: &ParametricBasis) -> Vec<String> {
     let mut lines = source_remarks(full);
     lines.push(format!(

@@ -23,7 +23,7 @@ const DECK_MODES: usize = 20;
 /// # Errors
 /// A part that cannot be assembled, a file that cannot be written.
 pub fn write_full_model(tribometer: &Tribometer, folder: &Path, mut say: impl FnMut(&str)) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder).with_context(|| format!("{}: cannot make the folder", folder.display()))?;
+    std::fs::create_dir_all(folder).with_context(|| format!("{}: the folder cannot be created", folder.display()))?;
     let mut toml = format!(
         "# A pad-on-disc tribometer of the paper's kind, with dimensions of this project: {} degrees of freedom.\n\
          name = \"tribometer\"\n\n[band]\nmax_hz = {BAND_HZ:?}\n\n[search]\nmu_max = {MU_MAX:?}\n",

@@ -18,7 +18,7 @@ use crate::study::bench::Route;
 
 /// Drawing units per px. The plotting library rounds positions to whole units; a finer grid keeps curves smooth.
 const FINE: u32 = 8;
-/// Colours of neighbouring curves, the same as on the page over white. The colour-blind can tell them apart, too.
+/// Colours of neighbouring curves, the same as on the page over white. They can be distinguished with colour blindness too.
 pub(crate) const COLOURS: [RGBColor; 7] = [
     RGBColor(26, 53, 216),
     RGBColor(122, 0, 18),
@@ -31,7 +31,7 @@ pub(crate) const COLOURS: [RGBColor; 7] = [
 
 /// Dash patterns that distinguish modes of the same colour: px drawn and px left out.
 const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
-/// Width of a legend, px, and its largest number of entries. More modes could not be told apart.
+/// Width of a legend, px, and its largest number of entries. More modes could not be distinguished.
 const LEGEND_WIDTH: usize = 891;
 const LEGEND_MOST: usize = 27;
 

@@ -94,7 +94,7 @@ pub fn rows_of(file: &str, input: impl BufRead) -> Result<Vec<Label>, RigError> 
             Ok(())
         }
         Listed::Numbers(..) => {
-            let limit = "node, direction, node, direction and value, or `rows` that say what the numbers are";
+            let limit = "node, direction, node, direction and value, or `rows` with node and direction of every number";
             Err(refuse(file, line, "entry", "has a row number".to_owned(), limit))
         }
     })?;

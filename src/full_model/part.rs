@@ -30,7 +30,7 @@ struct Read<'a> {
     row_of: &'a HashMap<Label, usize>,
 }
 
-/// What a matrix file must match, known before it is read.
+/// Required properties of a matrix file, known before it is read.
 pub struct Expected<'a> {
     pub rows: usize,
     /// The file or field that determines the number of rows, for errors.
@@ -105,7 +105,7 @@ fn placed(
         };
         let node = match nodes.place(label) {
             Some(node) => node,
-            // CalculiX assigns the incompatible modes of its bricks to nodes of their own.
+            // CalculiX assigns the incompatible modes of its bricks to separate nodes.
             None if internal => {
                 rows.push((INTERNAL, direction));
                 continue;
@@ -142,7 +142,7 @@ fn interface(toml: &str, field: &str, labels: &[u64], nodes: &Nodes, nodes_file:
     Ok(places)
 }
 
-/// Reads a square matrix and multiplies it by `factor`; `expected` is what it must match.
+/// Reads a square matrix and multiplies it by `factor`; `expected` are its required properties.
 ///
 /// # Errors
 /// [`RigError`].

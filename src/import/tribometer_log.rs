@@ -21,13 +21,13 @@ pub enum LogError {
     NoHeader { line: usize, header: String, missing: String, hint: String },
     #[error("line {line}: no column is called {header:?}, which {field} is to be read from")]
     NoSuchColumn { line: usize, field: Field, header: String },
-    #[error("line {line}: both {first:?} and {second:?} may be {field}: say which with --column {field}=NAME")]
+    #[error("line {line}: both {first:?} and {second:?} may be {field}: choose one with --column {field}=NAME")]
     TwoColumns { line: usize, field: Field, first: String, second: String },
     #[error("line {line}, column {column:?}: unit {unit:?} of {field} is not one of {known}")]
     Unit { line: usize, column: String, field: Field, unit: String, known: String },
     #[error(
         "both decimal commas and decimal points: {comma:?} in line {comma_line}, {point:?} in line {point_line}: \
-         say which with --decimal"
+         choose one with --decimal"
     )]
     Decimal { comma: String, comma_line: usize, point: String, point_line: usize },
     #[error("line {line}, column {column:?}: {value:?} is not {expected}")]
@@ -309,7 +309,7 @@ fn header_columns(cells: &[String], line: usize, options: &LogOptions) -> Result
 fn hint(field: Field, free: &[&String]) -> Option<String> {
     let fits = |cell: &&&String| split_unit(cell).1.is_some_and(|unit| !unit.is_empty() && field.unit(&unit).is_some());
     let column = free.iter().find(fits)?;
-    Some(format!("; if {column:?} is {field}, say so with --column '{field}={column}'"))
+    Some(format!("; if {column:?} is {field}, use --column '{field}={column}'"))
 }
 
 /// Name and unit of `name [unit]`, `name (unit)`, `name / unit` or `name in unit`.

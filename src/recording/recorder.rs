@@ -95,12 +95,12 @@ pub enum RecorderError {
     #[error(transparent)]
     Write(#[from] WriteError),
     #[error(
-        "recording failed: {reason}; {written} messages written, {dropped} lost; `squealcast recover` repairs what is there"
+        "recording failed: {reason}; {written} messages written, {dropped} lost; `squealcast recover` repairs its files"
     )]
     Failed { reason: String, written: u64, dropped: u64 },
-    #[error("the recorder did not finish within {0:?}: the disk does not answer; what is written can be recovered")]
+    #[error("the recorder did not finish within {0:?}: the disk does not respond; written messages can be recovered")]
     Timeout(Duration),
-    #[error("the recorder's thread ended unexpectedly; what is written can be recovered")]
+    #[error("the recorder's thread ended unexpectedly; written messages can be recovered")]
     Panicked,
 }
 
@@ -416,7 +416,7 @@ impl Drop for Recorder {
     }
 }
 
-/// Whether a disk error may be temporary, for example because somebody frees space.
+/// Whether a disk error may be temporary, for example until space is freed.
 fn may_pass(error: &RecorderError) -> bool {
     use io::ErrorKind::{FileTooLarge, QuotaExceeded, ReadOnlyFilesystem, StorageFull};
     const EIO: i32 = 5;

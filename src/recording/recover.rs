@@ -56,7 +56,7 @@ pub enum Outcome {
     InUse,
 }
 
-/// What was restored and what was lost.
+/// Counts of restored and lost messages.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Restored {
     /// The finished file.

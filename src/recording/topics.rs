@@ -255,10 +255,10 @@ mod tests {
             channel.schema = Some(Arc::new(Schema { data: text.replace(from, to).into_bytes(), ..schema }));
             read(channel).expect("it cannot be read")
         };
-        assert!(with_text("float64 friction_margin_error\n", "").contains("lacks `float64 friction_margin_error`"));
+        assert!(with_text("float64 friction_margin_error\n", "").contains("has no `float64 friction_margin_error`"));
         assert!(with_text("bool reused\n", "bool reused\nbool extra\n").contains("has `bool extra`"));
         // A message nested in the message.
-        assert!(with_text("float64 pad_participation\n", "").contains("Mode lacks `float64 pad_participation`"));
+        assert!(with_text("float64 pad_participation\n", "").contains("Mode has no `float64 pad_participation`"));
         let json = Channel { message_encoding: "json".to_owned(), ..prediction() };
         assert!(read(json).expect("not cdr").contains("\"json\""));
         let foreign = channel(Topic::Prediction.name(), Topic::RigInfo);

@@ -40,7 +40,7 @@ pub(super) fn build(
     };
     for (name, part) in [("pad", pad), ("disc", disc)] {
         if part.selected.len() != part.data.omega_rad_s.len() {
-            return refuse(&format!("{name}.modes"), "leaves out coordinates of a shared basis", "all of them");
+            return refuse(&format!("{name}.modes"), "omits coordinates of a shared basis", "all of them");
         }
         if part.side.damping_ratio.iter().any(|ratio| *ratio != 0.0) {
             return refuse(
@@ -128,7 +128,7 @@ impl RawBasis {
         let mut lines = vec![];
         if let (Some(tolerance), Some(error), Some(points)) = (tolerance, error, self.held_out) {
             lines.push(format!(
-                "basis      |dlambda|/|lambda| at most {error:.1e} at {points} held-out points, {tolerance:.1e} asked for"
+                "basis      |dlambda|/|lambda| at most {error:.1e} at {points} held-out points, {tolerance:.1e} required"
             ));
         }
         let ranges: Vec<String> = [

@@ -30,7 +30,7 @@ macro_rules! embedded {
 pub const EMBEDDED: [Embedded; 8] = [
     embedded!(
         "tribometer",
-        "pad-on-disc tribometer of 22032 degrees of freedom on 55 of its own vectors (default)",
+        "pad-on-disc tribometer of 22032 degrees of freedom on a basis of 55 vectors (default)",
         "tribometer-pad-565599e19c40.npz",
         "tribometer-disc-545e876cea94.npz"
     ),

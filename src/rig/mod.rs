@@ -251,11 +251,11 @@ impl Rig {
         })?;
         let read = |name: &str| match others.iter().find(|file| file.name == name) {
             Some(file) => Ok(file.bytes.clone()),
-            None => Err("it is not among the files given".to_owned()),
+            None => Err("it is not among the files of the rig".to_owned()),
         };
         let names: Vec<&str> = others.iter().map(|file| file.name.as_str()).collect();
         let limit =
-            if names.is_empty() { "a file given along".to_owned() } else { format!("one of {}", names.join(", ")) };
+            if names.is_empty() { "a file of the rig".to_owned() } else { format!("one of {}", names.join(", ")) };
         Self::build(first.clone(), &read, &limit)
     }
 

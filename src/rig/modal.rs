@@ -73,7 +73,7 @@ pub(super) fn build(
     Ok(built)
 }
 
-/// Builds the model of sides that have modal coordinates of their own.
+/// Builds the model of sides that have separate modal coordinates.
 fn apart(
     file: &str,
     pad: &Part,
@@ -182,7 +182,7 @@ fn given(
             return Err(RigError::Kind { file, field, value, limit: "one of the two".to_owned() });
         }
         if part.selected.len() != part.data.omega_rad_s.len() {
-            let (field, value) = (format!("{name}.modes"), "leaves out modes that [residual] does not hold".to_owned());
+            let (field, value) = (format!("{name}.modes"), "omits modes that [residual] does not contain".to_owned());
             return Err(RigError::Kind { file, field, value, limit: "all of them".to_owned() });
         }
     }

@@ -19,8 +19,8 @@ const MOST_BYTES: u64 = 1 << 30;
 const MOST_TIMES_ARCHIVE: (u64, u64) = (100, 64 << 20);
 /// Longest accepted header of an array, bytes; numpy writes 128.
 const LONGEST_HEADER: usize = 1024;
-/// Largest difference of two mirrored entries of a residual matrix, relative to its largest entry: what printing with
-/// ten digits leaves.
+/// Largest difference of two mirrored entries of a residual matrix, relative to its largest entry: the
+/// rounding of ten printed digits.
 const SYMMETRY: f64 = 1e-9;
 
 /// A numpy array in C order.
@@ -131,7 +131,7 @@ fn symmetric_residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> R
     };
     match arrays {
         [None, None] => Ok(None),
-        [None, Some(_)] => Err(refuse(file, names[1], "stands without residual_flexibility", "both, or neither")),
+        [None, Some(_)] => Err(refuse(file, names[1], "is given without residual_flexibility", "both, or neither")),
         [Some(flexibility), inertia] => Ok(Some(Residual {
             flexibility: symmetric(names[0], flexibility)?,
             inertia: inertia.map(|inertia| symmetric(names[1], inertia)).transpose()?,

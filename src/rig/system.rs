@@ -68,7 +68,7 @@ pub(super) fn build(source: &mut Source<'_>, raw: &RawSystem, settings: &Setting
             let symmetric: Vec<(f64, &SparseMatrix)> =
                 stiffness.iter().filter(|term| term.symmetric).map(|term| (term.at_reference, &term.matrix)).collect();
             if symmetric.is_empty() {
-                let value = "asks for modes of a system without a symmetric stiffness term".to_owned();
+                let value = "selects modes of a system without a symmetric stiffness term".to_owned();
                 let limit = "a symmetric matrix among [[system.stiffness]], or no `modes`".to_owned();
                 return Err(RigError::Kind { file, field: "system.modes".to_owned(), value, limit });
             }

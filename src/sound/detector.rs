@@ -1,4 +1,4 @@
-//! Finds squeal in a stream of samples: tones that are loud enough, stand out of the noise and last.
+//! Finds squeal in a stream of samples: tones that are loud enough, exceed the noise and last.
 //!
 //! Frames of about 40 ms (28 to 57 ms, the power of two nearest to 40 ms), a quarter of that apart, are searched for
 //! tones. A tone that lasts `min_duration_s` is a [`Squeal`]. Its onset, end and growth are then measured in the samples
@@ -49,7 +49,7 @@ const CLOCK_CORRECTION: f64 = 1.0 / 16.0;
 /// Most interruptions that are named; later ones are counted.
 pub const MOST_NAMED: usize = 100;
 
-/// What counts as squeal. The defaults are those of SAE J2521: at least 70 dB(A) between 1.25 and 16 kHz.
+/// Definition of squeal. The defaults are those of SAE J2521: at least 70 dB(A) between 1.25 and 16 kHz.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
     /// Least level, dB(A) re 20 µPa or dB re 1 µm/s².
@@ -127,7 +127,7 @@ pub struct Harmonic {
     pub of: u64,
 }
 
-/// What a detector finds.
+/// A finding of a detector.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Detection {
     /// A tone has lasted long enough. Its values are those so far.
@@ -311,7 +311,7 @@ impl Detector {
         Ok(detector)
     }
 
-    /// What it measures.
+    /// The measured quantity.
     pub fn quantity(&self) -> Quantity {
         self.calibration.quantity
     }
@@ -333,7 +333,7 @@ impl Detector {
         self.settings.min_duration_s + self.frame_s() + 2.0 * self.hop_s()
     }
 
-    /// What was received so far.
+    /// Counts of received samples.
     pub fn counts(&self) -> &Counts {
         &self.counts
     }
@@ -359,7 +359,7 @@ impl Detector {
         self.calibration.quantity.level_db(mean_square.sqrt())
     }
 
-    /// Takes the next block of samples, the first of them taken at `first_stamp_ns`. What is found is appended to
+    /// Takes the next block of samples, the first of them taken at `first_stamp_ns`. Findings are appended to
     /// `found`.
     pub fn push(&mut self, first_stamp_ns: i64, samples: &[f32], found: &mut Vec<Detection>) {
         let skipped = self.place(first_stamp_ns, samples.len(), found);

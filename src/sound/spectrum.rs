@@ -81,7 +81,7 @@ impl Spectra {
 
     /// The tone whose peak is at bin `k` of the latest spectrum, not the first or last bin.
     ///
-    /// The three magnitudes at and beside the peak of a Hann window give the fraction `δ` of a bin exactly, if the tone
+    /// The three magnitudes at and next to the peak of a Hann window give the fraction `δ` of a bin exactly, if the tone
     /// is stationary and alone: `δ = 2 (A_+ - A_-) / (2 A_0 + A_+ + A_-)`. The mean square follows from the shape of
     /// the main lobe, `W(δ) = sin(πδ) / (πδ (1 - δ²))`.
     ///

@@ -22,7 +22,7 @@ pub struct Waveform {
     pub samples: Vec<f32>,
 }
 
-/// What the samples of a channel mean.
+/// Meaning of the samples of a channel.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Channel {
     pub name: String,
@@ -48,7 +48,7 @@ pub enum Unit {
     FullScale,
 }
 
-/// What a channel measures.
+/// Quantity that a channel measures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Quantity {
     /// In Pa; levels in dB re 20 µPa, A-weighted: dB(A).

@@ -51,7 +51,7 @@ mod tests {
     fn values_within_their_rounding_bound_are_shown_as_zero() {
         assert_eq!(above_error(-1.7e-13, 2e-12, 5), "0");
         assert_eq!(above_error(-0.25, 2e-12, 5), "-0.25000");
-        assert_eq!(above_error(1e-13, f64::NAN, 5), "1.00e-13", "without a bound every digit stands");
+        assert_eq!(above_error(1e-13, f64::NAN, 5), "1.00e-13", "without a bound every digit is shown");
         assert_eq!(above_error(f64::NAN, 1.0, 5), "-");
     }
 }

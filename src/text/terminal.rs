@@ -18,7 +18,7 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
-/// Writes a line to standard error. Errors are ignored, since nobody may be reading.
+/// Writes a line to standard error. Errors are ignored, since there may be no reader.
 pub fn note(text: fmt::Arguments<'_>) {
     let line = format!("{text}\n");
     let _ = std::io::stderr().write_all(printable(&line).as_bytes());

@@ -1,4 +1,4 @@
-//! Rigs of kind 2: what the modes left out do at the contact, and modes from Universal Files.
+//! Rigs of kind 2: residual flexibility of the truncated modes, and modes from Universal Files.
 
 use std::path::Path;
 use std::process::Command;
@@ -330,7 +330,7 @@ fn wrong_residuals_are_refused_by_name() {
     );
     assert_eq!(
         refused(vec![], Some(diagonal.clone()), vec![6, 6]),
-        "a.npz: array `residual_inertia` stands without residual_flexibility; expected both, or neither"
+        "a.npz: array `residual_inertia` is given without residual_flexibility; expected both, or neither"
     );
     let archives = || [file("pad.npz", pad().archive(5, true, true)), file("disc.npz", disc().archive(4, true, true))];
     let load = |text: String| {

@@ -214,7 +214,7 @@ fn a_topic_that_cannot_be_read_says_why() {
     ];
     let older = bag(&folder.path().join("older.mcap"), &messages);
     let why = "/squealcast/prediction is not read: squealcast_msgs/msg/Prediction has other fields in this version of \
-               squealcast: the recorded one lacks `float64 friction_margin_error`";
+               squealcast: the recorded one has no `float64 friction_margin_error`";
     let out = text(&folder.path().join("report"));
     for args in [
         &["report", &older, "-o", &out, "--rig", "nine-dof"][..],

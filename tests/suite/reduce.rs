@@ -208,7 +208,7 @@ fn a_compact_rig_is_the_same_rig() {
         write(folder.path(), name, &written.replace(from, to))
     };
     let fewer = changed("fewer.toml", "[pad]", "[pad]\nmodes = 10");
-    run(["check", &fewer]).exits(1).complains("`pad.modes` leaves out modes that [residual] does not hold");
+    run(["check", &fewer]).exits(1).complains("`pad.modes` omits modes that [residual] does not contain");
     let pairs = other.files.iter().map(|file| file.name.as_str()).find(|name| name.contains("-residual-")).unwrap();
     let pad = other.files.iter().map(|file| file.name.as_str()).find(|name| name.contains("-pad-")).unwrap();
     run(["check", &changed("swapped.toml", pairs, pad)]).exits(1).complains("array `flexibility_normal` is missing");

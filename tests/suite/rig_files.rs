@@ -121,7 +121,7 @@ fn bad_files_of_kind_1() {
     refused!(
         inline("[pad]", "[pad]\nmodes = 3"),
         RigError::Reduction { .. },
-        "x.toml: pad.modes: 3 modes asked for, expected 1 to 2"
+        "x.toml: pad.modes: 3 modes requested, expected 1 to 2"
     );
     refused!(
         inline("[pad]", "[pad]\ndamping_ratio = [0.1]"),
@@ -167,7 +167,7 @@ fn bad_files_of_kind_2() {
     refused!(
         refused(&all(side(PAD))[..2]),
         RigError::MissingFile { .. },
-        "x.toml: disc.modal = \"disc.npz\" cannot be read: it is not among the files given; expected one of pad.npz"
+        "x.toml: disc.modal = \"disc.npz\" cannot be read: it is not among the files of the rig; expected one of pad.npz"
     );
     let (error, text) = modal("normal =", "norm = [0, 0, 1]\nnormal =", &side(PAD));
     assert!(matches!(error, RigError::UnknownKey { .. }) && text.contains("unknown key `norm`"), "{text}");
@@ -238,7 +238,7 @@ fn bad_files_of_kind_3() {
     refused!(
         refused(&[file("x.toml", SYSTEM), file("M.mtx", UNIT)]),
         RigError::MissingFile { .. },
-        "x.toml: system.stiffness[0].matrix = \"K.mtx\" cannot be read: it is not among the files given; \
+        "x.toml: system.stiffness[0].matrix = \"K.mtx\" cannot be read: it is not among the files of the rig; \
          expected one of M.mtx"
     );
     let (error, text) = system("scale", "skale", UNIT, UNIT);

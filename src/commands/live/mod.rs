@@ -29,7 +29,8 @@ pub type Foot = Box<dyn Fn(&Snapshot) -> Vec<String> + Send>;
 
 /// Contents of the view that are not in its [`Watch`].
 pub struct Frame {
-    /// The name of what is shown, whether it is simulated, and the address of the page. What does not fit is omitted.
+    /// Name of the rig or recording, whether it is simulated, and the address of the page. Items that do not fit are
+    /// omitted.
     pub title: Vec<String>,
     /// A mode is unstable if its damping ratio is below the negative of this value.
     pub instability_threshold: f64,
@@ -51,7 +52,7 @@ impl Shown {
     /// Ends the view and restores the terminal.
     pub fn stop(self) {
         self.stop.store(true, Ordering::Relaxed);
-        // Writing to a terminal or pipe that nobody reads may never return, so the waiting time is limited.
+        // Writing to a terminal or pipe without a reader may never return, so the waiting time is limited.
         let deadline = Instant::now() + 3 * EVERY;
         while !self.thread.is_finished() && Instant::now() < deadline {
             std::thread::sleep(Duration::from_millis(5));

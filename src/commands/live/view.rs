@@ -134,7 +134,7 @@ impl View<'_> {
     }
 }
 
-/// Colours that can be told apart with red-green blindness; the name of the status is always shown too.
+/// Colours that can be distinguished with red-green blindness; the name of the status is always shown too.
 fn colour(status: Status) -> Color {
     match status {
         Status::Ok => Color::Cyan,

@@ -30,7 +30,7 @@ struct Repeated {
     cdr: Vec<u8>,
 }
 
-/// What a replay must know before the first input, in the order in which a session gets it. The newest message of each
+/// Messages that a replay needs before the first input, in the order in which a session receives them. The newest message of each
 /// kind is repeated at the beginning of each file.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum InForce {

@@ -25,9 +25,9 @@ pub struct Item {
 
 /// A page with all items, as HTML.
 pub fn index(items: &[Item]) -> String {
-    let mut body = "<h1>The paper's tables and figures, made again</h1>\n\
-         <p class=\"lead\">Every number is computed; the paper's own are given next to them. Each table and figure is also a file of \
-         its own, beside this page.</p>\n"
+    let mut body = "<h1>The paper's tables and figures, reproduced</h1>\n\
+         <p class=\"lead\">Every number is computed; the paper's own are given next to them. Each table and figure is also a \
+         file in the folder of this page.</p>\n"
         .to_owned();
     let entry = |item: &Item| format!("<li><a href=\"#{}\">{}</a></li>\n", item.name, item.title);
     body +=

@@ -228,7 +228,7 @@ impl Study<'_> {
             Ok(squares.into_iter().map(|square| square.max(0.0).sqrt() / TAU).collect())
         })?;
         let rig = with_modes(files, modes, found.best.factor)?;
-        // Without residual flexibility a rig has no cut-off of its own; it is computed here.
+        // Without residual flexibility a rig has no cut-off; it is computed here.
         let highest = self.modes.omega_squared.iter().map(|squares| squares[modes - 1].max(0.0).sqrt() / TAU);
         let cutoff_hz = highest.fold(f64::INFINITY, f64::min);
         let reduced = self.reduced(String::new(), rig.model, Some(cutoff_hz.min(truth.band_hz)), found.best.factor)?;
@@ -283,7 +283,7 @@ impl Study<'_> {
         let text = format!(
             "<p>First natural frequencies, Hz. Ours is a model of the paper's kind with {} degrees of freedom: its \
              components, materials, supports, springs and 294 contact pairs, but dimensions of this project, which were tuned to \
-             these three frequencies at 22032 degrees of freedom. The paper's is said to have 904968.</p>\n",
+             these three frequencies at 22032 degrees of freedom. The paper reports 904968 for its model.</p>\n",
             self.full.model.dimension()
         ) + &table(&["", "ours", "paper, Abaqus", "ours off, %", "paper, measured"], &rows);
         let title = "Table 3: first natural frequencies of the tribometer".to_owned();
@@ -301,9 +301,9 @@ impl Study<'_> {
         }
         csv += &rows_of("full model", &truth.dots);
         let text = format!(
-            "The paper's way: no residual, contact stiffness identified for each number of modes. RM 1 ends at {:.0} Hz. The paper \
-             finds its four models very similar, and modes 1 and 2, then 6 and 7 merging at {} and {} Hz; where ours merge, and how far \
-             off each number of modes is, stands in the table of critical friction coefficients.",
+            "The paper's method: no residual, contact stiffness identified for each number of modes. RM 1 ends at {:.0} Hz. The paper \
+             finds its four models very similar, and modes 1 and 2, then 6 and 7 merging at {} and {} Hz; the table of critical friction \
+             coefficients lists where ours merge, and the errors of each number of modes.",
             models[0].band_hz, PAPER_MERGING_HZ[0], PAPER_MERGING_HZ[1]
         );
         let title = "Figure 14: the paper's reduced models over the friction coefficient".to_owned();
@@ -376,9 +376,9 @@ fn figure_13(found: &Identified, reduced: &Reduced) -> anyhow::Result<Item> {
         csv += &format!("{},{mean},{rms},{largest}\n", trial.factor * at_one);
     }
     let text = format!(
-        "Errors of {} against the full model at rest. Ours are least at {:.0} N/mm a pair, with a mean of {:.3} %; shaded is where the rms \
-         error stays below twice its least. The paper's are least at {} (printed N/m, which would be too soft for the number of modes \
-         to matter). The full model itself has {:.0} N/mm: the fit hides in the stiffness what the modes left out would do.",
+        "Errors of {} against the full model at rest. Ours are smallest at {:.0} N/mm a pair, with a mean of {:.3} %; in the shaded range the rms \
+         error is below twice its minimum. The paper's are smallest at {} (printed N/m, which would be too soft for the number of modes \
+         to matter). The full model has {:.0} N/mm: the fitted stiffness compensates for the flexibility of the truncated modes.",
         reduced.name,
         1e-3 * reduced.stiffness_n_per_m,
         100.0 * found.best.mean_error,
@@ -459,14 +459,14 @@ fn table_4(truth: &Truth, paper: &[Reduced], ours: &[Reduced], basis: &Reduced) 
         with_residual.push(cells);
     }
     let text = format!(
-        "<p>Mean errors of the first {FREQUENCIES} natural frequencies at rest, %. Left the paper's way: each number of modes with the contact \
-         stiffness that fits best, in N/mm. Right what this project does: one stiffness, {:.0} N/mm, whatever the number of modes, and what \
-         the modes left out still do at the contact (residual flexibility, and the inertial term up to half of the cut-off), or a \
+        "<p>Mean errors of the first {FREQUENCIES} natural frequencies at rest, %. Left, the paper's method: each number of modes with the contact \
+         stiffness that fits best, in N/mm. Right, this project's: one stiffness, {:.0} N/mm, for any number of modes, with the \
+         residual flexibility of the truncated modes (and the inertial term up to half of the cut-off), or on a \
          basis of the full model's own vectors.</p>\n{}\
-         <p>Mode by mode, the paper's way, ours beside the paper's: frequencies of the full models in Hz, errors in %. The paper's digits \
+         <p>Mode by mode, the paper's method, our values next to the paper's: frequencies of the full models in Hz, errors in %. The paper's digits \
          end at 0.01 to 0.1 Hz, so that its errors below 0.005 % are rounding.</p>\n{}\
          <p>Mode by mode, one contact stiffness with residual, errors in %. 10+10 modes end at {:.0} Hz, below the {FREQUENCIES}th \
-         frequency: a rig of these is not shown beyond.</p>\n{}",
+         frequency: such a rig shows no modes above.</p>\n{}",
         1e-3 * basis.stiffness_n_per_m,
         table(&["modes", "ours, N/mm", "paper, N/mm", "ours, its way", "paper", "ours, with residual"], &means),
         table(&["mode", "full", "paper", "RM 1", "paper", "RM 2", "paper", "RM 3", "paper", "RM 4", "paper"], &each),
@@ -520,19 +520,19 @@ fn critical(truth: &Truth, models: &[&Reduced], maps: &[Mapped]) -> Item {
         some => format!("Ours begins to grow at {} Hz.", some.join(", ")),
     };
     let text = format!(
-        "<p>Where windows of instability begin, up to a friction coefficient of {MU_MAX}: the full model, the paper's way (RM 1 to RM 4, no residual, \
-         own contact stiffness each), one contact stiffness with residual, and the parametric basis. A reduced model is not judged \
+        "<p>Where windows of instability begin, up to a friction coefficient of {MU_MAX}: the full model, the paper's method (RM 1 to RM 4, no residual, \
+         a separate contact stiffness each), one contact stiffness with residual, and the parametric basis. A reduced model is not judged \
          above its cut-off.</p>\n{}\
          <p>The paper's rig vibrated at {} Hz (dominant) to {} Hz, at friction coefficients of 0.3 to 0.4; its reduced models merge at {} and {} Hz. \
-         {grows} It is not that rig: components, materials, supports and the first frequencies agree, the \
-         shapes do not, as the paper does not give them, and which modes merge, and where, hangs on how near they lie and on how they move at \
-         the pad. What does carry over is how far a reduced model is from its own full one.</p>\n",
+         {grows} Our model differs from that rig: components, materials, supports and the first frequencies agree, but the mode \
+         shapes, which the paper does not give, do not. The modes that merge, and where, depend on the distance of their frequencies and on \
+         their motion at the pad. The error of a reduced model against its own full model can be compared.</p>\n",
         table(&header, &rows),
         PAPER_MEASURED_HZ[0],
         PAPER_MEASURED_HZ[1],
         PAPER_MERGING_HZ[0],
         PAPER_MERGING_HZ[1]
     );
-    let title = "Critical friction coefficients, and what was measured".to_owned();
+    let title = "Critical friction coefficients, and measured frequencies".to_owned();
     Item { name: "critical-friction", title, text, csv, svg: None }
 }

@@ -42,7 +42,7 @@ pub enum FemError {
     Loose { node: usize },
     #[error("spring {spring}: the stiffness is {value} N/m, expected a finite number above 0")]
     Spring { spring: usize, value: f64 },
-    #[error("{value} degrees of freedom asked for, expected at least {limit}")]
+    #[error("{value} degrees of freedom requested, expected at least {limit}")]
     Size { value: usize, limit: usize },
 }
 

@@ -287,7 +287,7 @@ mod tests {
         // the displacement, which settles to 1e-12 of its largest entry and passes through K.
         let rigid = form(&turn, &stiffening, &turn);
         assert!((rigid / inertia - 1.0).abs() < 1e-9, "{}", rigid / inertia - 1.0);
-        // Nor does a tilt about a diameter feel a stiffness: in the frame of the pad, a free gyroscope has none.
+        // A tilt about a diameter has no stiffness either: in the frame of the pad, a free gyroscope has none.
         let tilt = field(&structure, &rows, |[_, y, z]| [0.0, -z, y]);
         let (felt, spun) = (form(&tilt, &stiffening, &tilt), form(&tilt, &spin, &tilt));
         assert!((spun / (0.5 * inertia) - 1.0).abs() < 1e-12 && (felt / spun - 1.0).abs() < 1e-9, "{felt} {spun}");
@@ -368,7 +368,7 @@ mod tests {
     }
 
     /// A thin free disc in all directions, on its lowest modes. A transverse mode with `m` nodal diameters has the form
-    /// `φᵀ L φ = m²` and splits to `ω_0 ± m Ω`; where the slower wave stands still, `Ω = ω_0 / m`, the disc without its
+    /// `φᵀ L φ = m²` and splits to `ω_0 ± m Ω`; where the slower wave is stationary, `Ω = ω_0 / m`, the disc without its
     /// stress becomes unstable. In-plane motion of the faces changes this by about `(thickness / radius)²`, 3e-4, and the
     /// mesh by `(m spacing)² / 12`.
     #[test]
@@ -401,7 +401,7 @@ mod tests {
         assert!(definite(0.99 * expected, &l) && !definite(1.01 * expected, &l));
         let below = views(&l, 0.98 * expected);
         assert!(below.iter().all(|root| root.re.abs() < 1e-8 * root.im));
-        // The stress of the centrifugal load carries a turning disc beyond that speed.
+        // The stress of the centrifugal load keeps a turning disc stable beyond that speed.
         let carried = &l - &s;
         assert!(definite(1.01 * expected, &carried));
         eprintln!("{omega:.1} rad/s with {m:.4} nodal diameters, critical at {expected:.1} rad/s");

@@ -22,9 +22,9 @@ const NEAR: f64 = 1e-9;
 /// Longest Newton step accepted, in friction coefficient.
 const LONGEST: f64 = 0.1;
 /// Relative distance from the merging point at which a pair is evaluated. At the merging point both roots have the
-/// same vector; beside it the discriminant has the same slope, and the difference of the roots has more accurate
+/// same vector; near it the discriminant has the same slope, and the difference of the roots has more accurate
 /// digits.
-const BESIDE: f64 = 1e-10;
+const OFFSET: f64 = 1e-10;
 /// The conditions other than friction that change while a rig runs; ends are extrapolated in them.
 const MOVING: [Parameter; 2] = [Parameter::Load, Parameter::Speed];
 
@@ -295,8 +295,8 @@ impl Search<'_> {
             let value = match self.value(end.condition, point, mu)? {
                 Some(value) => value,
                 None => {
-                    // Exactly at the merging point both roots have the same vector; evaluate beside it.
-                    mu += BESIDE * unit;
+                    // Exactly at the merging point both roots have the same vector; evaluate near it.
+                    mu += OFFSET * unit;
                     let Some(value) = self.value(end.condition, point, mu)? else { return Ok(None) };
                     value
                 }
@@ -308,9 +308,9 @@ impl Search<'_> {
             mu += step;
             // The remaining error is of the order of this step squared.
             if step.abs() <= NEAR * unit {
-                let Some(beside) = self.value(end.condition, point, mu + BESIDE * unit)? else { return Ok(None) };
-                let slope = std::array::from_fn(|k| -beside.slope[k + 1] / beside.slope[0]);
-                let error = value.error / beside.slope[0].abs() + 4.0 * f64::EPSILON * unit;
+                let Some(near) = self.value(end.condition, point, mu + OFFSET * unit)? else { return Ok(None) };
+                let slope = std::array::from_fn(|k| -near.slope[k + 1] / near.slope[0]);
+                let error = value.error / near.slope[0].abs() + 4.0 * f64::EPSILON * unit;
                 return Ok(Some(End { mu, error, slope, ..*end }));
             }
         }

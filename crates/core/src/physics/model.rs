@@ -182,13 +182,13 @@ pub enum ModelError {
     #[error("{what} has {found} values, expected one for each of {expected} contact pairs")]
     PairCount { what: &'static str, found: usize, expected: usize },
     #[error(
-        "residual flexibility with [load] exponent {exponent}, expected 0: the contact stiffness it stands beside must \
-         not depend on the load"
+        "residual flexibility with [load] exponent {exponent}, expected 0: it requires a contact stiffness that \
+         does not depend on the load"
     )]
     FlexibleLoadExponent { exponent: f64 },
     #[error(
         "contact flexibility at friction coefficient {friction_coefficient} has condition number {condition:.1e}, \
-         limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient leave it out"
+         limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient exclude it"
     )]
     IllConditioned { friction_coefficient: f64, condition: f64, limit: f64 },
     #[error(
@@ -441,7 +441,7 @@ impl Model {
         model.finished()
     }
 
-    /// Whether the model has contact pairs of its own, which open at zero load.
+    /// Whether the model has contact pairs, which open at zero load.
     pub fn has_contact(&self) -> bool {
         self.has_contact
     }

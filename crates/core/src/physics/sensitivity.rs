@@ -137,7 +137,7 @@ pub fn of_roots(
         .collect()
 }
 
-/// Mean and discriminant of roots `first` and `second` of `spectrum`, whatever their distance.
+/// Mean and discriminant of roots `first` and `second` of `spectrum`, at any distance from each other.
 ///
 /// # Errors
 /// [`SensitivityError`].

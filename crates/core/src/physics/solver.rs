@@ -195,7 +195,7 @@ impl Solver {
         let mut raw = Vec::with_capacity(self.stiffness.nrows() + 8);
         for (&value, packing) in self.dense.values.iter().zip(packing(&self.dense.values)) {
             let (lambda, square) = match problem {
-                Problem::Damped if value.im < 0.0 => continue, // its conjugate stands for it
+                Problem::Damped if value.im < 0.0 => continue, // represented by its conjugate
                 Problem::Damped => (value, value * value),
                 // The subtraction from zero turns the -0 of a real root into 0.
                 _ => (square_root(c64::ZERO - value), c64::ZERO - value),
@@ -514,7 +514,7 @@ mod tests {
         assert_eq!(solve(Vectors::None), Ok(9));
     }
 
-    /// Finite terms whose sum overflows: every kind of problem is given up, whatever vectors are asked for.
+    /// Finite terms whose sum overflows: every kind of problem fails, with and without vectors.
     #[test]
     fn matrices_that_overflow_do_not_converge() {
         let term = |matrix: Mat<f64>, law: Law| Term { matrix, law };

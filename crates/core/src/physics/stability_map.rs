@@ -85,8 +85,8 @@ pub struct StabilityMap {
     pub complete: bool,
 }
 
-/// The window of instability whose end is nearest to the present friction coefficient: what squeals, or what would
-/// squeal next.
+/// The window of instability whose end is nearest to the present friction coefficient: the one that squeals, or
+/// would squeal next.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NextWindow<'a> {
     /// The window, with the identities of its modes (a merging pair or a single mode) and its kind.
@@ -256,7 +256,7 @@ fn continued_ids(node: &Node, spectrum: &Spectrum) -> Vec<Option<u32>> {
     carry(node, spectrum, |j| link.source[j], &mut next_id)
 }
 
-/// Orders the two identities of a pair. After a merging point they cannot be told apart by shape: while the pair is
+/// Orders the two identities of a pair. After a merging point they cannot be distinguished by shape: while the pair is
 /// coupled, the growing mode gets the lower identity; once the pair has separated, the lower frequency gets it.
 fn settle_pairs(from: &Node, to: &Spectrum, ids: &mut [Option<u32>]) {
     for j in 0..tracked(to) {

@@ -1,6 +1,6 @@
-//! What proves the numerics, for tests, benchmarks and `squealcast bench`: reference roots to thirty digits, extreme
-//! cases, synthetic rigs, comparisons at held-out points. Nothing here computes a prediction, and nothing that does
-//! depends on it. Only tests and the feature `proof` compile it.
+//! Proof of the numerics for tests, benchmarks and `squealcast bench`: reference roots to thirty digits, extreme
+//! cases, synthetic rigs, comparisons at held-out points. No prediction is computed here, and no code
+//! that predicts depends on this module. Only tests and the feature `proof` compile it.
 
 pub mod held_out;
 pub mod identities;

@@ -1,4 +1,4 @@
-//! Extreme cases of the numerics, each with what must hold there. `tests/suite/stress.rs` runs them,
+//! Extreme cases of the numerics, each with its required properties. `tests/suite/stress.rs` runs them,
 //! `squealcast bench --stress` shows them.
 //!
 //! | extreme | what happens |

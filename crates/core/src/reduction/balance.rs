@@ -1,4 +1,4 @@
-//! Static displacement under a load in balance.
+//! Static displacement under a self-equilibrated load.
 
 use faer::Mat;
 
@@ -15,7 +15,7 @@ const SETTLED: f64 = 1e-12;
 const MOST_STEPS: usize = 100;
 
 /// The displacement `u`, `n×1`, m, of `K u = f` under a `load` `f`, `n×1`, N. `K` may have rigid-body motions, if the
-/// load does no work on them; of these motions `u` has what rounding leaves, which strains nothing.
+/// load does no work on them; `u` then contains a small part of these motions, from rounding, which causes no strain.
 ///
 /// `(K + s M) Δu = f - K u` is iterated, so that the shift `s` leaves no error.
 ///

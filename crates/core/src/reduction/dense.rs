@@ -277,11 +277,11 @@ mod tests {
     fn selections_are_checked() {
         assert_eq!(ModeSelection::Indices(vec![2, 0]).indices("pad.modes", 3).unwrap(), [0, 2]);
         for (selection, expected) in [
-            (ModeSelection::Lowest(0), "pad.modes: 0 modes asked for, expected 1 to 3"),
-            (ModeSelection::Lowest(4), "pad.modes: 4 modes asked for, expected 1 to 3"),
-            (ModeSelection::Indices(vec![]), "pad.modes: an empty list asked for, expected at least one mode"),
-            (ModeSelection::Indices(vec![3]), "pad.modes: mode 3 asked for, expected 0 to 2"),
-            (ModeSelection::Indices(vec![1, 1]), "pad.modes: mode 1 twice asked for, expected every mode at most once"),
+            (ModeSelection::Lowest(0), "pad.modes: 0 modes requested, expected 1 to 3"),
+            (ModeSelection::Lowest(4), "pad.modes: 4 modes requested, expected 1 to 3"),
+            (ModeSelection::Indices(vec![]), "pad.modes: an empty list requested, expected at least one mode"),
+            (ModeSelection::Indices(vec![3]), "pad.modes: mode 3 requested, expected 0 to 2"),
+            (ModeSelection::Indices(vec![1, 1]), "pad.modes: mode 1 twice requested, expected every mode at most once"),
         ] {
             assert_eq!(selection.indices("pad.modes", 3).unwrap_err().to_string(), expected);
         }

@@ -25,7 +25,7 @@ pub enum ReductionError {
          expected at least {limit:.3e}"
     )]
     NegativeStiffness { what: String, mode: usize, value: f64, limit: f64 },
-    #[error("{what}: {value} asked for, expected {limit}")]
+    #[error("{what}: {value} requested, expected {limit}")]
     ModeCount { what: String, value: String, limit: String },
     #[error("{what}: no shift up to {value:.3e} rad^2/s^2 makes K + shift M positive definite")]
     NoShift { what: String, value: f64 },

@@ -90,7 +90,7 @@ pub struct FullSpectrum {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FullProgress {
     /// The model is ordered and symbolically analysed. `bytes` is a lower estimate of the memory needed in addition to
-    /// what was held before.
+    /// memory already in use.
     Analysed { bytes: usize },
     /// The matrix at this shift, rad/s, is factorised.
     Factored { shift_rad_s: f64 },
@@ -144,7 +144,7 @@ impl<'a> FullSolver<'a> {
         self.elsewhere_bytes = bytes;
     }
 
-    /// Estimated bytes a solve needs in addition to what was held before, with one factor in memory and `roots` roots
+    /// Estimated bytes a solve needs in addition to memory already in use, with one factor in memory and `roots` roots
     /// in the band.
     pub fn bytes(&self, vectors: FullVectors, roots: usize) -> usize {
         let PartBytes { held, factors, factoring } = self.factor_bytes();

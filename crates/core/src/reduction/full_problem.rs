@@ -58,7 +58,7 @@ impl<'a> Problem<'a> {
         if by_parts {
             let low_rank = model.low_rank(p);
             let largest = |matrix: &dyn Fn(usize) -> f64| (0..model.parts.len()).map(matrix).fold(0.0, f64::max);
-            // 1-norm of one contact pair: `|leftᵀ k right|₁ ≤ |k| |left|₁ |right|∞`. The largest pair stands for the
+            // 1-norm of one contact pair: `|leftᵀ k right|₁ ≤ |k| |left|₁ |right|∞`. The largest pair represents the
             // sum, because pairs share few columns.
             let pairs = |weights: &[f64]| {
                 let size = |k: usize| {

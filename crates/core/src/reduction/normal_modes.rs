@@ -467,7 +467,7 @@ mod tests {
         let none = normal_modes("pad", &mass, &stiffness, Wanted::Below(1.0), None, &mut |_| {}).unwrap_err();
         assert_eq!(
             none.to_string(),
-            "pad.modes: modes below 1 rad/s (there is none) asked for, expected 1 to 900 modes"
+            "pad.modes: modes below 1 rad/s (there is none) requested, expected 1 to 900 modes"
         );
     }
 

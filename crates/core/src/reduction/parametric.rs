@@ -90,7 +90,7 @@ pub struct ParametricRequest {
 /// Progress of the construction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ParametricStep {
-    /// Estimated bytes needed in addition to what was held before the solver was made.
+    /// Estimated bytes needed in addition to the memory in use before the solver was made.
     Planned { bytes: usize },
     /// Progress of a solve of the full model.
     Solving(FullProgress),

@@ -391,7 +391,7 @@ fn forward(symbolic: &SymbolicCholesky<usize>) -> &[usize] {
 fn supernodal(symbolic: &SymbolicCholesky<usize>) -> &SymbolicSupernodalCholesky<usize> {
     match symbolic.raw() {
         SymbolicCholeskyRaw::Supernodal(symbolic) => symbolic,
-        SymbolicCholeskyRaw::Simplicial(_) => unreachable!("supernodes were asked for"),
+        SymbolicCholeskyRaw::Simplicial(_) => unreachable!("supernodes were requested"),
     }
 }
 

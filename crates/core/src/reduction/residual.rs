@@ -67,7 +67,7 @@ impl Analysed<'_> {
     }
 
     /// Residual flexibility and inertia of the modes that `modes` omits, between the degrees of freedom `rows`. `None`
-    /// stands for a fixed degree of freedom, whose rows and columns are 0. `progress` receives the progress.
+    /// denotes a fixed degree of freedom, whose rows and columns are 0. `progress` receives the progress.
     ///
     /// # Errors
     /// [`ReductionError`]: `OnlyRigid` if all kept modes are rigid-body modes, which give no scale for the shift;

@@ -14,7 +14,7 @@ pub struct Substructure<'a> {
     pub mass: &'a SparseMatrix,
     /// `K`, `n×n`, N/m.
     pub stiffness: &'a SparseMatrix,
-    /// Rows of its degrees of freedom at the contact; `None` stands for a fixed one.
+    /// Rows of its degrees of freedom at the contact; `None` denotes a fixed one.
     pub rows: &'a [Option<usize>],
     /// Which modes to keep.
     pub wanted: Wanted,
@@ -151,7 +151,7 @@ fn side_by_side<T: Sync, R: Send>(
             .enumerate()
             .map(|(index, item)| {
                 let sender = sender.clone();
-                // A closed channel means that nobody listens to progress; ignore it.
+                // A closed channel means that progress is no longer received; ignore it.
                 scope.spawn(move || {
                     work(item, &mut |p| {
                         let _ = sender.send((index, p));

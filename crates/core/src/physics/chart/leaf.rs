@@ -142,7 +142,7 @@ impl Builder<'_> {
             }
         }
         let mut expansion = Expansion { channels: vec![], errors: vec![0.0; size], degree: 0, failing: Some(0) };
-        // Complex functions in an undamped model: the cluster lacks the conjugate of a member.
+        // Complex functions in an undamped model: the conjugate of a member is not in the cluster.
         if stray > 1e-6 {
             return expansion;
         }
@@ -246,7 +246,7 @@ impl Builder<'_> {
         }
         let shares = self.shares(branches, &settled);
         let degree = self.chart.basis.degree();
-        let mut beside: Vec<(usize, Option<usize>, Vec<f64>)> =
+        let mut auxiliary: Vec<(usize, Option<usize>, Vec<f64>)> =
             remainders.into_iter().map(|coefficients| (degree, None, coefficients)).collect();
         let mut functions = vec![];
         let (mut clusters, mut lowest) = (vec![], vec![]);
@@ -254,23 +254,23 @@ impl Builder<'_> {
             lowest.push(members.iter().copied().min());
             let Expansion { channels, errors, degree, .. } = expansion;
             functions.push((degree, k, channels));
-            beside.extend(share.map(|(degree, channel)| (degree, Some(k), channel)));
+            auxiliary.extend(share.map(|(degree, channel)| (degree, Some(k), channel)));
             clusters.push(Cluster { channel: 0, errors, share: None });
         }
         // Channels of high degree come first, so that the channels with coefficients of a degree are contiguous.
         functions.sort_by_key(|(degree, ..)| std::cmp::Reverse(*degree));
-        beside.sort_by_key(|(degree, ..)| std::cmp::Reverse(*degree));
+        auxiliary.sort_by_key(|(degree, ..)| std::cmp::Reverse(*degree));
         let mut columns = vec![];
         for (degree, k, channels) in functions {
             clusters[k].channel = columns.len();
             columns.extend(channels.into_iter().map(|channel| (degree, channel)));
         }
-        for (place, (_, cluster, _)) in beside.iter().enumerate() {
+        for (place, (_, cluster, _)) in auxiliary.iter().enumerate() {
             if let Some(k) = *cluster {
                 clusters[k].share = Some(place);
             }
         }
-        let beside: Vec<_> = beside.into_iter().map(|(degree, _, channel)| (degree, channel)).collect();
+        let auxiliary: Vec<_> = auxiliary.into_iter().map(|(degree, _, channel)| (degree, channel)).collect();
         // Clusters nearly in order of frequency, which makes sorting the roots fast.
         let mut clusters: Vec<_> = lowest.into_iter().zip(clusters).collect();
         clusters.sort_by_key(|(lowest, _)| *lowest);
@@ -281,7 +281,7 @@ impl Builder<'_> {
             clusters,
             tracked: branches.count,
             functions: Channels::new(&self.chart.basis, &columns),
-            beside: Channels::new(&self.chart.basis, &beside),
+            auxiliary: Channels::new(&self.chart.basis, &auxiliary),
             remainder_errors,
         })
     }

@@ -3,7 +3,7 @@
 //! error bounds.
 //!
 //! On each leaf of the box every root of the band belongs to a cluster. A root that is analytic on the leaf is a
-//! cluster of its own; roots that merge somewhere share one. The remainders, which are the traces of the matrix and
+//! separate cluster; roots that merge somewhere share one. The remainders, which are the traces of the matrix and
 //! of its square minus the contributions of the charted roots, are expanded too. Every evaluation is checked against
 //! the exact traces, so a root that is missing or counted twice is detected.
 
@@ -113,7 +113,7 @@ struct Cluster {
     channel: usize,
     /// Error bound of each symmetric function.
     errors: Vec<f64>,
-    /// For a single root, the channel of [`Leaf::beside`] with its pad participation, accurate to
+    /// For a single root, the channel of [`Leaf::auxiliary`] with its pad participation, accurate to
     /// [`leaf::SHARE_TOLERANCE`]; `None` if that did not converge.
     share: Option<usize>,
 }
@@ -136,12 +136,12 @@ struct Leaf {
     /// Expansions of the symmetric functions of the clusters.
     functions: Channels,
     /// The other expansions: the two remainders of the traces, in the first channels, and the pad participations.
-    beside: Channels,
+    auxiliary: Channels,
     /// Error bounds of the two remainders.
     remainder_errors: [f64; 2],
 }
 
-/// Number of channels of [`Leaf::beside`] that hold remainders of the traces.
+/// Number of channels of [`Leaf::auxiliary`] that hold remainders of the traces.
 const REMAINDERS: usize = 2;
 
 /// The roots of a model over a box of conditions.
@@ -164,7 +164,7 @@ pub struct Chart {
 pub struct Scratch {
     basis: Vec<f64>,
     functions: Vec<f64>,
-    beside: Vec<f64>,
+    auxiliary: Vec<f64>,
 }
 
 impl Chart {
@@ -180,7 +180,7 @@ impl Chart {
 
     /// Size of the coefficients in bytes.
     pub fn size_bytes(&self) -> usize {
-        let numbers = |leaf: &Leaf| leaf.functions.coefficients.len() + leaf.beside.coefficients.len();
+        let numbers = |leaf: &Leaf| leaf.functions.coefficients.len() + leaf.auxiliary.coefficients.len();
         self.leaves.iter().map(|leaf| 8 * numbers(leaf)).sum()
     }
 
@@ -251,8 +251,8 @@ impl Chart {
         out: &mut Vec<Root>,
     ) -> Result<Census, NotCharted> {
         let leaf = self.expand(p, scratch)?;
-        leaf.beside.evaluate(&self.basis, &scratch.basis, &mut scratch.beside);
-        let (values, beside) = (&scratch.functions, &scratch.beside);
+        leaf.auxiliary.evaluate(&self.basis, &scratch.basis, &mut scratch.auxiliary);
+        let (values, auxiliary) = (&scratch.functions, &scratch.auxiliary);
         let before = out.len();
         let mut found = [0.0; 2];
         let mut limit = [0.0; 2];
@@ -265,7 +265,7 @@ impl Chart {
             for &(z, error) in &roots[..size] {
                 let mut root = self.charted(z, error, size <= 2 && z.im == 0.0 && 2.0 * error < gap);
                 root.residual = root.residual_bound(known.norms);
-                root.pad_participation = cluster.share.map_or(f64::NAN, |share| beside[share].clamp(0.0, 1.0));
+                root.pad_participation = cluster.share.map_or(f64::NAN, |share| auxiliary[share].clamp(0.0, 1.0));
                 let weight = if self.undamped { 1.0 } else { 2.0 };
                 found[0] += weight * z.re;
                 found[1] += weight * (z * z).re;
@@ -275,7 +275,7 @@ impl Chart {
             }
         }
         for moment in 0..2 {
-            let rest = beside[moment];
+            let rest = auxiliary[moment];
             let difference = (found[moment] + rest - known.powers[moment]).abs();
             let limit = limit[moment] + leaf.remainder_errors[moment];
             if difference.is_nan() || difference > limit {

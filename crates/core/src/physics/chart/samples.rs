@@ -297,18 +297,18 @@ mod tests {
                 for (pair, [a, b]) in pairs(axes.len()).enumerate() {
                     let h = 1e-4;
                     let [below, above] = [-h, h].map(|h| {
-                        let mut beside = x;
-                        beside[b] += h;
-                        solve(beside)
+                        let mut shifted = x;
+                        shifted[b] += h;
+                        solve(shifted)
                     });
                     let off = |z: c64, other: c64| (z - other).norm();
                     for (k, &z) in here.z.iter().enumerate().filter(|&(k, _)| here.conditions[k] < 100.0) {
-                        let beside = |sample: &Sample| {
+                        let shifted = |sample: &Sample| {
                             let nearest = (0..sample.z.len())
                                 .min_by(|&i, &j| off(sample.z[i], z).total_cmp(&off(sample.z[j], z)));
                             sample.slopes[nearest.expect("there are roots")][a]
                         };
-                        let difference = (beside(&above) - beside(&below)) / (2.0 * h);
+                        let difference = (shifted(&above) - shifted(&below)) / (2.0 * h);
                         let found = here.curvatures[k][pair];
                         let limit = 1e-4 * (found.norm() + here.slopes[k][a].norm() + 1e-3 * z.norm());
                         assert!(

@@ -51,7 +51,7 @@ impl Chart {
         for leaf in &self.leaves {
             let numbers = leaf.low.iter().chain(&leaf.high).chain(&leaf.remainder_errors);
             words.extend(numbers.map(|x| x.to_bits()));
-            for channels in [&leaf.functions, &leaf.beside] {
+            for channels in [&leaf.functions, &leaf.auxiliary] {
                 words.extend(channels.widths.iter().map(|&width| width as u64));
             }
             words.extend([leaf.tracked as u64, leaf.clusters.len() as u64]);
@@ -60,7 +60,7 @@ impl Chart {
                 words.extend([cluster.size() as u64, cluster.channel as u64, share]);
                 words.extend(cluster.errors.iter().map(|error| error.to_bits()));
             }
-            let coefficients = leaf.functions.coefficients.iter().chain(&leaf.beside.coefficients);
+            let coefficients = leaf.functions.coefficients.iter().chain(&leaf.auxiliary.coefficients);
             words.extend(coefficients.map(|x| x.to_bits()));
         }
         words
@@ -142,15 +142,15 @@ impl Reader<'_> {
 
     fn leaf(&mut self, basis: &Basis, undamped: bool) -> Option<Leaf> {
         let (low, high, remainder_errors) = (self.numbers()?, self.numbers()?, self.numbers()?);
-        let (functions, beside) = (self.widths(basis)?, self.widths(basis)?);
-        if beside[0] < REMAINDERS {
+        let (functions, auxiliary) = (self.widths(basis)?, self.widths(basis)?);
+        if auxiliary[0] < REMAINDERS {
             return None;
         }
         let tracked = self.count(usize::MAX)?;
         let count = self.count(self.0.len())?;
-        let clusters = (0..count).map(|_| self.cluster(functions[0], beside[0], undamped)).collect::<Option<_>>()?;
-        let (functions, beside) = (self.channels(basis, functions)?, self.channels(basis, beside)?);
-        Some(Leaf { low, high, clusters, tracked, functions, beside, remainder_errors })
+        let clusters = (0..count).map(|_| self.cluster(functions[0], auxiliary[0], undamped)).collect::<Option<_>>()?;
+        let (functions, auxiliary) = (self.channels(basis, functions)?, self.channels(basis, auxiliary)?);
+        Some(Leaf { low, high, clusters, tracked, functions, auxiliary, remainder_errors })
     }
 
     fn widths(&mut self, basis: &Basis) -> Option<Vec<usize>> {
@@ -168,10 +168,10 @@ impl Reader<'_> {
         Some(Channels { widths, coefficients })
     }
 
-    fn cluster(&mut self, functions: usize, beside: usize, undamped: bool) -> Option<Cluster> {
+    fn cluster(&mut self, functions: usize, auxiliary: usize, undamped: bool) -> Option<Cluster> {
         let size = self.count(MAX_SIZE)?;
         let channel = self.count(functions)?;
-        let share = self.count(beside)?.checked_sub(1);
+        let share = self.count(auxiliary)?.checked_sub(1);
         let errors = (0..size).map(|_| self.number()).collect::<Option<_>>()?;
         let parts = if undamped { 1 } else { 2 };
         (size > 0 && channel + size * parts <= functions).then_some(Cluster { channel, errors, share })
