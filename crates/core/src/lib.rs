@@ -4,6 +4,7 @@
 //! The crate is pure: there is no file, clock, bus, log or serialisation in it or in its dependency tree.
 
 mod chebyshev;
+pub mod contact;
 pub mod fem;
 pub mod physics;
 #[cfg(any(test, feature = "proof"))]

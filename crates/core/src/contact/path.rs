@@ -1,0 +1,549 @@
+//! Newton steps for one state, and the path of states from `μ = 0`.
+//!
+//! Newton's direction is taken in the closures. The step along it is taken in `u_k = δ_k + f_k N_k`, the approach of a pair
+//! in series with a typical spring `1/f_k`: both an exponential and a sharp onset are nearly linear in it, so that long
+//! steps neither overflow nor open every pair.
+
+use faer::Mat;
+use faer::linalg::solvers::{PartialPivLu, Solve};
+
+use super::law::LawValue;
+use super::statics::{MeasuredLoad, PathEnd, StateSlope, Statics, StaticsError, SteadyState, times_columns};
+
+/// Largest residual of a state, relative to the largest terms of the equations.
+const LIMIT: f64 = 1e-11;
+/// A residual at which no further step is taken.
+const ROUNDING: f64 = 1e-15;
+/// Below this residual steps are taken in the closures at full length.
+const POLISH: f64 = 1e-9;
+/// Most Newton steps, and most halvings of one.
+const MOST_STEPS: usize = 60;
+const MOST_HALVINGS: usize = 25;
+/// Stiffness of bilateral springs, relative to that of the pairs, that stand in for open pairs while the state without
+/// friction is approached; the last entry is the problem itself.
+const SUPPORTS: [&[f64]; 2] = [&[1.0, 0.0], &[1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-5, 1e-7, 0.0]];
+/// Longest step in the friction coefficient, and the shortest before the path is taken to end.
+const LONGEST: f64 = 0.1;
+const SHORTEST: f64 = 1e-13;
+/// Largest difference between predicted and found forces of a step, relative to their sum: larger ones could lead to
+/// another branch.
+const DEVIATION: f64 = 0.1;
+/// Growth of the forces that counts as unlimited.
+const GROWTH: f64 = 1e6;
+
+/// Unknowns: closures, then rigid motions, then the force on the back if it is not measured.
+#[derive(Clone, Debug)]
+struct Point {
+    closure: Vec<f64>,
+    others: Vec<f64>,
+}
+
+/// The equations at one load and friction coefficient.
+struct Equations<'a> {
+    statics: &'a Statics,
+    load: f64,
+    x: f64,
+    /// `G_nn + x G_nt`.
+    flexibility: Mat<f64>,
+    /// `B_n Φ_r + x B_t Φ_r`, `c×r`.
+    pushed: Mat<f64>,
+    /// Stiffness of additional bilateral springs per pair.
+    support: f64,
+    scales: &'a Scales,
+}
+
+/// Typical sizes at a load.
+struct Scales {
+    /// m.
+    length: f64,
+    /// N.
+    force: f64,
+    /// Tangent stiffness of each pair at the mean pressure.
+    stiffness: Vec<f64>,
+    /// `f`, m/N.
+    flexibility: Vec<f64>,
+}
+
+/// The equations evaluated at a point.
+struct Evaluated {
+    point: Point,
+    law: Vec<LawValue>,
+    /// Pairs with a tangent stiffness.
+    closed: Vec<usize>,
+    /// Residual, m: of the pairs, then of the other equations times `length / force`.
+    residual: Vec<f64>,
+    /// Norm of the residual.
+    norm: f64,
+    /// Largest residual relative to the largest term of its kind of equation.
+    accuracy: f64,
+}
+
+/// Factorised Jacobian over closed pairs and other unknowns.
+struct Jacobian {
+    lu: PartialPivLu<f64>,
+    /// Sign of the determinant; 0 where the matrix is singular to working precision.
+    sign: i8,
+}
+
+impl Scales {
+    fn new(statics: &Statics, load: f64) -> Self {
+        let parts = &statics.parts;
+        let force = if load == 0.0 { 1.0 } else { load.abs() };
+        let pressure = force / statics.total_area;
+        let tangent = parts.law.at(parts.law.closure_at(pressure)).tangent;
+        let stiffness: Vec<f64> = parts.area.iter().map(|area| area * tangent).collect();
+        let own = |k: usize| parts.response.normal_flexibility[(k, k)];
+        let c = statics.pairs();
+        let largest =
+            |values: &mut dyn Iterator<Item = f64>| values.fold(0.0, |most: f64, value| most.max(value.abs()));
+        let length = [
+            pressure / tangent,
+            largest(&mut parts.gap_m.iter().copied()),
+            largest(&mut parts.response.gap_per_load.iter().map(|a| a * force)),
+            largest(&mut (0..c).map(own)) * force / c as f64,
+        ]
+        .into_iter()
+        .fold(0.0, f64::max);
+        let flexibility = (0..c).map(|k| own(k) + 1.0 / stiffness[k]).collect();
+        Self { length, force, stiffness, flexibility }
+    }
+}
+
+impl<'a> Equations<'a> {
+    fn new(statics: &'a Statics, load: f64, x: f64, support: f64, scales: &'a Scales) -> Self {
+        let parts = &statics.parts;
+        let flexibility = &parts.response.normal_flexibility + faer::Scale(x) * &parts.response.sliding_flexibility;
+        let pushed = &parts.response.rigid.normal + faer::Scale(x) * &parts.response.rigid.sliding;
+        Self { statics, load, x, flexibility, pushed, support, scales }
+    }
+
+    fn rigid(&self) -> usize {
+        self.pushed.ncols()
+    }
+
+    fn back_force(&self, point: &Point) -> f64 {
+        match self.statics.parts.measured {
+            MeasuredLoad::Back => self.load,
+            MeasuredLoad::Contact => point.others[self.rigid()],
+        }
+    }
+
+    /// Factor of the equations of balance, which makes them lengths.
+    fn weight(&self) -> f64 {
+        self.scales.length / self.scales.force
+    }
+
+    /// Law of `pair` at `closure`, with the additional spring.
+    fn law_at(&self, pair: usize, closure: f64) -> LawValue {
+        let mut value = self.statics.law_at(pair, closure);
+        if self.support > 0.0 {
+            let stiffness = self.support * self.scales.stiffness[pair];
+            value.pressure += stiffness * closure;
+            value.tangent += stiffness;
+        }
+        value
+    }
+
+    fn evaluate(&self, point: Point) -> Evaluated {
+        let parts = &self.statics.parts;
+        let c = self.statics.pairs();
+        let law: Vec<LawValue> = (0..c).map(|k| self.law_at(k, point.closure[k])).collect();
+        let forces: Vec<f64> = law.iter().map(|value| value.pressure).collect();
+        let loaded: Vec<usize> = (0..c).filter(|&k| forces[k] != 0.0).collect();
+        let closed: Vec<usize> = (0..c).filter(|&k| law[k].tangent != 0.0).collect();
+        let (mut moved, mut size) = (vec![0.0; c], vec![0.0; c]);
+        for &j in &loaded {
+            let force = forces[j];
+            for ((sum, most), entry) in moved.iter_mut().zip(&mut size).zip(self.flexibility.col(j).iter()) {
+                let term = force * entry;
+                *sum += term;
+                *most += term.abs();
+            }
+        }
+        let back = self.back_force(&point);
+        let mut residual = Vec::with_capacity(c + point.others.len());
+        let mut largest = 0.0f64;
+        for k in 0..c {
+            let terms = [point.closure[k], parts.gap_m[k], back * parts.response.gap_per_load[k]];
+            let (mut sum, mut most) = (terms.iter().sum::<f64>(), terms.iter().map(|term| term.abs()).sum::<f64>());
+            for j in 0..self.rigid() {
+                let term = parts.response.rigid.normal[(k, j)] * point.others[j];
+                sum += term;
+                most += term.abs();
+            }
+            residual.push(sum + moved[k]);
+            largest = largest.max(most + size[k]);
+        }
+        let worst = residual.iter().fold(0.0f64, |worst, value| worst.max(value.abs()));
+        let mut accuracy = if largest > 0.0 { worst / largest } else { 0.0 };
+        if residual.iter().any(|value| !value.is_finite()) {
+            accuracy = f64::INFINITY;
+        }
+        let mut balance = |sum: f64, most: f64| {
+            residual.push(self.weight() * sum);
+            let share = if most > 0.0 { sum.abs() / most } else { 0.0 };
+            accuracy = if share.is_finite() { accuracy.max(share) } else { f64::INFINITY };
+        };
+        for j in 0..self.rigid() {
+            let load = back * parts.response.rigid.load[j];
+            let (mut sum, mut most) = (load, load.abs());
+            for &k in &loaded {
+                let term = self.pushed[(k, j)] * forces[k];
+                sum += term;
+                most += term.abs();
+            }
+            balance(sum, most);
+        }
+        if parts.measured == MeasuredLoad::Contact {
+            let total: f64 = forces.iter().sum();
+            balance(total - self.load, forces.iter().map(|force| force.abs()).sum::<f64>() + self.load.abs());
+        }
+        let norm = residual.iter().map(|value| value * value).sum::<f64>().sqrt();
+        Evaluated { point, law, closed, residual, norm, accuracy }
+    }
+
+    /// The Jacobian over the closed pairs and the other unknowns:
+    ///
+    /// ```text
+    /// I + G_cc k_c     B_n Φ_r    a
+    /// w (B Φ_r)ᵀ k_c   0          w p_r
+    /// w 1ᵀ k_c         0          0
+    /// ```
+    fn jacobian(&self, at: &Evaluated) -> Jacobian {
+        let parts = &self.statics.parts;
+        let (closed, others, rigid) = (&at.closed, at.point.others.len(), self.rigid());
+        let m = closed.len();
+        let weight = self.weight();
+        let mut matrix = Mat::<f64>::zeros(m + others, m + others);
+        for (column, &j) in closed.iter().enumerate() {
+            let tangent = at.law[j].tangent;
+            let of_pair = self.flexibility.col(j);
+            let out = matrix.col_mut(column);
+            for (row, entry) in out.iter_mut().enumerate() {
+                *entry = match closed.get(row) {
+                    Some(&k) => of_pair[k] * tangent,
+                    None if row - m < rigid => weight * self.pushed[(j, row - m)] * tangent,
+                    None => weight * tangent,
+                };
+            }
+            matrix[(column, column)] += 1.0;
+        }
+        for other in 0..others {
+            for (row, &k) in closed.iter().enumerate() {
+                matrix[(row, m + other)] = if other < rigid {
+                    parts.response.rigid.normal[(k, other)]
+                } else {
+                    parts.response.gap_per_load[k]
+                };
+            }
+            if other == rigid {
+                for (j, load) in parts.response.rigid.load.iter().enumerate() {
+                    matrix[(m + j, m + other)] = weight * load;
+                }
+            }
+        }
+        let lu = matrix.partial_piv_lu();
+        let sign = determinant_sign(&lu, m + others);
+        Jacobian { lu, sign }
+    }
+
+    /// Solves `J d = right` for several right-hand sides, `(c + others)×n`, in place.
+    fn solve(&self, at: &Evaluated, jacobian: &Jacobian, right: &mut Mat<f64>) {
+        let parts = &self.statics.parts;
+        let (c, m, others, rigid) = (self.statics.pairs(), at.closed.len(), at.point.others.len(), self.rigid());
+        let mut reduced = Mat::from_fn(m + others, right.ncols(), |row, column| match at.closed.get(row) {
+            Some(&k) => right[(k, column)],
+            None => right[(c + row - m, column)],
+        });
+        jacobian.lu.solve_in_place(reduced.as_mut());
+        let mut moved = vec![0.0; c];
+        let mut increments = vec![0.0; c];
+        for column in 0..right.ncols() {
+            for (row, &k) in at.closed.iter().enumerate() {
+                increments[k] = at.law[k].tangent * reduced[(row, column)];
+            }
+            times_columns(self.flexibility.as_ref(), &increments, &at.closed, &mut moved);
+            for k in 0..c {
+                // An open pair follows the others.
+                let mut value = right[(k, column)] - moved[k];
+                for other in 0..others {
+                    let per = if other < rigid {
+                        parts.response.rigid.normal[(k, other)]
+                    } else {
+                        parts.response.gap_per_load[k]
+                    };
+                    value -= per * reduced[(m + other, column)];
+                }
+                right[(k, column)] = value;
+            }
+            for (row, &k) in at.closed.iter().enumerate() {
+                right[(k, column)] = reduced[(row, column)];
+            }
+            for other in 0..others {
+                right[(c + other, column)] = reduced[(m + other, column)];
+            }
+        }
+    }
+
+    /// Newton's direction.
+    fn direction(&self, at: &Evaluated, jacobian: &Jacobian) -> Vec<f64> {
+        let mut right = Mat::from_fn(at.residual.len(), 1, |row, _| -at.residual[row]);
+        self.solve(at, jacobian, &mut right);
+        right.col(0).iter().copied().collect()
+    }
+
+    /// The point a step of length `t` along `direction` leads to.
+    fn step(&self, at: &Evaluated, direction: &[f64], t: f64, polish: bool) -> Point {
+        let c = self.statics.pairs();
+        let closure = (0..c)
+            .map(|k| {
+                let (delta, value) = (at.point.closure[k], at.law[k]);
+                if polish {
+                    return delta + t * direction[k];
+                }
+                let f = self.scales.flexibility[k];
+                let support = self.support * self.scales.stiffness[k];
+                // With the additional spring f is shared by it: δ (1 + f k_s) + f N.
+                let stretch = 1.0 + f * support;
+                let approach = delta + f * value.pressure + t * (1.0 + f * value.tangent) * direction[k];
+                let flexibility = f * self.statics.parts.area[k] / stretch;
+                self.statics.parts.law.shared_closure(approach / stretch, flexibility)
+            })
+            .collect();
+        let others = at.point.others.iter().zip(&direction[c..]).map(|(value, step)| value + t * step).collect();
+        Point { closure, others }
+    }
+
+    /// Newton steps from `start`; the state with its Jacobian, or the residual where they ended.
+    fn newton(&self, start: Point) -> Result<(Evaluated, Jacobian), f64> {
+        let mut at = self.evaluate(start);
+        let mut jacobian = self.jacobian(&at);
+        for _ in 0..MOST_STEPS {
+            if at.accuracy <= ROUNDING {
+                return Ok((at, jacobian));
+            }
+            let direction = self.direction(&at, &jacobian);
+            if direction.iter().any(|value| !value.is_finite()) {
+                return Err(at.accuracy);
+            }
+            let polish = at.accuracy < POLISH;
+            let mut better = None;
+            let mut t = 1.0;
+            for _ in 0..MOST_HALVINGS {
+                let tried = self.evaluate(self.step(&at, &direction, t, polish));
+                let improves =
+                    if polish { tried.accuracy < 0.5 * at.accuracy } else { tried.norm <= (1.0 - 1e-4 * t) * at.norm };
+                if improves || (!polish && tried.accuracy <= ROUNDING) {
+                    better = Some(tried);
+                    break;
+                }
+                if polish {
+                    break;
+                }
+                t *= 0.5;
+            }
+            match better {
+                Some(tried) => {
+                    at = tried;
+                    jacobian = self.jacobian(&at);
+                }
+                None if at.accuracy <= LIMIT => return Ok((at, jacobian)),
+                None => return Err(at.accuracy),
+            }
+        }
+        if at.accuracy <= LIMIT { Ok((at, jacobian)) } else { Err(at.accuracy) }
+    }
+
+    /// The negative derivatives of the equations with respect to the load, `s μ` and `ln κ`, `(c + others)×3`.
+    fn parameters(&self, at: &Evaluated) -> Mat<f64> {
+        let parts = &self.statics.parts;
+        let (c, rigid, weight) = (self.statics.pairs(), self.rigid(), self.weight());
+        let forces: Vec<f64> = at.law.iter().map(|value| value.pressure).collect();
+        let all: Vec<usize> = (0..c).filter(|&k| forces[k] != 0.0).collect();
+        let (mut by_friction, mut by_stiffness) = (vec![0.0; c], vec![0.0; c]);
+        times_columns(parts.response.sliding_flexibility.as_ref(), &forces, &all, &mut by_friction);
+        times_columns(self.flexibility.as_ref(), &forces, &all, &mut by_stiffness);
+        let back = parts.measured == MeasuredLoad::Back;
+        let work = |rows: &Mat<f64>, j: usize| all.iter().map(|&k| rows[(k, j)] * forces[k]).sum::<f64>();
+        Mat::from_fn(at.residual.len(), 3, |row, parameter| {
+            let of_pair = row < c;
+            let of_motion = (!of_pair && row - c < rigid).then(|| row - c);
+            match (parameter, of_motion) {
+                (0, _) if of_pair => -if back { parts.response.gap_per_load[row] } else { 0.0 },
+                (0, Some(j)) => -weight * if back { parts.response.rigid.load[j] } else { 0.0 },
+                (0, None) => weight,
+                (1, _) if of_pair => -by_friction[row],
+                (1, Some(j)) => -weight * work(&parts.response.rigid.sliding, j),
+                (1, None) => 0.0,
+                (_, _) if of_pair => -by_stiffness[row],
+                (_, Some(j)) => -weight * work(&self.pushed, j),
+                (_, None) => -weight * forces.iter().sum::<f64>(),
+            }
+        })
+    }
+
+    fn state(&self, at: &Evaluated, jacobian: &Jacobian) -> SteadyState {
+        let c = self.statics.pairs();
+        let mut slopes = self.parameters(at);
+        self.solve(at, jacobian, &mut slopes);
+        let slope = |parameter: usize| {
+            let direct = if parameter == 2 { 1.0 } else { 0.0 };
+            let closure: Vec<f64> = (0..c).map(|k| slopes[(k, parameter)]).collect();
+            let along = |k: usize, value: f64, rate: f64| {
+                direct * value + if closure[k] == 0.0 { 0.0 } else { rate * closure[k] }
+            };
+            StateSlope {
+                force: (0..c).map(|k| along(k, at.law[k].pressure, at.law[k].tangent)).collect(),
+                tangent: (0..c).map(|k| along(k, at.law[k].tangent, at.law[k].curvature)).collect(),
+                rigid: (0..self.rigid()).map(|j| slopes[(c + j, parameter)]).collect(),
+                back_force: match (self.statics.parts.measured, parameter) {
+                    (MeasuredLoad::Contact, _) => slopes[(c + self.rigid(), parameter)],
+                    (MeasuredLoad::Back, 0) => 1.0,
+                    (MeasuredLoad::Back, _) => 0.0,
+                },
+                closure,
+            }
+        };
+        SteadyState {
+            load_n: self.load,
+            friction: self.x,
+            back_force_n: self.back_force(&at.point),
+            closure_m: at.point.closure.clone(),
+            force_n: at.law.iter().map(|value| value.pressure).collect(),
+            tangent_n_per_m: at.law.iter().map(|value| value.tangent).collect(),
+            curvature_n_per_m2: at.law.iter().map(|value| value.curvature).collect(),
+            rigid: at.point.others[..self.rigid()].to_vec(),
+            residual: at.accuracy,
+            per_load: slope(0),
+            per_friction: slope(1),
+            per_stiffness: slope(2),
+        }
+    }
+}
+
+/// The sign of the determinant, 0 if a pivot vanishes to working precision.
+fn determinant_sign(lu: &PartialPivLu<f64>, size: usize) -> i8 {
+    let upper = lu.U();
+    let mut negative = false;
+    for k in 0..size {
+        let pivot = upper[(k, k)];
+        if pivot == 0.0 || !pivot.is_finite() {
+            return 0;
+        }
+        negative ^= pivot < 0.0;
+    }
+    let (permutation, _) = lu.P().arrays();
+    let mut seen = vec![false; size];
+    for start in 0..size {
+        let (mut k, mut length) = (start, 0);
+        while !seen[k] {
+            seen[k] = true;
+            k = permutation[k];
+            length += 1;
+        }
+        negative ^= length > 0 && length % 2 == 0;
+    }
+    if negative { -1 } else { 1 }
+}
+
+/// The state at `load` and `s_mu`, continued from `s_mu = 0`.
+pub(super) fn follow(statics: &Statics, load: f64, s_mu: f64) -> Result<SteadyState, StaticsError> {
+    let scales = Scales::new(statics, load);
+    let (at, jacobian) = at_rest(statics, load, &scales)?;
+    let sign = jacobian.sign;
+    let mut state = Equations::new(statics, load, 0.0, 0.0, &scales).state(&at, &jacobian);
+    let mut others = at.point.others;
+    let (mut x, mut step) = (0.0, s_mu.clamp(-LONGEST, LONGEST));
+    while x != s_mu {
+        let rest = s_mu - x;
+        let next = if step.abs() >= rest.abs() { s_mu } else { x + step };
+        let equations = Equations::new(statics, load, next, 0.0, &scales);
+        let along = next - x;
+        let slope = &state.per_friction;
+        let moved = |value: &f64, slope: &f64| value + along * slope;
+        let predicted = Point {
+            closure: state.closure_m.iter().zip(&slope.closure).map(|(value, slope)| moved(value, slope)).collect(),
+            others: others
+                .iter()
+                .zip(slope.rigid.iter().chain([&slope.back_force]))
+                .map(|(value, slope)| moved(value, slope))
+                .collect(),
+        };
+        let forces = state.force_n.iter().zip(&slope.force).map(|(force, slope)| moved(force, slope).max(0.0));
+        let accepted = equations.newton(predicted).ok().filter(|(at, jacobian)| {
+            let difference: f64 = forces.zip(&at.law).map(|(force, value)| (force - value.pressure).abs()).sum();
+            let total: f64 = at.law.iter().map(|value| value.pressure).sum();
+            let pushes = load <= 0.0 || equations.back_force(&at.point) > 0.0;
+            jacobian.sign == sign && pushes && difference <= DEVIATION * total.max(f64::MIN_POSITIVE)
+        });
+        match accepted {
+            Some((at, jacobian)) => {
+                state = equations.state(&at, &jacobian);
+                others = at.point.others;
+                x = next;
+                step = (2.0 * step).clamp(-LONGEST, LONGEST);
+            }
+            None => {
+                step = 0.5 * along;
+                if step.abs() < SHORTEST * x.abs().max(1.0) {
+                    let end = classify(statics, &scales, &state, &others, step.signum(), sign);
+                    return Err(StaticsError::NoEquilibrium {
+                        load_n: load,
+                        asked: s_mu,
+                        friction_coefficient: x,
+                        end,
+                    });
+                }
+            }
+        }
+    }
+    Ok(state)
+}
+
+/// The state without friction, the minimum of a convex energy.
+fn at_rest(statics: &Statics, load: f64, scales: &Scales) -> Result<(Evaluated, Jacobian), StaticsError> {
+    let mut residual = f64::INFINITY;
+    for supports in SUPPORTS {
+        let others = vec![0.0; statics.others()];
+        let mut point = Point { closure: vec![0.0; statics.pairs()], others };
+        for &support in supports {
+            match Equations::new(statics, load, 0.0, support, scales).newton(point) {
+                Ok((at, jacobian)) if support == 0.0 && jacobian.sign != 0 => return Ok((at, jacobian)),
+                Ok((at, _)) => point = at.point,
+                Err(left) => {
+                    residual = left;
+                    break;
+                }
+            }
+        }
+    }
+    Err(StaticsError::NoStateAtRest { load_n: load, residual, limit: LIMIT })
+}
+
+/// How the path ends just beyond `state`, in the direction `toward`.
+fn classify(statics: &Statics, scales: &Scales, state: &SteadyState, others: &[f64], toward: f64, sign: i8) -> PathEnd {
+    let back_vanishes = statics.parts.measured == MeasuredLoad::Contact
+        && state.back_force_n.abs() <= 1e-9 * scales.force * (1.0 + state.per_friction.back_force.abs());
+    if back_vanishes || state.contact_force_n() > GROWTH * scales.force {
+        return PathEnd::Jams;
+    }
+    if others.is_empty() || state.rigid.is_empty() {
+        return PathEnd::Turns;
+    }
+    // Forces that stay put while the motions of a part do not, or a singular Jacobian beyond the last kink: it tips.
+    let largest = |values: &[f64]| values.iter().fold(0.0f64, |most, value| most.max(value.abs()));
+    let beyond = 1e3 * SHORTEST * toward;
+    let closure: Vec<f64> =
+        state.closure_m.iter().zip(&state.per_friction.closure).map(|(value, slope)| value + beyond * slope).collect();
+    let equations = Equations::new(statics, state.load_n, state.friction + beyond, 0.0, scales);
+    let at = equations.evaluate(Point { closure, others: others.to_vec() });
+    let jacobian = equations.jacobian(&at);
+    if jacobian.sign == -sign && largest(&state.per_friction.force) > GROWTH * scales.force {
+        return PathEnd::Turns;
+    }
+    let upper = jacobian.lu.U();
+    let pivots = (0..upper.nrows()).map(|k| upper[(k, k)].abs());
+    let (least, most) =
+        pivots.fold((f64::INFINITY, 0.0f64), |(least, most), pivot| (least.min(pivot), most.max(pivot)));
+    if least <= 1e-9 * most { PathEnd::Tips } else { PathEnd::Turns }
+}

@@ -1,0 +1,246 @@
+//! Statics of steady sliding: closures and forces of contact pairs that can open, by semi-smooth Newton steps.
+
+use faer::{Mat, MatRef};
+
+use super::law::{LawError, LawValue, PressureLaw};
+use super::path;
+use super::response::StaticResponse;
+
+/// Which force a rig measures as its normal load.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MeasuredLoad {
+    /// The force `F` on the back of the pad. Where other springs share it, `Σ N < F`.
+    Back,
+    /// The sum of the contact forces, `Σ N`. The force on the back is then an unknown.
+    Contact,
+}
+
+/// What the statics of `c` contact pairs are made of.
+#[derive(Clone, Debug)]
+pub struct StaticsParts {
+    pub law: PressureLaw,
+    /// `A`, `c`: area of each pair in m², or a factor; force = area × pressure. Positive.
+    pub area: Vec<f64>,
+    /// `h`, `c`, m: initial gaps, pad minus disc along the normal; negative for interference.
+    pub gap_m: Vec<f64>,
+    pub response: StaticResponse,
+    pub measured: MeasuredLoad,
+}
+
+/// Statics of steady sliding of `c` contact pairs.
+#[derive(Clone, Debug)]
+pub struct Statics {
+    pub(super) parts: StaticsParts,
+    pub(super) total_area: f64,
+}
+
+/// How the states that follow from frictionless contact end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PathEnd {
+    /// Contact forces grow without limit, or the force on the back that belongs to the contact force vanishes.
+    Jams,
+    /// The state turns back to smaller friction coefficients: beyond, there is no neighbouring state, and before it more
+    /// than one.
+    Turns,
+    /// The closed pairs no longer support a free-floating part.
+    Tips,
+}
+
+impl std::fmt::Display for PathEnd {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Jams => "the pad jams",
+            Self::Turns => "the state turns back and is not unique",
+            Self::Tips => "the closed pairs no longer support a free-floating part",
+        })
+    }
+}
+
+/// Why there is no state.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum StaticsError {
+    #[error("contact law: {0}")]
+    Law(#[from] LawError),
+    #[error("{what} is {rows}x{columns}, expected {expected_rows}x{expected_columns}")]
+    Shape { what: &'static str, rows: usize, columns: usize, expected_rows: usize, expected_columns: usize },
+    #[error("{what}, entry ({row}, {column}), is {value}, expected {limit}")]
+    Value { what: &'static str, row: usize, column: usize, value: f64, limit: &'static str },
+    #[error("{what} is {value}, expected {limit}")]
+    Condition { what: &'static str, value: f64, limit: &'static str },
+    #[error(
+        "no steady sliding without friction at a load of {load_n} N: Newton steps leave {residual:.1e} of the forces, limit \
+         {limit:.1e}; the load does not press free-floating parts together, or nothing supports them"
+    )]
+    NoStateAtRest { load_n: f64, residual: f64, limit: f64 },
+    #[error(
+        "no steady sliding at a load of {load_n} N and friction coefficient {asked}: {end} at {friction_coefficient:.6}"
+    )]
+    NoEquilibrium { load_n: f64, asked: f64, friction_coefficient: f64, end: PathEnd },
+    #[error("contact pair {pair} is closed by {closure_m:e} m, beyond the last closure of the table, {limit_m:e} m")]
+    BeyondTable { pair: usize, closure_m: f64, limit_m: f64 },
+}
+
+/// Derivatives of a state with respect to one parameter.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StateSlope {
+    /// `dδ`, `c`.
+    pub closure: Vec<f64>,
+    /// `dN`, `c`.
+    pub force: Vec<f64>,
+    /// `dk`, `c`: of the tangent stiffness.
+    pub tangent: Vec<f64>,
+    /// `dρ`, `r`.
+    pub rigid: Vec<f64>,
+    /// `dF`.
+    pub back_force: f64,
+}
+
+/// A state of steady sliding. Where a pair with a sharp onset is exactly at it, derivatives are those of the open side.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SteadyState {
+    /// The measured load, N.
+    pub load_n: f64,
+    /// `s μ`: friction coefficient times the sign of the disc speed.
+    pub friction: f64,
+    /// `F`, N: force on the back of the pad.
+    pub back_force_n: f64,
+    /// `δ`, `c`, m: closures; negative where a pair is apart.
+    pub closure_m: Vec<f64>,
+    /// `N`, `c`, N: contact forces.
+    pub force_n: Vec<f64>,
+    /// `k = dN/dδ`, `c`, N/m; 0 where a pair with a sharp onset is open.
+    pub tangent_n_per_m: Vec<f64>,
+    /// `dk/dδ`, `c`, N/m².
+    pub curvature_n_per_m2: Vec<f64>,
+    /// `ρ`, `r`: amplitudes of rigid motions.
+    pub rigid: Vec<f64>,
+    /// What the equations leave, relative to the largest of their terms.
+    pub residual: f64,
+    /// Per N of the measured load.
+    pub per_load: StateSlope,
+    /// Per unit of `s μ`.
+    pub per_friction: StateSlope,
+    /// Per relative change of the contact law's stiffness, `d/d ln κ` for `N = κ A p(δ)`.
+    pub per_stiffness: StateSlope,
+}
+
+impl SteadyState {
+    /// Number of pairs that carry a force.
+    pub fn pairs_closed(&self) -> usize {
+        self.force_n.iter().filter(|force| **force > 0.0).count()
+    }
+
+    /// `Σ N`, N.
+    pub fn contact_force_n(&self) -> f64 {
+        self.force_n.iter().sum()
+    }
+}
+
+impl Statics {
+    /// Checks shapes, signs and finiteness.
+    ///
+    /// # Errors
+    /// [`StaticsError`]: `Law`, `Shape`, `Value`.
+    pub fn new(parts: StaticsParts) -> Result<Self, StaticsError> {
+        parts.law.check()?;
+        let c = parts.area.len();
+        let StaticResponse { normal_flexibility, sliding_flexibility, gap_per_load, rigid } = &parts.response;
+        let r = rigid.load.len();
+        let column = |values: &[f64]| Mat::from_fn(values.len(), 1, |k, _| values[k]);
+        let [area, gaps, load, rigid_load] =
+            [&parts.area, &parts.gap_m, gap_per_load, &rigid.load].map(|values| column(values));
+        for (what, matrix, rows, columns) in [
+            ("area", &area, c, 1),
+            ("initial gap", &gaps, c, 1),
+            ("gap per load", &load, c, 1),
+            ("normal flexibility", normal_flexibility, c, c),
+            ("sliding flexibility", sliding_flexibility, c, c),
+            ("gap per rigid motion", &rigid.normal, c, r),
+            ("sliding per rigid motion", &rigid.sliding, c, r),
+            ("load on rigid motions", &rigid_load, r, 1),
+        ] {
+            if matrix.shape() != (rows, columns) {
+                let (expected_rows, expected_columns) = (rows, columns);
+                let (rows, columns) = matrix.shape();
+                return Err(StaticsError::Shape { what, rows, columns, expected_rows, expected_columns });
+            }
+            for j in 0..columns {
+                for i in 0..rows {
+                    let value = matrix[(i, j)];
+                    let limit = match what {
+                        "area" if value <= 0.0 => "more than 0",
+                        "normal flexibility" if i == j && value < 0.0 => "at least 0",
+                        _ if !value.is_finite() => "a finite number",
+                        _ => continue,
+                    };
+                    return Err(StaticsError::Value { what, row: i, column: j, value, limit });
+                }
+            }
+        }
+        if c == 0 {
+            return Err(StaticsError::Condition { what: "number of contact pairs", value: 0.0, limit: "at least 1" });
+        }
+        let total_area = parts.area.iter().sum();
+        Ok(Self { parts, total_area })
+    }
+
+    /// Number of contact pairs, `c`.
+    pub fn pairs(&self) -> usize {
+        self.parts.area.len()
+    }
+
+    /// What the statics were made of.
+    pub fn parts(&self) -> &StaticsParts {
+        &self.parts
+    }
+
+    /// The state at the measured load `load_n` (N) and `s_mu`, friction coefficient times the sign of the disc speed: the
+    /// one that follows continuously from `s_mu = 0`. A pure function of its arguments.
+    ///
+    /// # Errors
+    /// [`StaticsError`]: `Condition` if an argument is not finite, or the load is not positive although it alone holds
+    /// free-floating parts or is the contact force; `NoStateAtRest`; `NoEquilibrium` where the states end before `s_mu`;
+    /// `BeyondTable`.
+    pub fn state(&self, load_n: f64, s_mu: f64) -> Result<SteadyState, StaticsError> {
+        for (what, value) in [("load", load_n), ("friction coefficient", s_mu)] {
+            if !value.is_finite() {
+                return Err(StaticsError::Condition { what, value, limit: "a finite number" });
+            }
+        }
+        let needs_load = !self.parts.response.rigid.load.is_empty() || self.parts.measured == MeasuredLoad::Contact;
+        if needs_load && load_n <= 0.0 {
+            return Err(StaticsError::Condition { what: "load", value: load_n, limit: "more than 0" });
+        }
+        let found = path::follow(self, load_n, s_mu)?;
+        if let PressureLaw::Table(table) = &self.parts.law {
+            let limit_m = table.last_closure_m();
+            if let Some(pair) = found.closure_m.iter().position(|closure| *closure > limit_m) {
+                return Err(StaticsError::BeyondTable { pair, closure_m: found.closure_m[pair], limit_m });
+            }
+        }
+        Ok(found)
+    }
+
+    /// Value of the contact law of `pair`, times its area.
+    pub(super) fn law_at(&self, pair: usize, closure_m: f64) -> LawValue {
+        let LawValue { pressure, tangent, curvature } = self.parts.law.at(closure_m);
+        let area = self.parts.area[pair];
+        LawValue { pressure: area * pressure, tangent: area * tangent, curvature: area * curvature }
+    }
+
+    /// Number of unknowns beside the closures: rigid motions, and the force on the back if it is not measured.
+    pub(super) fn others(&self) -> usize {
+        self.parts.response.rigid.load.len() + usize::from(self.parts.measured == MeasuredLoad::Contact)
+    }
+}
+
+/// `matrix * vector` over the listed `columns` only, in ascending order.
+pub(super) fn times_columns(matrix: MatRef<'_, f64>, vector: &[f64], columns: &[usize], out: &mut [f64]) {
+    out.fill(0.0);
+    for &j in columns {
+        let factor = vector[j];
+        for (sum, entry) in out.iter_mut().zip(matrix.col(j).iter()) {
+            *sum += factor * entry;
+        }
+    }
+}
