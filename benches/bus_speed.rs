@@ -1,4 +1,4 @@
-//! The node at the speed of the bus, over shared memory, beside a bare round trip over the same bus. For a quiet machine:
+//! Round trips to the node over shared memory, compared with a bare round trip over the same bus. For a quiet machine:
 //! `cargo bench --bench bus_speed`.
 
 #[path = "../tests/suite/bus/mod.rs"]
@@ -21,7 +21,7 @@ use squealcast::rig::Rig;
 use squealcast::session::settings::Settings;
 use squealcast::system::clock;
 
-/// Conditions sent at 1 kHz before the other of the two takes its turn.
+/// Conditions sent at 1 kHz in a block; blocks to the node and bare blocks alternate.
 const BLOCK: usize = 1000;
 /// Turns.
 const BLOCKS: usize = 10;
@@ -85,7 +85,7 @@ fn wave(seq: u64) -> OperatingPoint {
     OperatingPoint { friction_coefficient: 0.5 + 0.49 * (0.01 * seq as f64).sin(), ..point(seq) }
 }
 
-/// Who sends conditions to a bus and hears what becomes of them.
+/// Sends conditions to a bus and receives the answers.
 struct Asker {
     source: ShmSource,
     received: Receiver<Received<Prediction>>,

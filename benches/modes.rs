@@ -1,11 +1,11 @@
-//! Time and memory of the lowest modes of a free annular disc of bricks, at several sizes, beside SLEPc with MUMPS on the
+//! Time and memory of the lowest modes of a free annular disc of bricks, at several sizes, compared with SLEPc with MUMPS on the
 //! same matrices:
 //!
 //! ```text
 //! cargo bench --bench modes -- 20000 50000 100000 --repeat 3 --slepc /usr/bin/python3
 //! ```
 //!
-//! Every solution has a process of its own, whose memory is told by the system; ours and SLEPc's take turns. Frequencies
+//! Every solution runs in a separate process, whose memory the system reports; ours and SLEPc's alternate. Frequencies
 //! are compared before a time is printed. A disc has pairs of equal frequencies and six rigid motions: none may be missed.
 //! SLEPc is Debian's `python3-slepc4py`, one process, its factorisation MUMPS.
 
@@ -36,7 +36,7 @@ struct Options {
     /// Solve once in this process and print it as JSON
     #[arg(long, hide = true)]
     once: bool,
-    /// `cargo bench` says so
+    /// passed by `cargo bench`
     #[arg(long, hide = true)]
     bench: bool,
 }

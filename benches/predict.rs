@@ -1,7 +1,7 @@
 //! Time of a prediction by each route, answers checked first: `cargo bench --bench predict`.
 //!
 //! Synthetic undamped rigs over the friction coefficient, 48 contact pairs, band 5 kHz, one thread. 490 modes take minutes more:
-//! they are measured with SQUEALCAST_MEASURE=1. Against error and beside LAPACK the same routes stand in `squealcast bench`.
+//! they are measured with SQUEALCAST_MEASURE=1. `squealcast bench` measures the same routes against their error, and LAPACK.
 
 use std::hint::black_box;
 

@@ -1,4 +1,4 @@
-//! What a condition costs in memory: nothing, after the first, when it is read off the chart.
+//! Allocations of a prediction: a charted one allocates nothing, except the first.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -112,7 +112,7 @@ fn a_reused_condition_allocates_nothing() {
     assert_eq!(session.counters().reused, 499);
 }
 
-/// A dense solve: what it allocates is vectors of roots and shapes, whose number does not grow with the conditions.
+/// A dense solve allocates vectors of roots and shapes, whose number does not grow with the number of conditions.
 #[test]
 fn a_solved_condition_allocates_the_same_every_time() {
     let rig = synthetic(24);

@@ -1,6 +1,6 @@
 //! Every reader of bytes from outside against mutations of sound files: it must answer each within 256 MiB and 10 s.
 //!
-//! Each reader has a process of its own, whose allocations are counted; as many run at a time as there are processors.
+//! Each reader runs in a separate process, whose allocations are counted; as many run at a time as there are processors.
 //! Mutations are drawn from a seeded generator and not guided by coverage, which needs a compiler that instruments every
 //! crate. `SQUEALCAST_FUZZ_S` is how many seconds each reader gets, and `SQUEALCAST_FUZZ_SEED` the seed. Arguments name
 //! readers.
@@ -22,9 +22,9 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use targets::{TARGETS, Target};
 
-/// What a reader may have allocated at a time beside its input.
+/// Bytes that a reader may hold at a time in addition to its input.
 const MOST_BYTES: usize = 256 << 20;
-/// What it may take for one input, on the slowest machine.
+/// Time limit for one input, on the slowest machine.
 const LONGEST: Duration = Duration::from_secs(10);
 /// Seconds for each reader unless the environment says otherwise.
 const SECONDS: f64 = 1.0;
@@ -85,7 +85,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Runs the readers of these names, each in a process of its own.
+/// Runs the readers of these names, each in a separate process.
 fn all(names: Vec<&'static str>) -> ExitCode {
     let waiting = Mutex::new(names);
     let failed = Mutex::new(vec![]);
@@ -128,7 +128,7 @@ fn mutate(target: &Target) {
     let seeds = seeds(target.name);
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let (mut count, mut most, mut longest) = (0_u64, 0, Duration::ZERO);
-    // As it is first: what is wrong with a sound file is not the mutations' doing.
+    // First the file without mutation: it must be read without an error.
     let mut next = seeds.clone();
     let started = Instant::now();
     while started.elapsed().as_secs_f64() < seconds || !next.is_empty() {

@@ -85,7 +85,7 @@ fn file(name: &str, bytes: &[u8]) -> PathBuf {
     path
 }
 
-/// The files of a full model of one node; the first byte says which of them the rest stands for.
+/// The files of a full model of one node; the first byte selects the file that the rest represents.
 const FULL_MODEL: [(&str, &str); 5] = [
     ("model.toml", include_str!("full_model.toml")),
     ("K.mtx", "%%MatrixMarket matrix coordinate real symmetric\n3 3 3\n1 1 2e6\n2 2 3e6\n3 3 4e6\n"),

@@ -23,7 +23,7 @@ fn side(name: &str, omega_rad_s: Vec<f64>, phi: Mat<f64>) -> ModalSide<'_> {
     ModalSide { name, nodes_m, omega_rad_s, phi, residual: None, damping_ratio: None, mass_share: None }
 }
 
-/// A rig of two sides, `more` beside the patch.
+/// A rig of two sides with the tables `more` in addition to the patch.
 fn rig_of(more: &str, sides: &[ModalSide<'_>]) -> Vec<RigFile> {
     let patch = "[[contact_patch]]\naxis_point_m = [0.0, 0.0, 0.0]\naxis_direction = [0.0, 1.0, 0.0]\n\
                  normal = [0.0, 1.0, 0.0]\nstiffness_n_per_m = 2e5\n";
@@ -39,7 +39,7 @@ fn modes(rig: &Rig, p: &OperatingPoint) -> Vec<c64> {
     spectrum(rig, p).modes().iter().map(|root| root.lambda).collect()
 }
 
-/// Sides with modes of their own are a special case of a shared basis: `[Φ_p 0]` and `[0 Φ_d]`.
+/// Sides with separate modes are a special case of a shared basis: `[Φ_p 0]` and `[0 Φ_d]`.
 #[test]
 fn a_shared_basis_of_both_sides_modes_is_the_same_rig() {
     let law = "[load]\nexponent = 0.3\n[friction]\nlateral_damping = true\nslope_s_per_m = -0.01\n";
@@ -136,7 +136,7 @@ fn a_system_on_its_basis_has_the_roots_it_has() {
     for (disc_speed_rad_s, friction_coefficient) in [(2.0, 0.8), (5.0, 0.33), (20.0, 0.0), (11.0, 0.61)] {
         let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s, friction_coefficient };
         let found = match_roots(&modes(&whole, &p), &modes(&rig, &p), counted);
-        // Not among the points that were held out: the tolerance is what was found at those, not a bound.
+        // Not one of the held-out points: the tolerance was verified at those and is not a bound elsewhere.
         assert!(found.errors.len() > 5 && found.worst() < 1e-6, "{p:?}: {} {:e}", found.errors.len(), found.worst());
     }
     for (wrong, message) in [
@@ -197,7 +197,7 @@ fn a_rig_made_at_one_load_and_used_at_another_is_caught() {
     fs::write(&hertzian, written + "\n[load]\nexponent = 0.3333333333333333\nreference_n = 500.0\n").unwrap();
     let to = temp.path().join("at-500-n.toml");
     run(["reduce", &text(&hertzian), "--range", "mu=0:1,load=500", "--points", "0", "-o", &text(&to)]).exits(0);
-    // A prediction says so itself.
+    // The prediction carries a note.
     let beyond = "beyond the conditions that the basis was made for";
     let predict = |load: &str| run(["predict", &text(&to), "--mu", "0.3", "--load", load]).exits(0).stdout;
     assert!(predict("900").contains(beyond) && !predict("500").contains(beyond));
@@ -209,7 +209,7 @@ fn a_rig_made_at_one_load_and_used_at_another_is_caught() {
         eprintln!("{}", found["certificate"]);
         found["certificate"]["max_relative_error"].as_f64().unwrap()
     };
-    // 50 to 2000 N, of which nothing was told to the basis: more than the 1e-6 that it holds at 500 N.
+    // 50 to 2000 N, a range the basis was not sampled over: the error exceeds the 1e-6 that holds at 500 N.
     let elsewhere = verify(&to, 3);
     // The same rig at its own load: the range that points are drawn from is the rig's chart.
     let mut near: toml::Table = fs::read_to_string(&to).unwrap().parse().unwrap();

@@ -13,7 +13,7 @@ use tempfile::TempDir;
 /// Files the rig file refers to.
 const MATRICES: [&str; 8] = ["M.mtx", "K1.mtx", "KR.mtx", "KGeo.mtx", "D1.mtx", "DG.mtx", "DR.mtx", "D4.mtx"];
 
-/// The rig file with the matrices beside it, if they are there.
+/// The rig file in the folder of the matrices, if they exist.
 fn rig() -> Option<(TempDir, String)> {
     let shared = std::env::var_os("SQUEALCAST_SHARED")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
@@ -55,7 +55,7 @@ fn the_brake_on_150_modes_squeals_where_its_reference_does() {
         assert!((hz - expected_hz).abs() <= 0.005, "{hz} Hz instead of {expected_hz}");
         assert!((growth - expected_growth).abs() <= 0.0005, "{growth} 1/s instead of {expected_growth} at {hz} Hz");
     }
-    // What is listed lies in the band, ascending, each identity once; the solve is good to rounding.
+    // Listed modes lie in the band, ascending, each identity once; residuals are of the size of rounding.
     let frequencies: Vec<f64> = modes.iter().map(|mode| number(mode, "frequency_hz")).collect();
     assert!(frequencies.is_sorted() && frequencies.iter().all(|hz| *hz <= 6000.0), "{frequencies:?}");
     let mut ids: Vec<u64> = modes.iter().map(|mode| mode["id"].as_u64().expect("a number")).collect();
@@ -123,7 +123,7 @@ fn check_describes_the_brake() {
         .says("KGeo.mtx times disc_speed_rad_s^2 - 1, symmetric");
 }
 
-/// On a basis of its own vectors the full model's roots are all there: against the values of the data's README, from
+/// A rig on a basis of the full model's vectors has all its roots: compared with the values of the data's README, from
 /// eight shifts and Newton refinement in another program, at the reference speed; held-out points over speed and friction
 /// are solved in full by the command itself.
 #[test]

@@ -18,7 +18,7 @@ use squealcast::bus::shm::{
 use squealcast::msgs::shm::{Form, OperatingPointForm};
 use squealcast::msgs::{OperatingPoint, Prediction, RigInfo, Vibration};
 
-/// A node hears its inputs with two readers: a reliable one and a best-effort one.
+/// A node receives its inputs with two readers: a reliable one and a best-effort one.
 const READERS: usize = 2;
 
 /// Loopback, in a domain.
@@ -48,7 +48,7 @@ fn spawn_peer(test: &str, name: &str, value: &str) -> Peer {
     Peer(child)
 }
 
-/// Another process; it ends by SIGKILL, whatever becomes of the test.
+/// Another process; it is killed even if the test fails.
 struct Peer(Child);
 
 impl Drop for Peer {
@@ -92,7 +92,7 @@ fn shared_memory_carries_both_ways() {
 
 #[test]
 fn a_slow_shared_memory_reader_counts_lost_messages() {
-    // Twice what may wait for it.
+    // Twice as many as its queue holds.
     const WAITING: u64 = OperatingPointForm::WAITING_SAMPLES as u64;
     const COUNT: u64 = 2 * WAITING;
     let options = shm("slow");
@@ -191,7 +191,7 @@ fn a_file_prefix_keeps_strangers_apart() {
     let (sender, received) = unbounded();
     let _input = ShmInput::spawn(&apart, into(sender)).expect("input");
     assert_eq!(ShmSource::new(&options).expect("stranger").publish(&point(1)).expect("published"), 0);
-    // It stays: what a writer leaves behind that nobody has connected to yet goes with it.
+    // It is kept alive: the samples of a writer without readers vanish with it.
     let source = ShmSource::new(&apart).expect("source");
     assert_eq!(source.publish(&point(2)).expect("published"), 1);
     assert_eq!(next(&received).message, point(2));
@@ -354,7 +354,7 @@ fn namespaces_separate_nodes() {
     }
 }
 
-/// What waits while a lost sample is sent again, or the machine is busy: a thread that hears is held up here.
+/// Samples are queued while a lost one is sent again or the machine is busy; here the receiving thread is delayed.
 #[test]
 fn reliable_inputs_that_wait_are_not_lost() {
     const COUNT: u64 = 6000; // 2 kHz for 3 s, the default time between heartbeats of Fast DDS
@@ -456,8 +456,8 @@ fn peers_with_incompatible_quality_of_service_are_counted_while_they_are_there()
     wait_until("it is gone", || ros.counts().incompatible == 0);
 }
 
-/// A second node of one domain and namespace: subscribers cannot tell the predictions of the two apart. In a namespace of its
-/// own it disturbs nobody.
+/// A second node of one domain and namespace: subscribers cannot distinguish the predictions of both. In another
+/// namespace it is no problem.
 #[test]
 fn another_publisher_of_predictions_is_counted_while_it_is_there() {
     let domain = Domain::claim();

@@ -1,5 +1,5 @@
-//! Files that claim more than they hold, unpack to far more than they are, or are no files at all: the program refuses them
-//! by name, at once, and within 256 MiB of memory of its own. More than that would end it with a signal, which no test here
+//! Files that claim more than they contain, unpack to far more than their size, or are no regular files: the program refuses them
+//! by name, at once, and within 256 MiB of private memory. More than that would end it with a signal, which no test here
 //! takes for an answer.
 
 use std::ffi::OsStr;
@@ -238,7 +238,7 @@ fn recordings_that_unpack_beyond_the_limit_are_refused_briefly() {
     recover(&bomb, "20 unreadable records; the rest of it is not read");
     let large = recording(&[chunk(&[0; 1000], 256 << 20)]);
     recover(&large, "chunk of 268435456 bytes, more than the limit of");
-    // Messages as large as a chunk may be, one in each: they are given out, but not all at once.
+    // Messages as large as a chunk may be, one in each: they are returned one after another, not held all at once.
     let records = [channel(), message(1, 31 << 20)].concat();
     let many = recording(&vec![chunk(&records, records.len() as u64); 8]);
     recover(&many, "what follows is not read");
@@ -257,7 +257,8 @@ fn recordings_that_unpack_beyond_the_limit_are_refused_briefly() {
     recover(&recording(&[chunk(&schemas, schemas.len() as u64)]), "schemas and channels of more than the limit");
 }
 
-/// What an earlier process left in the record directory must not keep the node from starting, whatever is in it.
+/// A file that an earlier process left in the record directory does not prevent the node from starting, for any
+/// content.
 #[test]
 fn leftovers_that_cannot_be_repaired_are_set_aside() {
     let folder = folder();

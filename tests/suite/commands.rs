@@ -1,4 +1,4 @@
-//! What the real binary computes and says: exit codes, output, closed forms, the published nine-degree-of-freedom model.
+//! Results and output of the binary: exit codes, output, closed forms, the published nine-degree-of-freedom model.
 //! Sessions are in `sessions.rs`.
 
 use std::collections::BTreeMap;
@@ -17,7 +17,7 @@ fn modes(prediction: &Value) -> Vec<c64> {
 
 // --- predict ---------------------------------------------------------------------------------------------------------
 
-/// One coordinate, `λ² = -k`, written as kind 3 so that a test can say exactly what comes out.
+/// One coordinate, `λ² = -k`, written as kind 3 so that a test knows the exact result.
 fn one_coordinate(directory: &Path, stiffness: f64) -> String {
     let entry = |value: f64| format!("%%MatrixMarket matrix coordinate real general\n1 1 1\n1 1 {value:e}\n");
     write(directory, "m.mtx", &entry(1.0));
@@ -89,7 +89,7 @@ fn conditions_default_to_the_reference_of_the_rig() {
     let prediction = json(["predict", &rig, "--json"]);
     assert_eq!(prediction["rig"], "one");
     assert_eq!(conditions(&prediction), [80.0, -7.5, 0.125]);
-    // Kind 3 does not tell pad from disc; JSON has no NaN.
+    // Kind 3 does not distinguish pad and disc; JSON has no NaN.
     assert_eq!(prediction["modes"][0]["pad_participation"], Value::Null);
     // √((2π)²)/2π: two roundings.
     assert!((number(&prediction["modes"][0], "frequency_hz") - 1.0).abs() < 4.0 * f64::EPSILON);
@@ -119,7 +119,7 @@ fn static_divergence_is_reported_apart() {
 #[test]
 fn a_contact_that_does_not_slide_or_is_open_is_said() {
     let frequencies = |args: &[&str]| modes(&json(args.iter().chain(&["--json"])));
-    // Slower than 0.01 rad/s μ counts as 0, whatever was asked for.
+    // Slower than 0.01 rad/s μ counts as 0, for any given value.
     for speed in ["0", "0.0099", "-0.0099"] {
         let at_rest = ["predict", "nine-dof", "--mu", "1", "--speed", speed];
         run(at_rest).exits(0).says("not sliding: friction coefficient taken as 0").says("stable");
@@ -260,7 +260,7 @@ fn nine_degrees_of_freedom_have_the_published_modes() {
         let found = modes(&json(["predict", rig, "--mu", mu, "--json"]));
         assert_eq!(found.len(), expected.len(), "{rig} at {mu}");
         for (found, &(sigma, omega)) in found.iter().zip(expected) {
-            // 1e-9 relative is what is promised. λ² rather than λ: the pairs are near their merging, where a backward
+            // The documented accuracy is 1e-9, relative. λ² rather than λ: the pairs are near their merging, where a backward
             // error ε moves λ by ε/|λ₁-λ₂|, and λ² = -κ is what is computed. Growth rates by themselves too: they
             // are 1e-2 of |λ| here, so 1e-9 of them is 1e-11 of |λ|, still far above ε/|λ₁-λ₂| = 1e-14.
             let (square, root) = (*found * *found, c64::new(sigma, omega));
@@ -298,7 +298,7 @@ fn nine_degrees_of_freedom_have_the_published_critical_friction() {
             assert_eq!(keys, ["frequency_hz", "kind", "mode_ids", "mu_from", "mu_to"], "sorted by the reader");
             let off = (number(window, "mu_from") - mu).abs();
             worst = worst.max(off);
-            // 1e-10 is what is promised.
+            // The documented accuracy is 1e-10.
             assert!(off < 1e-10, "{rig}: {window} instead of {mu}");
             assert_eq!(window["mode_ids"], serde_json::json!(ids), "{rig}: {window}");
             assert_eq!(window["mu_to"], Value::Null, "{rig}: open at 20: {window}");
@@ -312,11 +312,11 @@ fn nine_degrees_of_freedom_have_the_published_critical_friction() {
         assert!((TAU * hz / pair.im - 1.0).abs() < 1e-6, "{rig}: {hz} Hz at {from}, {pair} beside it");
     }
     eprintln!("largest difference of a critical friction coefficient: {worst:.1e}");
-    // The search ends where it is told to.
+    // The search ends at the given limit.
     let short = json(["critical", "nine-dof", "--mu-max", "2", "--json"]);
     assert_eq!(short["windows"].as_array().expect("windows").len(), 1);
     assert_eq!(json(["critical", "nine-dof", "--mu-max", "0.8", "--json"])["critical_friction"], Value::Null);
-    // Nothing hides below what is stated: twenty halvings of the range.
+    // The stated resolution: twenty halvings of the range.
     assert!(number(&short, "narrowest_window") <= 2.0 / 1e6, "{short}");
     assert_eq!(short["complete"], true);
 }
@@ -568,12 +568,12 @@ fn damping_destabilises_hulten_modes_as_routh_and_hurwitz_say() {
         rigs.extend((!file.is_empty()).then(|| launch(file)));
         for rig in rigs {
             let found = json(["critical", &rig, "--json"]);
-            // 1e-10 is what is promised of every end of a window.
+            // The documented accuracy of every end of a window is 1e-10.
             assert!((number(&found, "critical_friction") - expected).abs() < 1e-10, "{found} instead of {expected}");
             let window = &found["windows"][0];
             assert_eq!(window["kind"], "zero_growth");
             assert!((number(window, "frequency_hz") / expected_hz - 1.0).abs() < 1e-9, "{found}");
-            // The growth rate changes its sign there; 1e-4 beside it |σ| is about 0.01 1/s, far above rounding.
+            // The growth rate changes its sign there; at a distance of 1e-4 |σ| is about 0.01 1/s, far above rounding.
             for (beside, unstable) in [(-1e-4, 0), (1e-4, 1)] {
                 let mu = (expected + beside).to_string();
                 assert_eq!(json(["predict", &rig, "--mu", &mu, "--json"])["unstable_modes"], unstable);
@@ -624,7 +624,7 @@ fn a_mode_that_grows_out_of_the_band_ends_its_window_there_or_not_at_all() {
                 [[system.damping]]\nmatrix = \"c.mtx\"\nscale = \"friction_coefficient - 0.1\"\n";
     let found = json(["critical", &write(folder.path(), "band.toml", toml), "--json"]);
     assert_eq!(found["windows"].as_array().map(Vec::len), Some(1), "{found}");
-    // 1e-10 is what is promised of both ends.
+    // The documented accuracy of both ends is 1e-10.
     assert!((number(&found, "critical_friction") - 0.1).abs() < 1e-10, "{found}");
     // The smaller root, written without cancellation.
     let rest = limit - 1.1 * k;

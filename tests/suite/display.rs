@@ -1,6 +1,6 @@
 //! The display against a real `demo`: over plain sockets, and in Debian's Chromium where it and Node.js are there.
 //!
-//! `tests/browser/setup.sh` puts in place what the browser tests need. Without it they are skipped and say so; with
+//! `tests/browser/setup.sh` installs the programs that browser tests need. Without them they are skipped with a note; with
 //! `SQUEALCAST_BROWSER_TESTS=required` that is a failure.
 
 use std::collections::HashMap;
@@ -209,7 +209,7 @@ fn browser_tests() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/browser")
 }
 
-/// What a browser test printed.
+/// Output of a browser test.
 fn browse(script: &str, arguments: &[&str]) -> serde_json::Value {
     let pictures = std::env::var("SQUEALCAST_PICTURES").unwrap_or_default();
     let output = Command::new("node").arg(browser_tests().join(script)).args(arguments).arg(pictures).output().unwrap();
@@ -304,7 +304,7 @@ fn the_page_shows_a_demo_as_it_is() {
             ];
             assert_eq!(mode["values"].as_array().unwrap().len(), values.len());
             for (shown, value) in mode["values"].as_array().unwrap().iter().zip(values) {
-                // What is not known, such as the pad's share where a chart does not tell it, is shown as nothing.
+                // Unknown values, such as the pad's share of a charted cluster, are shown as empty.
                 let exact = shown.as_str().unwrap().parse().ok();
                 assert_eq!(exact, value.is_finite().then_some(value), "mode {} of input {seq}", known.id);
             }
@@ -601,7 +601,7 @@ fn a_report_lists_hits_misses_and_false_alarms() {
             let found_s: f64 = row("lead").split_once(' ').unwrap().0.parse().unwrap();
             assert!((found_s - expected_s).abs() < 0.07, "lead {found_s} s, by construction {expected_s} s");
         }
-        // With a threshold above the tone nothing was heard.
+        // With a threshold above the tone there is no measured squeal.
         run(&["report", session, "-o", out.to_str().unwrap(), "--vibration-threshold", "120"]);
         let html = std::fs::read_to_string(out.join("report.html")).unwrap();
         assert!(
@@ -618,7 +618,7 @@ fn a_report_lists_hits_misses_and_false_alarms() {
     assert!(html.contains("holds no measured vibration"));
 }
 
-/// Nobody, one, twenty pages of which one never reads, and nobody again, in one run.
+/// No page, one, twenty of which one never reads, and none again, in one run.
 #[test]
 fn pages_do_not_slow_the_node() {
     if !measures() {

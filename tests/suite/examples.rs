@@ -5,7 +5,7 @@ use std::process::{Command, Output};
 
 use crate::program::{Running, command, until};
 
-/// The compiled example `name`, which `cargo test` builds beside the tests.
+/// The compiled example `name`, which `cargo test` builds with the tests.
 fn example(name: &str) -> PathBuf {
     let test = std::env::current_exe().unwrap();
     test.parent().and_then(|deps| deps.parent()).unwrap().join("examples").join(name)

@@ -91,7 +91,7 @@ impl Disk {
         Some(Self { folder, device: String::from_utf8(attached.stdout).unwrap().trim().to_owned() })
     }
 
-    /// Mounts it when nobody has it any more: another process may have taken a copy of the mount into a namespace of its own, and
+    /// Mounts it when it is no longer mounted: another process may have copied the mount into its own namespace, and
     /// with it the file system that was stopped.
     fn mount(&self) -> Option<Mounted> {
         let began = Instant::now();
@@ -122,7 +122,7 @@ fn cut_power(folder: &Path) {
     assert!(succeeds("python3", &["-c", script, &text(folder)]), "the file system does not stop");
 }
 
-// --- what is written -------------------------------------------------------------------------------------------------
+// --- written files ---------------------------------------------------------------------------------------------------
 
 /// Inputs of the writers, on a file system that stays.
 struct Prepared {
@@ -339,15 +339,15 @@ impl Writer {
     }
 }
 
-/// What a writer has done so far.
+/// Progress of a writer.
 #[derive(Default)]
 struct Progress {
     begun: AtomicBool,
-    /// Files that were written, as their writer said.
+    /// Files that their writer reported as written.
     done: AtomicUsize,
 }
 
-/// Lets `writer` write until the power is cut, and looks what is there when it is back; what was lost of a recording.
+/// Lets `writer` write until the power is cut, and inspects the files when it is back; returns the loss of a recording.
 fn power_cut(disk: &Disk, writer: Writer, after: Duration, prepared: &Prepared) -> Option<Duration> {
     let mounted = disk.mount()?;
     let folder = mounted.folder.join("written");
@@ -378,7 +378,7 @@ fn power_cut(disk: &Disk, writer: Writer, after: Duration, prepared: &Prepared) 
 
     let mounted = disk.mount()?;
     let control = mounted.folder.join("control");
-    // What nobody put on the disk is not there: the power was cut.
+    // Data that were not flushed to the disk are not there: the power was cut.
     assert!(fs::read(&control).unwrap_or_default().is_empty(), "the file system was not stopped");
     let _ = fs::remove_file(control);
     let done = progress.done.load(Ordering::SeqCst).checked_sub(1);
@@ -416,7 +416,7 @@ fn a_power_failure_leaves_every_file_whole_or_not_there() {
 
 // --- disks that are full or may not be written to ---------------------------------------------------------------------
 
-/// A node that begins on a disk which refuses predicts on, says so, and records once the disk accepts.
+/// A node that starts on a disk which refuses writes predicts, reports it, and records once the disk accepts data.
 #[test]
 fn a_node_starts_on_a_disk_that_is_full_or_read_only() {
     let temp = TempDir::new().unwrap();
@@ -430,7 +430,7 @@ fn a_node_starts_on_a_disk_that_is_full_or_read_only() {
         let args =
             ["demo", "nine-dof-case-2", "--no-ros", "--no-shm", "--no-display", "--no-chart", "--plain", "--record"];
         let node = Running::start(command(args.iter().map(|&arg| arg.to_owned()).chain([text(&records)])));
-        // It predicts: what it says of that is read at the end.
+        // It predicts; its notes are read at the end.
         std::thread::sleep(Duration::from_secs(1));
         mounted.remount(accepting);
         let recordings = || if records.exists() { files_below(&records) } else { vec![] };

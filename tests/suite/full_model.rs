@@ -1,4 +1,4 @@
-//! Full models from files: what is read of the tribometer, and what is said of files that are wrong.
+//! Full models from files: the tribometer as read back, and the errors of invalid files.
 
 use std::path::Path;
 
@@ -240,7 +240,7 @@ fn calculix_abaqus_and_matrix_market_give_the_same_modes() {
     }
 }
 
-/// Labelled rows as Abaqus lists them, a node held along z; cut short, what is left must not pass for a smaller model.
+/// Labelled rows as Abaqus lists them, a node held along z; a truncated file must not be taken for a smaller model.
 #[test]
 fn labelled_matrices_cut_short_are_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -281,7 +281,7 @@ fn labelled_matrices_cut_short_are_refused() {
         .complains("k.txt, line 2: entry is at node 17, direction 2; expected a row of rows.csv");
 }
 
-/// What only a factorisation finds out about a matrix is told with its file.
+/// An error of a matrix that only the factorisation finds names its file.
 #[test]
 fn indefinite_matrices_are_refused_by_file_name() {
     let folder = tempfile::tempdir().unwrap();
@@ -385,7 +385,7 @@ fn the_full_tribometer_is_solved() {
     run(["full", &path, "--mu", "0.4"]).exits(0).says("covered: 0 to 4000 Hz");
 }
 
-/// A rig of kind 3 that leaves nothing out is its own full model: no error beyond rounding, nothing missed or invented.
+/// A rig of kind 3 without truncation is its own full model: no error beyond rounding, nothing missed or invented.
 #[test]
 fn a_rig_that_leaves_nothing_out_agrees() {
     let rig = program::launch("hulten.toml");

@@ -21,7 +21,7 @@ fn the_stiffness_behind_known_frequencies_is_found() {
     let softer = rig_file.replace("stiffness_n_per_m = 1.0", "stiffness_n_per_m = 0.125");
     assert_eq!(softer.matches("stiffness_n_per_m = 0.125").count(), 2);
     let rig = write(temp.path(), "softer.toml", &softer);
-    // In any order: the natural frequencies of a rig have none of their own.
+    // In any order: targets are sorted.
     let listed: String = NINE_DOF_RAD_S.iter().rev().map(|w| format!("m,{}\n", w / TAU)).collect();
     let targets = write(temp.path(), "measured.csv", &format!("mode,frequency_hz\n{listed}"));
     let svg = temp.path().join("identification.svg");
@@ -72,7 +72,7 @@ fn the_stiffness_behind_known_frequencies_is_found() {
     assert!(few > 1.5 * all, "{few} {all}");
 }
 
-/// A rig of kind 2 with the residual of what it leaves out, against the full model's own frequencies with another
+/// A rig of kind 2 with the residual of the truncated modes, against the full model's own frequencies with another
 /// stiffness; and against its own, where nothing is left out.
 #[test]
 fn the_stiffness_of_a_full_model_is_found_on_a_rig_with_residuals() {
@@ -106,7 +106,7 @@ fn the_stiffness_of_a_full_model_is_found_on_a_rig_with_residuals() {
     let (exact, stiffer) = (frequencies(FACTOR), frequencies(1.02 * FACTOR));
     let found = json(["identify", &rig_file, "--targets", &list("full.csv", &exact), "--json"]);
     eprintln!("{found}");
-    // The sensitivity by the full model's own frequencies; those of the rig are off by what the modes left out leave.
+    // The sensitivity by the full model's own frequencies; those of the rig differ by the remaining truncation error.
     let sensitivity = rms(&stiffer, &exact) / 1.02_f64.ln();
     assert!((number(&found, "sensitivity") / sensitivity - 1.0).abs() < 0.05, "{sensitivity} {found}");
     let rig = Rig::load(&rig_file).unwrap().with_contact_stiffness_times(FACTOR).unwrap();
@@ -143,7 +143,7 @@ fn the_stiffness_of_a_full_model_is_found_on_a_rig_with_residuals() {
     run(write_fitted).exits(1).complains("is there with another content");
 }
 
-/// Frequencies that two stiffnesses fit about as well say so.
+/// Frequencies that many stiffnesses fit about as well are reported as such.
 #[test]
 fn stiffness_that_is_poorly_determined_is_called_so() {
     let temp = tempfile::tempdir().unwrap();

@@ -45,7 +45,7 @@ impl Side {
         }
     }
 
-    /// An archive of the first `kept` modes, with residuals of the rest where they are asked for.
+    /// An archive of the first `kept` modes, with residuals of the rest if requested.
     fn archive(&self, kept: usize, flexibility: bool, inertia: bool) -> Vec<u8> {
         let rows = self.phi.len();
         let (nodes, modes) = (self.nodes.len() as u64, kept as u64);
@@ -174,7 +174,7 @@ fn modes_left_out_follow_statically_through_triads_and_interpolation() {
             assert_same(&c, &damping, 1e-8, "C");
         }
     }
-    // Without what the other modes do, the springs are much too stiff: the test can fail.
+    // Without residual flexibility the contact is much too stiff: the test can fail.
     let plain = rig("", pad().archive(KEPT[0], false, false), disc().archive(KEPT[1], false, false));
     let [plain, _] = matrices(&plain, 0.3);
     assert!((&plain - &condensed(0.3)[0]).norm_max() > 0.01 * plain.norm_max());
@@ -209,7 +209,7 @@ fn the_order_of_nodes_means_nothing() {
     }
 }
 
-/// What a session maps at the rig's reference.
+/// The stability map of a session at the rig's reference.
 fn mapped(rig: &Rig, solver: &mut Solver) -> StabilityMap {
     StabilityMap::build(&rig.model, solver, &rig.reference, &map_options(rig)).unwrap()
 }
@@ -339,7 +339,7 @@ fn wrong_residuals_are_refused_by_name() {
     };
     let hertzian = load(toml(&format!("{SIDES}\n[load]\nexponent = 0.5")));
     assert!(hertzian.starts_with("x.toml: residual flexibility with [load] exponent 0.5, expected 0"), "{hertzian}");
-    // A rigid-body motion cannot be left out: it has no flexibility.
+    // A rigid-body motion cannot be omitted: it has no flexibility.
     let mut floating = pad();
     floating.omega[0] = 0.0;
     let text = toml(&SIDES.replacen("\"pad.npz\"", "\"pad.npz\"\nmodes = [1, 2]", 1));

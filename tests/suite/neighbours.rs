@@ -4,8 +4,8 @@ use std::process::{Command, Stdio};
 
 use crate::program::{self, Running, command, ended, until};
 
-/// Runs a shell script as root in a mount namespace of its own: `/dev/shm` and `/tmp` are empty and gone afterwards, and
-/// `$SQUEALCAST` can be started by any user. `None` where that is not possible, which is said.
+/// Runs a shell script as root in a separate mount namespace: `/dev/shm` and `/tmp` are empty and gone afterwards, and
+/// `$SQUEALCAST` can be started by any user. `None`, with a note, if that is not possible.
 fn in_a_namespace(script: &str) -> Option<program::Run> {
     let possible =
         Command::new("unshare").args(["-m", "setpriv", "--reuid", "1111", "true"]).stderr(Stdio::null()).status();
@@ -13,7 +13,7 @@ fn in_a_namespace(script: &str) -> Option<program::Run> {
         program::skipped("this is not root, or there is no unshare and setpriv");
         return None;
     }
-    // Mounted where `/tmp` does not hide it, whoever may read the folder it is in.
+    // Mounted where `/tmp` does not hide it, whatever the permissions of its folder are.
     let around = format!(
         "set -eu
          mount -t tmpfs -o mode=755 tmpfs /mnt
@@ -31,8 +31,8 @@ fn in_a_namespace(script: &str) -> Option<program::Run> {
     Some(ended(output.expect("unshare was there")))
 }
 
-/// iceoryx2 keeps its files in a folder that belongs to whoever came first. The second user gets one of their own, in which
-/// all of their processes meet.
+/// iceoryx2 keeps its files in a folder that belongs to its first user. The second user gets a separate folder, which all
+/// of this user's processes share.
 #[test]
 fn a_second_user_gets_shared_memory_of_their_own() {
     let script = "
@@ -52,7 +52,7 @@ fn a_second_user_gets_shared_memory_of_their_own() {
     ran.complains("shared memory: /tmp/iceoryx2 belongs to user 1111");
 }
 
-/// Somebody may have taken the name of the folder before.
+/// The name of the folder may be taken already.
 #[test]
 fn a_folder_that_others_could_write_to_is_refused() {
     let script = "
@@ -73,7 +73,7 @@ fn too_little_shared_memory_is_an_error() {
     ran.exits(1).complains("/dev/shm has 8388608 bytes free, expected at least").complains("--no-shm stays off it");
 }
 
-/// Two nodes on one service: readers cannot tell their predictions apart.
+/// Two nodes on one service: readers cannot distinguish their predictions.
 #[test]
 fn a_second_node_of_the_same_name_is_warned_about() {
     let prefix = format!("test-neighbours-{}/", std::process::id());

@@ -1,4 +1,4 @@
-//! Recordings as commands read them: those of others, those without predictions, several at a time; what is predicted of them,
+//! Recordings as commands read them: of other programs, without predictions, several at a time; their predictions,
 //! verified, reported and played.
 
 use std::io::{BufRead, BufReader};
@@ -395,7 +395,7 @@ impl Playing {
                 break;
             }
         }
-        // What it says from here on must not block it.
+        // Its later output must not block it.
         std::thread::spawn(move || lines.for_each(drop));
         Self(child)
     }
@@ -452,7 +452,7 @@ fn a_replay_waits_for_readers_and_its_stamps_never_run_backward() {
     }
 }
 
-/// A node that joins ROS 2 after the replay hears everything it plays.
+/// A node that joins ROS 2 after the replay receives everything it plays.
 #[test]
 fn a_replay_over_ros_waits_for_a_node() {
     const COUNT: u64 = 200;

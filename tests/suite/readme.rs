@@ -1,6 +1,6 @@
 //! Every command that README.md shows is run: those of its `sh` and `console` blocks that begin with `squealcast` or
-//! `cargo run --release --`. One that says `# needs ...` behind it is left out (`# needs a rig`), one that says
-//! `# exits with N` must do so. They run one after another in one folder, with what the repository holds beside them.
+//! `cargo run --release --`. One that says `# needs ...` behind it is skipped (`# needs a rig`), one that says
+//! `# exits with N` must do so. They run one after another in one folder, with a copy of the repository's files.
 
 use std::fs::{self, File};
 use std::io::Write;
@@ -24,7 +24,7 @@ const LET_RUN: Duration = Duration::from_secs(3);
 struct Shown {
     /// As a shell gets it, the program's own name in front.
     command: String,
-    /// What it needs that a test has not.
+    /// A requirement that a test cannot meet.
     needs: Option<String>,
     exit_code: i32,
 }
@@ -114,7 +114,7 @@ fn run(shown: &Shown, folder: &Path) {
         format!("{}:{}", program.parent().expect("a folder").display(), std::env::var("PATH").unwrap_or_default());
     let (stdout, stderr) = (folder.join(".stdout"), folder.join(".stderr"));
     let domain = domain::Domain::claim();
-    // Where it is one program, Ctrl-C and exit code are its own and not the shell's.
+    // Where it is one program, Ctrl-C reaches it and the exit code is its exit code, not the shell's.
     let exec = if shown.command.contains(['|', ';', '&']) { "" } else { "exec " };
     let child = Command::new("sh")
         .args(["-c", &format!("{exec}{}", shown.command)])

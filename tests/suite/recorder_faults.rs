@@ -1,4 +1,4 @@
-//! The recorder when the process, the disk or the directory fails it: what is lost is bounded, counted and said.
+//! The recorder when the process, the disk or the directory fails: losses are bounded, counted and reported.
 
 use std::{
     fs::{self, File},
@@ -83,8 +83,8 @@ impl Drop for Lateness {
 
 // --- the process is killed -------------------------------------------------------------------------------------------
 
-/// Kills a recording node `after` it has put something on the disk, restores what it left, and says how much of its last time is
-/// lost. What was there to be read before the kill is restored, all of it.
+/// Kills a recording node `after` it has put something on the disk, recovers its files, and returns how much of the end is
+/// lost. Messages that were readable before the kill are all recovered.
 fn kill_and_restore(after: Duration) -> Duration {
     let temp = TempDir::new().unwrap();
     let node = Running::start(command(demo(temp.path(), 500)));
@@ -208,7 +208,7 @@ fn a_full_disk_is_reported_and_predictions_go_on() {
     let [interrupted] = &status.interrupted[..] else { panic!("{status:?}") };
     assert!(interrupted.ends_with(format!("{}_0.mcap.active", base_name(&finished.directory))), "{interrupted:?}");
 
-    // What was on the disk of the first file is not lost either.
+    // Messages of the first file on the disk are not lost either.
     let recovered = recover(&finished.directory).unwrap().recoveries;
     assert_eq!(recovered.len(), 2);
     let entries = read(&finished.directory);
@@ -224,7 +224,7 @@ fn a_full_disk_is_reported_and_predictions_go_on() {
     let error = recorder.finish(LIMIT).unwrap_err();
     assert!(matches!(error, RecorderError::Failed { .. }), "{error}");
 
-    // Full from the start: an error at once, and nothing left behind.
+    // Full from the start: an error at once, and no files.
     let empty = TempDir::new().unwrap();
     disk.0.store(100, Ordering::SeqCst);
     let config = RecorderConfig { disk, ..RecorderConfig::new(empty.path()) };
@@ -266,7 +266,7 @@ fn a_disk_that_is_full_at_the_start_is_recorded_to_when_it_is_not() {
     let first: Vec<_> = entries.iter().take(2).map(|entry| known(entry).cloned().unwrap()).collect();
     assert_eq!(first, [rig_info().payload, setting("warn_margin", 0.2, 2).payload]);
 
-    // Any other reason is a mistake that nobody would want to wait with.
+    // Any other reason is permanent, so it is reported without waiting.
     let occupied = temp.path().join("occupied");
     fs::write(&occupied, "").unwrap();
     let error = Recorder::start_when_possible(RecorderConfig::new(&occupied)).unwrap_err();
@@ -313,7 +313,7 @@ fn a_disk_that_hangs_does_not_delay_predictions() {
     disk.hang(true);
     let mut taken = 1;
     let mut seq = 0;
-    // Were it to wait, nobody would let the disk go on.
+    // If it waited here, the disk would never be released.
     while recorder.record(point(seq, T0 + seq * 1000)) {
         (taken, seq) = (taken + 1, seq + 1);
         assert!(seq < 10_000_000, "the queue has no bound");
@@ -341,7 +341,7 @@ fn a_recorder_that_does_not_finish_is_left() {
     assert!(matches!(error, RecorderError::Timeout(waited) if waited == limit), "{error}");
 }
 
-/// A disk that counts what it is asked to do, and panics when told to.
+/// A disk that counts its operations and panics on demand.
 #[derive(Debug, Default)]
 struct CountingDisk {
     writes: AtomicI64,
@@ -416,7 +416,7 @@ fn a_recorder_panic_is_reported_and_its_files_are_recovered() {
     assert_eq!(recover(temp.path()).unwrap().messages_restored(), 1);
 }
 
-/// A finished file is never replaced by what an interrupted one of its name held.
+/// A finished file is never replaced by the content of an interrupted one of the same name.
 #[test]
 fn an_interrupted_file_does_not_replace_a_finished_one() {
     let temp = TempDir::new().unwrap();
@@ -435,7 +435,7 @@ fn an_interrupted_file_does_not_replace_a_finished_one() {
 
 // --- the directory goes ----------------------------------------------------------------------------------------------
 
-/// Short intervals: what happens to the directory is noticed at once.
+/// Short intervals: changes of the directory are noticed immediately.
 fn attentive(directory: &Path) -> RecorderConfig {
     RecorderConfig {
         flush_interval: Duration::from_millis(5),
@@ -604,7 +604,8 @@ fn a_start_that_fails_leaves_no_session() {
 
 // --- files of one session --------------------------------------------------------------------------------------------
 
-/// Each file begins with what is in force, so that it comes out the same by itself; of the whole session it changes nothing.
+/// Each file begins with the rig, settings, map, ends and chart in force, so that it verifies by itself; a replay of the whole
+/// session skips them.
 #[test]
 fn each_file_of_a_session_verifies_by_itself() {
     let folder = folder();

@@ -1,4 +1,4 @@
-//! Recordings end to end: what was recorded is read back, whatever happened to the process, the disk or the file.
+//! Recordings end to end: recorded messages are read back after faults of the process, the disk or the file.
 
 use std::{
     fs, io,

@@ -129,7 +129,7 @@ fn the_rig_file_names_archives_by_their_hash_and_hands_on_the_tables() {
     let path = tribometer(folder.path(), 5000);
     let to = folder.path().join("out.toml");
     let first = run(["reduce", &path, "--modes", "12+9", "--points", "0", "-o", &text(&to)]).exits(0);
-    // Plain lines where nobody looks on: what is done, with time and memory.
+    // Plain lines without a terminal: the steps, with time and memory.
     for expected in
         ["degrees of freedom read", "pad: ordering and analysing", "disc: factored", "GiB]", "out.toml written"]
     {
@@ -231,7 +231,7 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     // Enough to read it by, and no more: either way refuses before it factors anything.
     for way in [&["--modes", "40+40"][..], &[]] {
         let run = run(["reduce", &path, "--memory-gib", "0.05", "-o", &to].into_iter().chain(way.iter().copied()));
-        run.exits(1).complains("it needs 0.").complains("beside what is held already, more than the 0.0");
+        run.exits(1).complains("it needs 0.").complains("in addition to what is already in use, more than the 0.0");
     }
     run(["reduce", &path, "--modes", "40", "-o", &to])
         .exits(1)
@@ -268,7 +268,7 @@ fn what_cannot_be_done_is_refused_and_leaves_nothing() {
     assert_eq!(files_below(folder.path()), before);
 }
 
-/// Of 3 + 3 modes the unstable ones of the full model are missed: the rig is written, and the exit code says so.
+/// Of 3 + 3 modes the unstable ones of the full model are missed: the rig is written, and the exit code is 3.
 #[test]
 fn verify_reports_modes_that_a_rig_misses() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! Everything that can be wrong with a rig file and what it refers to: each its own error that names file, field,
+//! Invalid rig files and files they refer to: each fault has an error that names file, field,
 //! value and limit; and no bytes at all that make a reader panic.
 
 use std::io::{Cursor, Write};
@@ -254,7 +254,7 @@ fn bad_files_of_kind_3() {
         RigError::Line { line: 3, .. },
         "K.mtx, line 3: value is `nan`; expected a finite number"
     );
-    // A header that claims a great many rows asks for no memory.
+    // A header that claims a great many rows allocates no memory.
     let (error, _) =
         system("x", "x", "%%MatrixMarket matrix coordinate real general\n99999999999999 99999999999999 0", UNIT);
     assert!(matches!(error, RigError::Shape { .. }));

@@ -238,7 +238,7 @@ fn the_real_brake_in_150_modes() {
     eprintln!("150 modes of 4669 degrees of freedom: {:?}\n{}", start.elapsed(), rig.describe());
     let (stiffness, damping) = matrices(&rig, &rig.reference);
     let roots = roots(&stiffness, &damping);
-    // Growth rate and frequency by scipy 1.17 (eigsh, then dense), from the README beside the data, as printed there.
+    // Growth rate and frequency by scipy 1.17 (eigsh, then dense), from the README of the data, as printed there.
     for (sigma, hz) in [(1.499, 782.55), (70.134, 2775.71), (111.972, 4190.19), (110.389, 5799.21)] {
         let distance = |root: &&c64| (root.re - sigma).hypot(root.im / std::f64::consts::TAU - hz);
         let nearest = roots.iter().min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap();
@@ -248,7 +248,7 @@ fn the_real_brake_in_150_modes() {
     }
 }
 
-/// A mode shape linear in position: whatever interpolation is exact for linear fields gives the same contact rows.
+/// A mode shape linear in position: every interpolation that is exact for linear fields gives the same contact rows.
 fn shape(node: &[f64; 3], mode: usize, sign: f64) -> [f64; 3] {
     let m = mode as f64 + 1.0;
     [0.3 * m + 2.0 * sign * node[0], -0.2 + 3.0 * m * node[1], sign * 0.7 + 5.0 * node[0] - 4.0 * m * node[1]]

@@ -32,7 +32,7 @@ fn scipy_predicts_the_same() {
     assert!(cases.len() > 150 && merging == 2, "{} cases, {merging} mergings", cases.len());
 }
 
-/// 1e-9 relative is what is promised; LAPACK's and our backward errors leave 1e-12 of these roots.
+/// The documented accuracy is 1e-9, relative; LAPACK's and our backward errors leave 1e-12 of these roots.
 const TOLERANCE: f64 = 1e-9;
 
 /// What differs, and by how much the rest does.
@@ -130,7 +130,7 @@ impl Comparison {
     }
 }
 
-/// A mode, as either program tells it.
+/// A mode as printed by either program.
 struct Root {
     lambda: c64,
     pad_share: Option<f64>,

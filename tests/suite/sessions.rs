@@ -43,7 +43,7 @@ fn a_recording_verifies_and_another_rig_differs() {
     let other = other
         .says("0 predictions identical, 2500 different, 0 missing, 0 extra")
         .says("stability maps or charts differ");
-    // The largest differences are told: case 1 against case 2, 1 against 0.7071 rad/s of their first modes alone.
+    // The largest differences are reported: case 1 against case 2, 1 against 0.7071 rad/s of their first modes alone.
     let sensitivity =
         other.stdout.split("frequency ").nth(1).expect("largest differences").split(' ').next().expect("a number");
     assert!(sensitivity.parse::<f64>().expect("a number") > 0.3, "{sensitivity}");
@@ -97,7 +97,7 @@ fn a_truncated_recording_is_reported_and_recovered() {
     let cut = elsewhere.path().join("cut_0.mcap");
     std::fs::write(&cut, &bytes[..bytes.len() * 2 / 3]).expect("a file");
 
-    // What can be read verifies, but the loss is said and is no success.
+    // Readable messages verify, but the loss is reported and the exit code is not 0.
     let verified = run(["replay", "--verify", &text(&cut)]).exits(3).complains("damaged").complains("cut_0.mcap");
     let identical: u64 = verified
         .stdout
@@ -112,7 +112,7 @@ fn a_truncated_recording_is_reported_and_recovered() {
 
     let recovered = run(["recover", &text(&cut)]).exits(3).says("restored").says("cut_0.mcap");
     assert!(recovered.stdout.contains("kept as"), "{}", recovered.stdout);
-    // What was restored is a sound recording of as much.
+    // The restored messages form a valid recording.
     let verified = run(["replay", "--verify", &text(&cut)]).exits(0);
     assert_eq!(verified.stderr, "");
     verified.says(&format!("{identical} predictions identical, 0 different"));
@@ -187,7 +187,7 @@ fn check_finished(directory: &Path) {
 fn signals_end_the_demo_with_a_finished_recording() {
     let folder = folder();
     let prefix = prefix("demo");
-    // A rig of small files: what is recorded beyond them are predictions.
+    // A rig of small files, so that most of the recording are predictions.
     let args = ["demo", "nine-dof-case-2", "--no-ros", "--shm-prefix", &prefix, "--record", &text(folder.path())];
     let mut sessions: Vec<PathBuf> = vec![];
     for signal in ["INT", "TERM"] {
@@ -197,7 +197,7 @@ fn signals_end_the_demo_with_a_finished_recording() {
         until("the recording to grow", || size(folder.path()) > before + 20_000);
         let ended = running.signal(signal).exits(0).complains("recording into").complains("recorded ").says("seq ");
         assert!(!ended.stderr.contains("not recorded"), "{}", ended.stderr);
-        // A second start in the same directory makes a recording of its own.
+        // A second start in the same directory makes a separate recording.
         let mut now: Vec<PathBuf> = std::fs::read_dir(folder.path())
             .expect("the folder")
             .map(|entry| entry.expect("an entry").path())
@@ -243,7 +243,7 @@ fn a_node_predicts_inputs_of_shared_memory_until_it_is_stopped() {
         let source = Running::start(command(source.iter().copied().chain(bus)));
         let before = if directory.exists() { size(&directory) } else { 0 };
         until("the recording to grow", || directory.exists() && size(&directory) > before + 20_000);
-        // The first sensitivities may come before the map that knows where windows end; they are told again each second.
+        // The first sensitivities may come before the map that knows where windows end; they are published again every second.
         until("sensitivities with an end of a window", || sensitivity_with_an_end(&newest(&directory)).is_some());
         source.signal(signal).exits(0);
         node.signal(signal).exits(0).says("OK");
@@ -254,7 +254,7 @@ fn a_node_predicts_inputs_of_shared_memory_until_it_is_stopped() {
     for session in sessions {
         check_finished(&session);
         let recording = Recording::open(&session).expect("a recording");
-        // The rig was charted while it ran, and sensitivities were told.
+        // The rig was charted while it ran, and sensitivities were published.
         let kinds: Vec<u8> = recording
             .messages()
             .filter_map(|entry| match entry.message {
@@ -307,6 +307,6 @@ fn a_demo_of_set_duration_ends_by_itself() {
     demo.says("seq ");
     let session = mcap(folder.path()).parent().expect("its directory").to_owned();
     check_finished(&session);
-    // 1 s at 200 Hz; every input was heard.
+    // 1 s at 200 Hz; every input was received.
     run(["replay", "--verify", &text(&session)]).exits(0).says("200 inputs, ");
 }

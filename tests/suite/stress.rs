@@ -1,4 +1,4 @@
-//! Extremes for the numerics: every case of `proof::stress`, and random rigs against what needs no eigenvalue solver.
+//! Extremes for the numerics: every case of `proof::stress`, and random rigs compared with methods that need no eigenvalue solver.
 
 use faer::{Mat, c64};
 use proptest::prelude::*;

@@ -1,5 +1,5 @@
-//! What RustDDS and ros2-client do wrong or not at all, of which launch/ROS2.md tells: each test holds as long as a limit
-//! stands. One that fails brings good news: the limit is gone, and so may be what is said and done about it.
+//! Limits of RustDDS and ros2-client, which launch/ROS2.md lists: each test passes as long as a limit exists. If one fails, the
+//! limit is gone, and its workaround and description can be removed.
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
@@ -121,10 +121,10 @@ fn parameters_are_not_described() {
 }
 
 /// A reader asks a new writer for a heartbeat at once. Fast DDS only takes that for a request if its base is 0, and otherwise
-/// waits for its heartbeat period, 3 s: what it sent before the node knew it comes that late.
+/// waits for its heartbeat period, 3 s: messages sent before the node discovered it arrive that late.
 ///
-/// Here a participant of this test's own making is announced by one datagram, as one that has discovery's own writers: the
-/// node's readers ask those.
+/// Here a participant made by this test is announced by one datagram, as one that has discovery's own writers: the
+/// node's readers request data from those.
 #[test]
 fn a_new_writer_is_asked_for_a_heartbeat_in_a_form_that_fast_dds_ignores() {
     let domain = Domain::claim();

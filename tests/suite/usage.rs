@@ -1,4 +1,4 @@
-//! What a user meets first: inputs outside the limits, lists and completions, standard output as a file, quiet runs.
+//! First contact of a user: inputs outside the limits, lists and completions, standard output as a file, quiet runs.
 
 use crate::program::{self, folder, run, text, write};
 

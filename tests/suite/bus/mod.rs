@@ -21,7 +21,7 @@ pub fn point(seq: u64) -> OperatingPoint {
     }
 }
 
-/// What a node would answer; as many modes as a message holds.
+/// The answer of a node, with as many modes as a message holds.
 pub fn answer(point: &OperatingPoint) -> Prediction {
     Prediction {
         header: point.header.clone(),

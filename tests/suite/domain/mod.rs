@@ -1,10 +1,10 @@
-//! DDS domains that nobody else on this machine uses.
+//! DDS domains that no other process on this machine uses.
 
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::sync::atomic::{AtomicU16, Ordering};
 
-/// A domain of its own, as long as this lives: also against other tests, and other runs of tests on this machine.
+/// A domain reserved as long as this value lives, also against other tests and other test runs on this machine.
 pub struct Domain {
     pub id: u16,
     _claim: UnixListener,

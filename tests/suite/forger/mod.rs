@@ -19,13 +19,13 @@ pub enum Forged {
     Gap,
     /// The first fragment of a sample of 4 GiB.
     DataFrag,
-    /// Fragment 2^32 - 1 is asked for again: a bit set up to there.
+    /// Fragment 2^32 - 1 is requested again: a bit set up to there.
     NackFrag,
 }
 
 pub const ALL_FORGED: [Forged; 4] = [Forged::Heartbeat, Forged::Gap, Forged::DataFrag, Forged::NackFrag];
 
-/// A participant that does not exist, on a socket of its own.
+/// A participant that does not exist, on a separate socket.
 pub struct Forger {
     socket: UdpSocket,
     target: (Ipv4Addr, u16),
@@ -34,7 +34,7 @@ pub struct Forger {
 }
 
 impl Forger {
-    /// Aims at the first participant of a domain at `address`; `number` tells forgers apart.
+    /// Aims at the first participant of a domain at `address`; `number` distinguishes forgers.
     pub fn new(address: Ipv4Addr, domain: u16, number: u32) -> Self {
         let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).expect("a socket");
         let mut prefix = [0x01, 0x0f, 0xba, 0xad, 0, 0, 0, 0, 0, 0, 0, 1];
@@ -43,7 +43,7 @@ impl Forger {
     }
 
     pub fn send(&self, datagram: &[u8]) {
-        // A refusal (nobody listens while the node's side restarts) is news of an earlier datagram.
+        // A refusal (no socket is open while the node's side restarts) refers to an earlier datagram.
         let _ = self.socket.send_to(datagram, self.target);
     }
 
@@ -185,7 +185,7 @@ fn info_ts() -> Vec<u8> {
     submessage(0x09, 0, &[&1_700_000_000u32.to_le_bytes(), &[0; 4]])
 }
 
-/// To whoever gets it.
+/// To any receiver.
 fn info_dst() -> Vec<u8> {
     submessage(0x0e, 0, &[&[0; 12]])
 }

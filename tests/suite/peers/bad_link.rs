@@ -22,7 +22,7 @@ struct BadLink {
 }
 
 impl BadLink {
-    /// `None`, said aloud, where this process may make none; with `SQUEALCAST_PEERS` set that is a failure.
+    /// `None`, with a note, if this process may not create them; with `SQUEALCAST_PEERS` set that is a failure.
     fn make(python: &Path) -> Option<Self> {
         let apart = Command::new("unshare").args(["--net", "true"]).stderr(Stdio::null()).status();
         if !Path::new("/dev/net/tun").exists() || !apart.is_ok_and(|status| status.success()) {
@@ -62,7 +62,7 @@ fn nothing_is_lost_over_a_bad_link(ros: &str) {
     let _alone = alone();
     say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
     let folder = TempDir::new().expect("a folder");
-    // Nobody else is in these namespaces, but for shared memory.
+    // No other process is in these namespaces, except through shared memory.
     let (domain, prefix) = names();
     let arguments =
         ["--net", "--target", &link.near, env!("CARGO_BIN_EXE_squealcast"), "run", RIG, "--no-shm", "--record"];
@@ -74,7 +74,7 @@ fn nothing_is_lost_over_a_bad_link(ros: &str) {
     ]);
     let process = start(Path::new("nsenter"), &arguments, folder.path());
     let mut node = Node { process, domain, prefix, folder };
-    // Somebody at the node's end who hears the same inputs.
+    // A second subscriber at the node's end, which receives the same inputs.
     let script = manifest_dir().join("tests/peers/patient_listener.py");
     let listener = BadLink::at(&link.near, &ros_python)
         .arg(script)
@@ -88,7 +88,7 @@ fn nothing_is_lost_over_a_bad_link(ros: &str) {
 
     let seconds = (COUNT / 500).to_string();
     let pace = ["--rate", "500", "--seconds", &seconds, "--depth", "20000", "--settle", "3", "--drain", "30"];
-    // What comes too late to be predicted is passed over, and a stall is a silence until it ends.
+    // Inputs that arrive too late are passed over, and a stall is a silence until it ends.
     let only = ["--only-exchange", "--allow-passed-over", "--allow-silence", "--wait", "60"];
     let domain = node.domain();
     let report = peer_by(
@@ -104,7 +104,7 @@ fn nothing_is_lost_over_a_bad_link(ros: &str) {
     let seqs: HashSet<u64> = content.inputs.iter().map(|input| input.seq).collect();
     say(&format!(
         "bad link: {} of {COUNT} inputs recorded, {} missed, {} passed over, {} answered, first answer after {} s, {} silences; \
-         rclpy beside the node: {received}",
+         rclpy next to the node: {received}",
         seqs.len(),
         content.count("ros2_missed"),
         content.count("inputs_passed_over"),

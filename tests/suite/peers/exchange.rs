@@ -94,7 +94,7 @@ fn iceoryx2_in_python_is_answered() {
     node.interrupt();
 }
 
-/// Ours on both buses at once: the node must not care over which of them it hears first.
+/// Our peers on both buses at once: the result must not depend on the bus an input arrives over first.
 #[test]
 fn what_comes_over_both_buses_is_answered_once() {
     const COUNT: u64 = 1000;
@@ -149,7 +149,7 @@ fn what_comes_over_both_buses_is_answered_once() {
     verify(&node.recording());
 }
 
-/// A measured vibration over both buses, or one of them, into a recording that others read: each once, beside inputs.
+/// A measured vibration over both buses, or one of them, into a recording that others read: each once, together with inputs.
 #[test]
 fn a_vibration_over_both_buses_is_recorded_once_and_read_by_others() {
     const COUNT: u64 = 100;
@@ -168,7 +168,7 @@ fn a_vibration_over_both_buses_is_recorded_once_and_read_by_others() {
         frequency_hz: 1500.0 + k as f64,
         level_db: 60.0 + 0.1 * k as f64,
     };
-    // Until the node has discovered us in its turn: an answer, and vibrations with numbers of their own until then.
+    // Until the node has discovered us: an answer, and vibrations with separate numbers until then.
     let mut seq = 0;
     wait_until("an answer", || {
         seq += 1;
@@ -203,7 +203,7 @@ fn a_vibration_over_both_buses_is_recorded_once_and_read_by_others() {
     let content = Content::read(&recording);
     for expected in &sent {
         let found = content.vibrations.iter().filter(|found| found.frequency_hz == expected.frequency_hz);
-        // What came over shared memory first has lost its frame.
+        // Messages that arrived over shared memory first have no frame.
         let found: Vec<_> = found.map(|found| (found.header.stamp, found.level_db)).collect();
         assert_eq!(found, [(expected.header.stamp, expected.level_db)], "{expected:?}");
     }

@@ -45,12 +45,12 @@ fn manifest_dir() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// A program that `setup.sh` leaves: `python` or `ros-python`. `None`, said aloud, where it is not there.
+/// A program that `setup.sh` installs: `python` or `ros-python`. `None`, with a note, if it is missing.
 fn peer_program(name: &str) -> Option<PathBuf> {
     peer_program_in("", name)
 }
 
-/// The same in the folder beside it that was set up with `PEERS_ROS=jazzy`, whose name ends with `-jazzy`.
+/// The same in the neighbouring folder that was set up with `PEERS_ROS=jazzy`, whose name ends with `-jazzy`.
 fn peer_program_in(suffix: &str, name: &str) -> Option<PathBuf> {
     let given = std::env::var_os("SQUEALCAST_PEERS").map(|folder| PathBuf::from(folder_with(folder, suffix)));
     let folder = given.clone().unwrap_or_else(|| manifest_dir().join(format!("target/peers{suffix}")));
@@ -127,7 +127,7 @@ impl Drop for Killed {
     }
 }
 
-/// A running node with a domain and a prefix of its own.
+/// A running node with a separate domain and prefix.
 struct Node {
     process: Killed,
     domain: Domain,
@@ -153,7 +153,7 @@ impl Node {
         self.domain.id.to_string()
     }
 
-    /// What it said so far.
+    /// Its output so far.
     fn said(&self) -> String {
         ["stdout", "stderr"].map(|name| fs::read_to_string(self.folder.path().join(name)).unwrap_or_default()).concat()
     }
@@ -173,7 +173,7 @@ impl Node {
     }
 }
 
-/// A domain, and a prefix of shared memory, that nobody else on this machine uses now.
+/// A domain, and a prefix of shared memory, that no other process on this machine uses.
 fn names() -> (Domain, String) {
     let domain = Domain::claim();
     let prefix = format!("peers-{}-{}/", std::process::id(), domain.id);

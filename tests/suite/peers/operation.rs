@@ -1,4 +1,4 @@
-//! A node as it is operated: started by a launch file, killed, and beside the real brake.
+//! A node as it is operated: started by a launch file, killed, and with the real brake.
 
 use std::fs;
 use std::os::unix::fs::symlink;
@@ -54,7 +54,7 @@ fn the_launch_file_starts_the_node() {
     let command: Vec<String> = serde_json::from_value(loaded["command"].clone()).expect("a command line");
     say(&format!("launch file, loader {}: squealcast {}", loaded["loader"], command[1..].join(" ")));
     say_versions(&ros_python, &["ros-rclpy"]);
-    // As launched, but for the name of shared memory, which a node of somebody else may have.
+    // As launched, but for the name of shared memory, which another user's node may have.
     let mut arguments = command[1..].to_vec();
     arguments.splice(2..2, ["--shm-prefix".to_owned(), prefix.clone()]);
     let process = start(Path::new(&command[0]), &arguments, folder.path());
@@ -149,7 +149,7 @@ fn the_real_brake_runs_live() {
             "brake4669",
             "--wait",
             "120",
-            // The node comes after the peer: DDS then takes up to three seconds until it hears of it.
+            // The node comes after the peer: DDS then takes up to three seconds to discover it.
             "--settle",
             "5",
             "--speed",

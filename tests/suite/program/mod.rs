@@ -1,4 +1,4 @@
-//! The real binary as a test runs it: folders of its own, exit code, both outputs.
+//! The binary as a test runs it: separate folders, exit code, both outputs.
 
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
@@ -22,11 +22,11 @@ pub fn measuring() -> bool {
 
 /// Writes a line to standard error that the test runner does not capture.
 pub fn aloud(line: &str) {
-    // Nobody reads it where standard error is closed: no reason to fail.
+    // Standard error may be closed, which is no reason to fail.
     drop(writeln!(std::io::stderr(), "{line}"));
 }
 
-/// Says that a test is skipped for want of a peer; with `SQUEALCAST_PEERS` every peer is required, and it fails.
+/// Reports that a test is skipped because a peer is missing; with `SQUEALCAST_PEERS` every peer is required, and it fails.
 #[track_caller]
 pub fn skipped(why: &str) {
     assert!(std::env::var_os("SQUEALCAST_PEERS").is_none(), "SQUEALCAST_PEERS is set, but {why}");
@@ -51,7 +51,7 @@ pub fn promised(what: &str, took: Duration, limit: Duration) {
     assert!(!measuring() || took < limit, "{what} took {took:?}, promised {limit:?}");
 }
 
-/// What a run left behind.
+/// Result of a run.
 pub struct Run {
     pub code: i32,
     pub stdout: String,
@@ -65,14 +65,14 @@ pub fn command<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> 
     command
 }
 
-/// The folder for charts of the programs that this test starts: one of its own, so that no chart of an older program, or of
+/// The folder for charts of the programs that this test starts: a separate one, so that no chart of an older program, or of
 /// the user, answers for this one.
 pub fn cache_folder() -> PathBuf {
     static FOLDER: OnceLock<PathBuf> = OnceLock::new();
     let made = || {
         let all = Path::new(env!("CARGO_TARGET_TMPDIR")).join("cache");
         std::fs::create_dir_all(&all).expect("a folder of the test");
-        // What runs that have ended left behind; several tests may look at once.
+        // Folders of ended runs; several tests may search at the same time.
         for entry in std::fs::read_dir(&all).expect("just made").flatten() {
             if !Path::new("/proc").join(entry.file_name()).exists() {
                 let _ = std::fs::remove_dir_all(entry.path());
@@ -215,7 +215,7 @@ impl Running {
         Self(Some(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the program starts")))
     }
 
-    /// Sends a signal (`HUP`) and does not wait for what comes of it.
+    /// Sends a signal (`HUP`) and does not wait for the effect.
     pub fn send(&self, signal: &str) {
         let id = self.0.as_ref().expect("still running").id().to_string();
         let sent = Command::new("kill").args([&format!("-{signal}"), &id]).status();
