@@ -1,4 +1,4 @@
-// What every browser test shares: Debian's Chromium, an eye on errors and on requests to elsewhere, and a picture folder.
+// Shared by all browser tests: Debian's Chromium, a record of errors and of requests to other origins, and a picture folder.
 import { mkdirSync } from "node:fs";
 import { createRequire } from "node:module";
 import { chromium } from "playwright-core";
@@ -21,7 +21,7 @@ export async function open(browser, url, options, faults) {
   const page = await context.newPage();
   const { origin } = new URL(url);
   page.on("console", (message) => {
-    // Software rendering says that taking a picture waits for it.
+    // Software rendering warns that taking a picture waits for it.
     if (/GL Driver Message .*Performance/.test(message.text())) return;
     if (["error", "warning"].includes(message.type())) faults.push(`console: ${message.text()}`);
   });
@@ -37,7 +37,7 @@ export async function open(browser, url, options, faults) {
   return page;
 }
 
-/** Asks again until `holds` says so; how long that takes is not judged. */
+/** Repeats until `holds` is true; the time this takes is not judged. */
 export async function until(what, holds) {
   for (const began = Date.now(); !(await holds()); ) {
     check(Date.now() - began < 180000, `waited for 180 s: ${what}`);

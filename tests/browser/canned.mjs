@@ -60,7 +60,7 @@ function shape(id) {
   return { id, frequency_hz: hz, growth_rate_per_s: growth, pad_share: 0.31, growth_change, disc, parts: [part("pad", 0.4, 0), part("disc", 1, 1)] };
 }
 
-/** What the node says of a friction coefficient. */
+/** The node's prediction at a friction coefficient. */
 function predicted(mu, seq) {
   const modes = modesAt(mu);
   const unstable = modes.filter((mode) => mode[2] > 0).sort((a, b) => b[2] - a[2]);
@@ -82,7 +82,7 @@ function predicted(mu, seq) {
   };
 }
 
-/** Nothing is known of a moment. */
+/** The answer for a moment without data. */
 const blank = (level, reason) => ({ level, reason, seq: 40, stamp_s: NOW, reused: false, load: null, speed: null, mu: null, critical: null, margin: null, growth: null, worst_hz: null, unstable: 0, modes: [], fastest: null, next: null, spread: null, trend_per_s: null });
 
 const FAULT = "normal load -5 N is below its limit of 0 N";
@@ -164,7 +164,7 @@ export function serve(assets, situation, more = {}) {
   return new Promise((ready) => server.listen(0, "127.0.0.1", () => ready({
     url: `http://127.0.0.1:${server.address().port}/`,
     turn(other) { situation = other; },
-    /** The node falls silent without a word. */
+    /** The node stops sending without closing the connection. */
     hang() { clearInterval(ticks); },
     stop() { clearInterval(ticks); server.closeAllConnections(); server.close(); },
   })));

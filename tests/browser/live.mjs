@@ -1,4 +1,4 @@
-// A page on a running `demo`: node live.mjs URL [pictures]. Prints JSON: what the page showed, to be compared.
+// A page on a running `demo`: node live.mjs URL [pictures]. Prints the content of the page as JSON, for comparison.
 import { readFileSync } from "node:fs";
 import { check, launch, open, picture, until, violations } from "./browser.mjs";
 
@@ -50,7 +50,7 @@ await page.waitForFunction(() => document.getElementById("status").dataset.level
 await lookAt(6, false);
 check(places.size > 3, `the cursor stood at ${[...places]}`);
 
-// The words fit the colours.
+// The words agree with the colours.
 const [word, panel] = await page.evaluate(() => [document.getElementById("level").textContent, document.getElementById("status").dataset.level]);
 check(word.toLowerCase() === panel, `${word} on a panel of ${panel}`);
 
@@ -67,7 +67,7 @@ const work = ((await worked()) - work0) * 1000 / (Date.now() - began);
 await wall.context().close();
 
 // A mode moves when chosen, and stands when paused.
-// A canvas of WebGL shows its picture and forgets it, and says its displacements instead.
+// A WebGL canvas cannot be read back; it publishes its displacements instead.
 const pixels = () => page.locator("#shape").evaluate((canvas) => (canvas.displacements ? JSON.stringify(canvas.displacements()) : canvas.toDataURL()));
 await page.locator("#modes .mode-button").nth(2).click();
 await page.locator("#stage").scrollIntoViewIfNeeded();
@@ -97,7 +97,7 @@ const csv = readFileSync(await download.path(), "utf8");
 check(csv.startsWith("number,kind,onset"), `CSV begins with ${csv.slice(0, 40)}`);
 check(csv.trim().split("\n").length >= 2, "CSV without an event");
 
-// Nothing jumps: the panels stay where they are for a while.
+// The layout is stable: the panels stay where they are for a while.
 const boxes = () => page.evaluate(() => [...document.querySelectorAll(".panel")].map((panel) => {
   const { x, y, width, height } = panel.getBoundingClientRect();
   return [x, y, width, height].map(Math.round).join(",");

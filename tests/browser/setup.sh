@@ -1,5 +1,5 @@
 #!/bin/sh
-# Puts in place what the browser tests need: Debian's Chromium and the packages of package-lock.json.
+# Installs the programs of the browser tests: Debian's Chromium and the packages of package-lock.json.
 # May be run again at any time.
 set -eu
 cd "$(dirname "$0")"

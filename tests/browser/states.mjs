@@ -68,7 +68,7 @@ for (const [status, word] of Object.entries(WORDS)) {
   served.stop();
 }
 
-// The map shows the window that is near at its own scale, and everything when asked to.
+// The map shows the window that is near at its own scale, and the whole range on request.
 const served = await serve(assets, "warn");
 let page = await open(browser, served.url, LAPTOP, faults);
 await showsMode(page, 1);
@@ -87,7 +87,7 @@ await page.mouse.move(box.x + 0.25 * box.width, box.y + box.height / 2);
 check(/^μ 0\.25/.test(await text(page, "map-readout")), `hover: ${await text(page, "map-readout")}`);
 await page.locator("input[name=map-range][value=near]").check({ force: true });
 
-// The shape follows the mode that grows, unless somebody picked one; it stops without data.
+// The shape follows the mode that grows, unless the user picked one; it stops without data.
 served.turn("worst");
 await showsMode(page, 14);
 await page.locator("#modes .mode-button").nth(3).click();
@@ -104,12 +104,12 @@ await until("the shape moves", async () => (await displacements(page)) !== movin
 served.turn("no_data");
 await reaches(page, "no_data");
 await page.waitForSelector("#stage.still");
-// The picture that was due comes first.
+// A frame that was already scheduled comes first.
 await page.waitForTimeout(300);
 const stands = await displacements(page);
 await page.waitForTimeout(500);
 check((await displacements(page)) === stands, "the shape moves without data");
-// A node that falls silent without a word is no node that is quiet.
+// A lost connection is distinguished from a node without inputs.
 served.turn("ok");
 await reaches(page, "ok");
 served.hang();

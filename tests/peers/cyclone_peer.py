@@ -1,6 +1,6 @@
 """The exchange of rclpy_peer.py by a second DDS implementation: CycloneDDS, without anything of ROS.
 
-Run it with the `python` that setup.sh leaves. Prints one line of JSON; exit code 0 only when all holds.
+Run it with the `python` that setup.sh installs. Prints one line of JSON; exit code 0 only if every check passes.
 """
 
 import os

@@ -1,6 +1,6 @@
 """A stand-in of the node under test, only to check the peers themselves: it predicts nothing.
 
-With `--defect` it does one thing wrong (now and then), which the peers must find: see selftest.sh.
+With `--defect` it has one intermittent defect, which the peers must find: see selftest.sh.
 """
 
 import argparse

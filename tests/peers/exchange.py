@@ -1,4 +1,4 @@
-"""What every peer does alike: publish conditions at a rate, and keep account of the answers."""
+"""Shared by all peers: publish conditions at a rate, and record the answers."""
 
 import argparse
 import json
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 LEVELS = ("OK", "WARN", "SQUEAL", "FAULT")
 FAULT = 3
-DEPTH = 64  # of every queue: reliable, keep last 64, unless told otherwise
+DEPTH = 64  # of every queue: reliable, keep last 64, by default
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
@@ -50,7 +50,7 @@ def arguments(description: str) -> argparse.ArgumentParser:
 
 @dataclass
 class Answer:
-    """What is looked at in a prediction."""
+    """The fields of a prediction that are checked."""
 
     seq: int
     stamp_ns: int
@@ -72,7 +72,7 @@ class Sent:
 
 @dataclass
 class Exchange:
-    """The account of one run. Answers may come on another thread than inputs."""
+    """The record of one run. Answers may come on another thread than inputs."""
 
     args: argparse.Namespace
     inputs: dict[int, Sent] = field(default_factory=dict)

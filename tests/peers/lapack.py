@@ -1,8 +1,8 @@
-"""Eigenvalues by LAPACK's dgeev, as scipy calls it, one thread: what `squealcast bench --lapack PYTHON` times beside its own.
+"""Eigenvalues by LAPACK's dgeev, as scipy calls it, one thread: timed by `squealcast bench --lapack PYTHON` for comparison.
 
 Standard input: matrix after matrix, each as two little-endian 64-bit integers (dimension; 0 values alone, 1 both vectors) and the
 entries by columns. Standard output: first a line of versions; for each matrix the seconds of the call alone, then real and
-imaginary parts of the eigenvalues. Workspace is of LAPACK's own choosing and asked for once; the input is not checked.
+imaginary parts of the eigenvalues. The size of the workspace is queried from LAPACK once; the input is not checked.
 """
 
 import os

@@ -4,7 +4,7 @@
 
 With ROS 2's own `launch` and `launch_ros` where they can be imported: the launch file is then run by them, with a
 program in place of the node that notes its command line. There are no wheels of them, so elsewhere by a stand-in of
-the few classes that the launch file uses, as `--loader` can also ask for. The JSON says which it was.
+the few classes that the launch file uses, which `--loader` can also select. The JSON names the loader used.
 """
 
 import argparse
@@ -32,7 +32,7 @@ def main() -> int:
     use_ros = options.loader == "ros" or (options.loader == "auto" and real)
     try:
         loaded = load_with_ros(options.file, given) if use_ros else load_with_stand_in(options.file, given)
-    except Exception as error:  # noqa: BLE001  whatever the launch file raises
+    except Exception as error:  # noqa: BLE001  any error of the launch file
         print(f"load_launch: {options.file}: {type(error).__name__}: {error}", file=sys.stderr)
         return 1
     print(json.dumps({"loader": "ros" if use_ros else "stand-in", **loaded}))
@@ -71,7 +71,7 @@ def load_with_ros(file: Path, given: dict[str, str]) -> dict[str, object]:
 
 
 def load_with_stand_in(file: Path, given: dict[str, str]) -> dict[str, object]:
-    """What launch and launch_ros do with the few classes used here, as their sources say (jazzy)."""
+    """The behaviour of launch and launch_ros for the few classes used here, after their sources (jazzy)."""
 
     class LaunchDescription:
         def __init__(self, entities):

@@ -1,6 +1,6 @@
-"""Hears the operating points beside the node, with a queue that nothing overflows: what the node could have heard.
+"""Receives the same operating points as the node, with a queue that never overflows: those the node could have received.
 
-Prints "listening" once it does. When its standard input ends it prints one line of JSON: how many it heard, how many
+Prints "listening" once it does. When its standard input ends it prints one line of JSON: how many it received, how many
 different ones, the longest wait for one, and how many waits were longer than `--silence` seconds.
 """
 

@@ -1,8 +1,8 @@
 """Drives the node under test over ROS 2 with rclpy, as a rig's own program would.
 
 Publishes conditions and checks that each is answered once, in order, under its own stamp and sequence number; then, as
-a late joiner, reads the rig; then the parameters; then the diagnostics. Prints one line of JSON; exit code 0 only when
-all holds. Run it with the `ros-python` that setup.sh leaves.
+a late joiner, reads the rig; then the parameters; then the diagnostics. Prints one line of JSON; exit code 0 only if
+every check passes. Run it with the `ros-python` that setup.sh installs.
 """
 
 import argparse
@@ -157,7 +157,7 @@ class Peer:
         }
 
     def check_parameters(self) -> dict[str, object]:
-        """List, get, describe, set; and what must be refused is refused, with a reason, and changes nothing."""
+        """List, get, describe, set; invalid values are refused with a reason and change nothing."""
         from rclpy.parameter import Parameter
         from rclpy.parameter_client import AsyncParameterClient
 
@@ -228,7 +228,7 @@ class Peer:
         return len(self.diagnostics)
 
     def check_silence(self) -> None:
-        """Inputs have stopped: the node says so, once. (1 s is the default of silence_timeout_s.)"""
+        """Inputs have stopped: the node reports it once. (1 s is the default of silence_timeout_s.)"""
         wait_until(lambda: self.exchange.silence_faults > 0, 4.0)
         time.sleep(1.5)
         if self.exchange.silence_faults != 1:

@@ -1,8 +1,8 @@
-"""Reads the mesh of a tribometer's folder with meshio and holds it against the tables of nodes beside it.
+"""Reads the mesh of a tribometer's folder with meshio and compares it with the tables of nodes in the folder.
 
     read_mesh.py DIR
 
-Says the version, and how many nodes, bricks and components there are.
+Prints the version and the numbers of nodes, bricks and components.
 """
 
 import sys

@@ -61,7 +61,7 @@ def with_rosbags(directory):
     with Reader(directory) as reader:
         for connection in reader.connections:
             typestore.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
-        # What metadata.yaml says, and what is there.
+        # The counts in metadata.yaml and those of the files.
         assert reader.message_count == sum(connection.msgcount for connection in reader.connections)
         for connection, timestamp, raw in reader.messages():
             decoded = typestore.deserialize_cdr(raw, connection.msgtype)

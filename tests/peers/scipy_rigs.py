@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Rigs written by numpy and scipy, and what scipy predicts for them.
+"""Rigs written by numpy and scipy, and their predictions by scipy.
 
     scipy_rigs.py DIR
 
@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 TAU = 2 * np.pi
 
-# Negative friction coefficients stand for sliding in the other direction.
+# Negative friction coefficients represent sliding in the other direction.
 LIMITS = "[limits]\nfriction_coefficient = [-10.0, 10.0]\n"
 
 
@@ -149,7 +149,7 @@ class Modal:
         text = f"name = '{self.name}'\n{LIMITS}[pad]\nmodal = '{self.name}-pad.npz'\n{modes}"
         if self.disc is not None:
             # Fortran order here, C order above; the damping ratios in the rig file, which counts modes upwards in
-            # frequency, whatever their order in the archive.
+            # frequency, for any order in the archive.
             zeta = self.disc.zeta[np.argsort(self.disc.omega)]
             np.savez_compressed(folder / f"{self.name}-disc.npz", omega_rad_s=self.disc.omega,
                                 phi=np.asfortranarray(self.disc.phi), nodes_m=self.disc.nodes)  # fmt: skip
@@ -251,7 +251,7 @@ def modal_cases(folder):
     patches = [patch(leaning, list(range(len(disc_nodes))), 3e7, 0.0)]
     rigs.append((Modal("leaning", pad, disc, patches, 0.01, True), np.savez, ""))
 
-    # Nodes of their own on either side, no damping at all; the five lowest of eight pad modes.
+    # Different nodes on both sides, no damping; the five lowest of eight pad modes.
     pad = Side(rng, place(sector(rng, *pad_grid, 0.0, 1.0)), 8, (700, 8000), damped=False)
     disc = Side(rng, place(sector(rng, *disc_grid, 0.0, 1.0)), 10, (400, 7000), damped=False)
     patches = [patch(axis, list(range(len(disc.nodes))), 2e7, 0.0)]

@@ -15,7 +15,7 @@ trap 'stop; rm -f "$out"' EXIT
 trap 'exit 1' INT TERM
 
 start() { # arguments of the stand-in
-    domain=$((30 + (domain - 29) % 60)) # a domain of its own: endpoints linger
+    domain=$((30 + (domain - 29) % 60)) # a separate domain: endpoints linger
     "$dir/bin/ros-python" "$here/echo_node.py" --domain "$domain" --seconds 60 "$@" &
     standin=$!
 }

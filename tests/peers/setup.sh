@@ -23,7 +23,7 @@ python=${PYTHON:-python3}
 say() { echo "peers: $*"; }
 die() { echo "peers: $*" >&2; exit 1; }
 
-# One at a time, should two tests ask at once.
+# One at a time, if two tests start it at the same time.
 exec 9>"$dir/lock"
 flock 9
 
@@ -34,13 +34,13 @@ quietly() {
     "$@" >"$log" 2>&1 || { tail -n 40 "$log" >&2; die "failed: $* (see $log)"; }
 }
 
-# The name of a stamp says what was done, its content for what; so a step is repeated when its input changes.
+# The name of a stamp is that of a step, its content the step's input; so a step is repeated when its input changes.
 done_for() { [ "$(cat "$dir/$1.stamp" 2>/dev/null)" = "$2" ]; }
 hash_of() { cat "$@" | sha256sum | cut -c 1-16; }
 
 [ -f "$here/requirements-$ros.txt" ] || die "PEERS_ROS=$ros: not one of kilted, jazzy"
 
-# --- what the machine must have ---------------------------------------------------------------------------------
+# --- required programs -----------------------------------------------------------------------------------------
 
 needs=
 command -v "$python" >/dev/null || needs="$needs python3"
@@ -59,7 +59,7 @@ version=$("$python" -c 'import platform, sys; print(platform.python_version(), s
 
 # --- the two virtual environments -------------------------------------------------------------------------------
 
-# The wheels of ROS bring libraries of their own and re-execute Python at every start: the rest is kept apart.
+# The wheels of ROS contain their own libraries and re-execute Python at every start: other packages are kept separate.
 make_venv() { # name, requirements
     key="$version $dir $(hash_of "$2")"
     done_for "$1" "$key" && return

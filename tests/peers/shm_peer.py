@@ -74,7 +74,7 @@ assert (ctypes.sizeof(OperatingPoint), ctypes.sizeof(Mode), ctypes.sizeof(Predic
 
 
 def open_services(node, name, payload, rig):
-    """The topic and the event service beside it, whatever settings they have; created with room for many otherwise."""
+    """The topic and its event service, with any settings they have; created with room for many otherwise."""
     service = iox2.ServiceName.new(name)
     topic = (
         node.service_builder(service)

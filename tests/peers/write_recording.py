@@ -1,4 +1,4 @@
-"""Writes recordings of operating points as other programs do: a rosbag2 directory by `rosbags`, and beside it a file
+"""Writes recordings of operating points as other programs do: a rosbag2 directory by `rosbags`, and next to it a file
 with LZ4 chunks and one without chunks by `mcap`, and three directories in forms that are not read: compressed message by
 message (of the node's own topic), compressed as a whole, and in the sqlite3 format.
 

@@ -16,7 +16,7 @@ const ask = async (path) => {
   if (!answer.ok) throw new Error(await answer.text());
   return answer.json();
 };
-/** Interval between updates of the numbers, ms: nobody can read faster. */
+/** Interval between updates of the numbers, ms: faster changes cannot be read. */
 const NUMBERS_EVERY = 300;
 
 const about = await ask("about.json");
@@ -98,8 +98,8 @@ function sifted(state) {
   return { ...state, ...nothing, ...silent };
 }
 
-function take(heard) {
-  const state = sifted(heard);
+function take(received) {
+  const state = sifted(received);
   latest = state;
   heardAt = performance.now();
   if (!recording) connected();

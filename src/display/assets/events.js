@@ -20,8 +20,8 @@ export class Events {
   show(events, comparison = null) {
     const measured = (comparison?.measured ?? []).map((squeal) => ({ ...squeal, kind: VERDICTS[squeal.verdict], class: squeal.verdict === "hit" ? "aside" : "missed" }));
     const alarms = new Set(comparison?.false_alarms);
-    const told = events.map((event) => (alarms.has(event.number) ? { ...event, note: "false alarm" } : event));
-    const shown = [...told, ...this.notes, ...measured].sort((a, b) => a.onset_s - b.onset_s).slice(-MOST).reverse();
+    const judged = events.map((event) => (alarms.has(event.number) ? { ...event, note: "false alarm" } : event));
+    const shown = [...judged, ...this.notes, ...measured].sort((a, b) => a.onset_s - b.onset_s).slice(-MOST).reverse();
     const counted = ["SQUEAL", "FAULT", "NO DATA"].map((kind) => [kind.toLowerCase(), events.filter((event) => event.kind === kind).length]);
     const counts = counted.filter(([, count]) => count).map(([kind, count]) => `${count} × ${kind}`).join(", ");
     const summary = events.length ? `${counts}${events.length > MOST ? `, the last ${MOST} shown` : ""}` : "none so far";
@@ -35,7 +35,7 @@ export class Events {
     row.className = event.class ?? (event.kind === "SQUEAL" ? "squeal" : "fault");
     const moment = (at_s) => (this.start === undefined ? time(at_s) : `${fixed(at_s - this.start, 2)} s`);
     const ends = known(event.end_s);
-    // The moment of fastest growth; for a fault its onset. Notes and measurements have values of their own.
+    // The moment of fastest growth; for a fault its onset. Notes and measurements have separate values.
     const shown = event.peak ?? event.onset ?? event;
     const values = [
       event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, moment(event.onset_s),

@@ -177,7 +177,7 @@ export class History {
   #waterfall(holder) {
     const element = this.#element(holder, { key: "unstable", label: "unstable", unit: "Hz" }, "waterfall");
     let shown = [];
-    let heard = [];
+    let measured = [];
     let range = null;
     const heat = heatScale();
     const paint = (u) => {
@@ -198,7 +198,7 @@ export class History {
       // Measured frequencies as small dots, so that they do not hide the predictions.
       ctx.fillStyle = colour("--ink");
       const dot = 2 * devicePixelRatio;
-      for (const bin of heard) {
+      for (const bin of measured) {
         ctx.fillRect(u.valToPos((bin.k + 0.5) * this.binS, "x", true) - dot / 2, u.valToPos(bin.v.hz, "y", true) - dot / 2, dot, dot);
       }
     };
@@ -209,8 +209,8 @@ export class History {
     }, [[], []], element);
     return { u, element, marker: this.#marker(u), data: (bins) => {
       shown = bins.filter((bin) => bin.u.length > 0);
-      heard = bins.filter((bin) => bin.v && bin.v.hi >= this.threshold);
-      const all = [...shown.flatMap((bin) => bin.u.map(([hz]) => hz)), ...heard.map((bin) => bin.v.hz)];
+      measured = bins.filter((bin) => bin.v && bin.v.hi >= this.threshold);
+      const all = [...shown.flatMap((bin) => bin.u.map(([hz]) => hz)), ...measured.map((bin) => bin.v.hz)];
       if (all.length) {
         const low = Math.min(...all);
         const high = Math.max(...all);
@@ -307,7 +307,7 @@ function columns(holder) {
   return display === "grid" ? gridTemplateColumns.split(" ").length : 1;
 }
 
-/** The colour of a growth rate from 0 to 1: contrast increases with growth. Also paints the scale beside the plot. */
+/** The colour of a growth rate from 0 to 1: contrast increases with growth. Also paints the scale next to the plot. */
 function heatScale() {
   const stops = [0, 1, 2, 3].map((k) => colour(`--heat-${k}`).match(/[0-9a-f]{2}/gi).map((pair) => parseInt(pair, 16)));
   const heat = (share) => {

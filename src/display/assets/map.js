@@ -323,13 +323,13 @@ export class StabilityMap {
       plots.setAttribute("aria-valuemax", limits.x[1]);
       plots.setAttribute("aria-valuenow", this.read ?? this.state?.mu ?? limits.x[0]);
     }
-    const text = this.read === null || !curves ? "" : this.#told(this.read, pointed);
+    const text = this.read === null || !curves ? "" : this.#values(this.read, pointed);
     put(at("map-readout"), text || (curves ? "Point at the map, or focus it and use the arrow keys, to read values off." : ""));
     plots.setAttribute("aria-valuetext", text || "nothing read off");
   }
 
   /** The values at a friction coefficient as text: of the visible modes nearest to the pointer, or growing fastest. */
-  #told(mu, pointed) {
+  #values(mu, pointed) {
     const { mu: grid, modes } = this.curves;
     const after = Math.max(1, grid.findIndex((value) => value >= mu));
     const share = (mu - grid[after - 1]) / (grid[after] - grid[after - 1]);
@@ -340,8 +340,8 @@ export class StabilityMap {
       .filter(({ hz }) => known(hz) && hz >= low && hz <= high);
     const away = ({ hz, growth }) => (pointed ? Math.abs(pointed.u.valToPos(pointed.axis === "growth" ? growth : hz, "y") - pointed.y) : -growth);
     const near = found.sort((a, b) => away(a) - away(b)).slice(0, MOST_READ).sort((a, b) => a.id - b.id);
-    const told = near.map(({ id, hz, growth }) => `mode ${id}: ${fixed(hz, hz >= 100 ? 1 : 4)} Hz, ${signed(growth, 2)} 1/s`);
-    return `μ ${fixed(mu, 4)}   ${told.join("   ")}`;
+    const texts = near.map(({ id, hz, growth }) => `mode ${id}: ${fixed(hz, hz >= 100 ? 1 : 4)} Hz, ${signed(growth, 2)} 1/s`);
+    return `μ ${fixed(mu, 4)}   ${texts.join("   ")}`;
   }
 }
 

@@ -104,8 +104,8 @@ export class ShapeView {
   #changes(change) {
     const named = { friction: "μ", load: "load", speed: "speed", contact_stiffness: "stiffness", contact_damping: "damping" };
     const entry = (kind, text) => Object.assign(document.createElement(kind), { textContent: text });
-    const told = Object.entries(named).filter(([key]) => known(change?.[key]));
-    const pairs = told.map(([key, name]) => {
+    const available = Object.entries(named).filter(([key]) => known(change?.[key]));
+    const pairs = available.map(([key, name]) => {
       const pair = document.createElement("div");
       pair.append(entry("dt", name), entry("dd", change[key] === 0 ? "0" : signed(change[key], 2)));
       return pair;

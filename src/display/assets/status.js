@@ -10,8 +10,8 @@ function listening(inputs) {
   if (!inputs) return "";
   const { topic, domain, service, start } = inputs;
   const places = [topic && `topic ${topic} in ROS domain ${domain ?? 0}`, service && `shared-memory service ${service}`].filter(Boolean);
-  const heard = places.length ? `Listens to ${places.join(" and ")}.` : "Listens to no bus.";
-  return start ? `${heard} Without a rig, start: ${start}` : heard;
+  const text = places.length ? `Listens to ${places.join(" and ")}.` : "Listens to no bus.";
+  return start ? `${text} Without a rig, start: ${start}` : text;
 }
 
 export class Status {
@@ -76,7 +76,7 @@ export class Status {
     const { growth, worst, load, speed } = this.decimals;
     for (const [, [hz]] of state.modes ?? []) growth.of(leastGrowth(hz));
     const fresh = !at("status").classList.contains("stale");
-    // The numbers in the message change with every state, faster than anybody can read.
+    // The numbers in the message change with every state, too fast to be read.
     if (fresh) put(at("reason"), state.message ?? "");
     this.#answer(state, padShare, fresh);
     put(at("margin"), signed(state.margin, 4), state.margin);
@@ -98,15 +98,15 @@ export class Status {
     this.#trend(state);
   }
 
-  /** What squeals now or next: the modes, their frequency, the friction coefficient, and the part that moves. */
+  /** The present or next squeal: the modes, their frequency, the friction coefficient, and the part that moves. */
   #answer(state, padShare, fresh) {
     const { fastest, next, status, mu } = state;
-    const told = asserts(state) && (fastest || next);
-    at("answer-facts").hidden = !told;
-    at("answer-text").hidden = Boolean(told);
+    const answered = asserts(state) && (fastest || next);
+    at("answer-facts").hidden = !answered;
+    at("answer-text").hidden = Boolean(answered);
     const silent = ["waiting", "no_data"].includes(status);
     put(at("answer-title"), status === "squeal" ? "Squeals now" : silent ? "Inputs" : "Squeals next");
-    if (!told) {
+    if (!answered) {
       const stable = state.map ? `Nothing up to μ ${fixed(this.muMax, 2)}.` : "Not known yet: the stability map is being made.";
       put(at("answer-text"), !fresh ? "" : asserts(state) ? stable : silent ? this.listening : "Not known: there is no prediction for this input.");
       return;
