@@ -26,6 +26,9 @@ const LEAST_SPAN_DB: f64 = 6.0;
 const FASTEST_PER_WINDOW: f64 = 3.0;
 /// A rate whose interval of confidence is wider than this share of it to either side is not stated.
 const LEAST_CONFIDENCE: f64 = 0.3;
+/// Largest mean square of the residuals, in units of the variance that the weights state: 0.2 in the logarithm of the
+/// amplitude (1.7 dB) where there is no noise. What grows otherwise, such as a tone that is switched on, has no rate.
+const LARGEST_MISFIT: f64 = 100.0;
 /// Standard deviation of the logarithm of the amplitude that is not noise: what the model of constant growth leaves.
 const MODEL_DEVIATION: f64 = 0.02;
 
@@ -65,6 +68,8 @@ struct Line {
     intercept: f64,
     /// Half of the interval of 95 % confidence of the slope.
     half_width: f64,
+    /// Mean square of the residuals, weighted.
+    misfit: f64,
 }
 
 impl Envelope {
@@ -164,8 +169,11 @@ impl Envelope {
                 return None;
             }
             let line = fit(&points)?;
-            let Line { slope, intercept, half_width } = line;
+            let Line { slope, intercept, half_width, misfit } = line;
             if half_width > LEAST_CONFIDENCE * slope || slope * windowed.length_s > FASTEST_PER_WINDOW {
+                return None;
+            }
+            if misfit > LARGEST_MISFIT {
                 return None;
             }
             // A window sees the average of the growing amplitude, which exceeds the amplitude at its middle.
@@ -254,9 +262,10 @@ fn fit(points: &[[f64; 3]]) -> Option<Line> {
     let slope = points.iter().map(|[x, y, w]| w * (x - x_mean) * (y - y_mean)).sum::<f64>() / x_square;
     let intercept = y_mean - slope * x_mean;
     let residuals: f64 = points.iter().map(|[x, y, w]| w * (y - intercept - slope * x).powi(2)).sum();
-    let variance = (residuals / freedom as f64).max(1.0) / x_square;
+    let misfit = residuals / freedom as f64;
+    let variance = misfit.max(1.0) / x_square;
     let half_width = student_95(freedom) * variance.sqrt();
-    (slope.is_finite() && half_width.is_finite()).then_some(Line { slope, intercept, half_width })
+    (slope.is_finite() && half_width.is_finite()).then_some(Line { slope, intercept, half_width, misfit })
 }
 
 /// Two-sided 95 % quantile of Student's t. By its expansion in `1/ν` from 9 degrees of freedom on (Abramowitz and Stegun
