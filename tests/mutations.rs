@@ -246,6 +246,18 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
             "Pruefstand 3\nZeit [s];Normalkraft [N];Drehzahl [1/min];Reibwert\n0,0;500,5;124;0,35\n0,1;501;124;0,36\n",
             "Time,Load,Speed,Friction force\n,N,rpm,N\n2026-01-01T00:00:00Z,500,124,170\n",
         ]),
+        "wav" => {
+            let long = [b"RF64".as_slice(), &[255; 4], b"WAVEds64", &[28, 0, 0, 0], &[8; 28]].concat();
+            let format = |bits: u8, block: u8| {
+                let rest = [0x80, 0xbb, 0, 0, 0, 0, 0, 0, block, 0, bits, 0];
+                [b"fmt ".as_slice(), &[16, 0, 0, 0, 1, 0, 2, 0], &rest].concat()
+            };
+            let data = [b"data".as_slice(), &[24, 0, 0, 0], &[7; 24]].concat();
+            let mut float = vec![];
+            squealcast::import::wav::write(&mut float, 51_200, &[0.5; 8]).expect("memory");
+            let riff = [b"RIFF".as_slice(), &[60, 0, 0, 0], b"WAVE", &format(16, 4), &data].concat();
+            vec![riff, [long, format(24, 6), data].concat(), float]
+        }
         "recording" => {
             let folder =
                 std::fs::read_dir(format!("{}/recordings/ramp", env!("CARGO_MANIFEST_DIR"))).expect("a recording");

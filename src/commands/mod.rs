@@ -1,5 +1,6 @@
 //! The commands, one per file. Exit codes and output are handled here.
 
+mod against;
 mod bench;
 mod buses;
 mod check;
@@ -9,6 +10,7 @@ mod demo;
 mod display;
 mod format;
 mod full;
+mod hear;
 mod identify;
 mod import;
 mod live;
@@ -28,6 +30,7 @@ mod ros2_side;
 mod run;
 mod signals;
 mod simulate;
+mod simulated_sound;
 mod steps;
 mod sweep;
 mod tribometer;
@@ -84,6 +87,7 @@ enum Command {
     Report(report::Options),
     Import(import::Options),
     PredictLog(predict_log::Options),
+    Hear(hear::Options),
     Recover(recover::Options),
     Rigs(rigs::Options),
     Check(check::Options),
@@ -130,6 +134,7 @@ pub fn main() -> ExitCode {
         Command::Report(options) => options.run(),
         Command::Import(options) => options.run(),
         Command::PredictLog(options) => options.run(),
+        Command::Hear(options) => options.run(),
         Command::Recover(options) => options.run(),
         Command::Predict(options) => options.run(),
         Command::Sweep(options) => options.run(),

@@ -75,15 +75,30 @@ impl Recordings {
             let [first, ..] = &self.recordings[..] else { unreachable!("more than one") };
             bail!("{} recordings are given, expected one, such as {}", self.recordings.len(), first.display());
         }
-        let mut paths = self.paths()?;
-        let count = paths.len();
-        let Some(path) = paths.pop() else { unreachable!("at least one") };
-        if count > 1 {
-            note!("{count} recordings: the last by name, {}", path.display());
-        }
+        let path = last(self.paths()?);
         let recording = self.open(&path)?;
         Ok((path, recording))
     }
+}
+
+/// The last by name of at least one recording, reported if there are several.
+fn last(mut paths: Vec<PathBuf>) -> PathBuf {
+    let count = paths.len();
+    let Some(path) = paths.pop() else { unreachable!("at least one") };
+    if count > 1 {
+        note!("{count} recordings: the last by name, {}", path.display());
+    }
+    path
+}
+
+/// Opens the recording at a path; of a folder with several, the last by name. Reports what cannot be read.
+///
+/// # Errors
+/// The path contains no recording.
+pub fn open_last(path: &Path) -> anyhow::Result<(PathBuf, Recording)> {
+    let path = last(recordings_at(path)?);
+    let recording = TopicOptions { read_topics: vec![] }.open(&path)?;
+    Ok((path, recording))
 }
 
 /// The error for a recording without predictions, with advice.

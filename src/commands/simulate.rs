@@ -7,6 +7,7 @@ use anyhow::{Context, ensure};
 use clap::Args;
 
 use super::buses::BusOptions;
+use super::simulated_sound::SoundOptions;
 use super::{Outcome, finite, not_negative, positive, signals};
 use crate::bus::ros_args::RosArgs;
 use crate::bus::ros2::Ros2Source;
@@ -39,6 +40,8 @@ pub struct Options {
     /// Rig file, or the name of an embedded rig, for --record
     #[arg(long, value_name = "RIG", requires = "record")]
     rig: Option<String>,
+    #[command(flatten)]
+    sound: SoundOptions,
     #[command(flatten)]
     vibration: VibrationOption,
     #[command(flatten)]
@@ -139,6 +142,7 @@ impl Options {
             // A simulation cannot be run twice, so no inputs are known in advance.
             let predicted = offline::record(&rig, None, std::iter::empty(), measured, directory)?;
             note!("{}", predicted.directory.display());
+            self.sound.write(&predicted.directory, self.seed)?;
             return Ok(Outcome::Done);
         }
         self.publish(profile, period, ros_args)

@@ -15,6 +15,7 @@
 //! | matrices, nodes and rows of a full model | [`FULL_MODEL_PART`] | about 20 times the file; lines of 1 MiB |
 //! | tribometer log | [`LOG`] | about 12 times the file; lines of 64 KiB |
 //! | target frequencies | [`TARGETS`] | about 10 times the file |
+//! | WAV file | none: read in pieces | 20 MiB for each channel, of at most 64 |
 //! | chart | [`CHART`] | 3 times the file |
 //! | recording (MCAP) | none: read in pieces | 256 MiB and an attachment, see [`crate::recording::record_walker`] |
 

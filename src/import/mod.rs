@@ -1,6 +1,7 @@
-//! Converts a tribometer log to a recording of operating points.
+//! Converts a tribometer log to a recording of operating points; reads WAV files.
 
 pub mod tribometer_log;
+pub mod wav;
 
 use std::{
     collections::BTreeMap,

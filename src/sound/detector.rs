@@ -136,6 +136,16 @@ pub enum Detection {
     Ended(Squeal),
 }
 
+impl Detection {
+    /// The squeal, if it is over.
+    pub fn ended(self) -> Option<Squeal> {
+        match self {
+            Self::Ended(squeal) => Some(squeal),
+            Self::Began(_) => None,
+        }
+    }
+}
+
 /// An interruption of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Interruption {
@@ -753,11 +763,7 @@ mod tests {
     }
 
     fn ended(found: &[Detection]) -> Vec<Squeal> {
-        let ended = found.iter().filter_map(|detection| match detection {
-            Detection::Ended(squeal) => Some(*squeal),
-            Detection::Began(_) => None,
-        });
-        let mut ended: Vec<Squeal> = ended.collect();
+        let mut ended: Vec<Squeal> = found.iter().copied().filter_map(Detection::ended).collect();
         ended.sort_by_key(|squeal| squeal.onset_ns);
         ended
     }

@@ -3,12 +3,14 @@
 //! - [`waveform`]: samples of one channel with their rate, unit and time.
 //! - [`spectrum`]: short-time spectra and the tones in them; [`weighting`]: A-weighting.
 //! - [`envelope`]: onset, end and growth of one tone; [`detector`]: squeals in a stream of samples.
+//! - [`matching`]: predictions scored against squeal in sound.
 //! - [`simulated`]: sound with squeals whose properties are known.
 //!
 //! Nothing here reads a file, a bus or a clock; time comes from the stamps of the samples.
 
 pub mod detector;
 pub mod envelope;
+pub mod matching;
 pub mod simulated;
 pub mod spectrum;
 pub mod waveform;

@@ -1,12 +1,14 @@
 //! Every reader of bytes from outside, as a function that must return for any bytes: with a value or an error, never a panic,
 //! and within the ceilings of `squealcast::files::input_file`.
 
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use squealcast::bus::params_file;
 use squealcast::full_model::FullModelFile;
 use squealcast::import::tribometer_log;
+use squealcast::import::wav::Wav;
 use squealcast::msgs::schema::Topic;
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::{Chart, OperatingPoint, Traces};
@@ -23,7 +25,7 @@ pub struct Target {
     pub read: fn(&[u8]),
 }
 
-pub const TARGETS: [Target; 12] = [
+pub const TARGETS: [Target; 13] = [
     Target {
         name: "npz",
         read: |bytes| {
@@ -64,6 +66,7 @@ pub const TARGETS: [Target; 12] = [
             let _ = tribometer_log::parse(&tribometer_log::decode_text(bytes), &Default::default());
         },
     },
+    Target { name: "wav", read: wav },
     Target { name: "recording", read: recording },
     Target {
         name: "cdr",
@@ -105,6 +108,15 @@ fn full_model(bytes: &[u8]) {
 /// The seeds of `full_model`.
 pub fn full_models() -> Vec<Vec<u8>> {
     (0..).zip(FULL_MODEL).map(|(k, (_, content))| [&[k][..], content.as_bytes()].concat()).collect()
+}
+
+/// Reads the samples too, as far as they are there.
+fn wav(bytes: &[u8]) {
+    let Ok(mut wav) = Wav::open("a.wav", Cursor::new(bytes)) else { return };
+    let mut channels = vec![vec![]; usize::from(wav.channels)];
+    while wav.read(4096, &mut channels).is_ok_and(|count| count > 0) {
+        channels.iter_mut().for_each(Vec::clear);
+    }
 }
 
 fn recording(bytes: &[u8]) {

@@ -34,6 +34,7 @@ mod rig_models;
 mod ros2_side;
 mod scipy;
 mod sessions;
+mod sound;
 mod stress;
 mod tribometer;
 mod upstream;

@@ -69,7 +69,8 @@ fn commands(text: &str) -> Vec<Shown> {
 fn goes_on(command: &str) -> bool {
     let words: Vec<&str> = command.split_whitespace().collect();
     match words[1] {
-        "run" | "demo" | "simulate" | "view" => true,
+        "run" | "demo" | "view" => true,
+        "simulate" => !words.contains(&"--record"),
         "replay" => !words.contains(&"--verify"),
         _ => false,
     }
