@@ -58,7 +58,8 @@ impl Options {
     fn tribometer(&self) -> anyhow::Result<Vec<Item>> {
         let mut steps = self.progress.steps(2);
         let folder = self.output.join("tribometer");
-        write_full_model(&Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?, &folder, |_| ())?;
+        let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
+        write_full_model(&tribometer, false, &folder, |_| ())?;
         steps.say(&format!("{} written", folder.display()));
         let full = FullModelFile::load(&folder.join("tribometer.toml"))?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));

@@ -17,6 +17,9 @@ pub struct Options {
     /// Degrees of freedom, at least; the 294 contact pairs are the same at any size
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = clap::value_parser!(u32).range(5_000..=4_000_000))]
     dof: u32,
+    /// Also write the matrices of the disc that turns in the frame of the pad: gyroscopic, spin and stress-stiffening terms
+    #[arg(long)]
+    rotation: bool,
     /// Folder to write into
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
@@ -32,7 +35,9 @@ impl Options {
         let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
         let (pad, disc) = (tribometer.pad.structure.dof(), tribometer.disc.structure.dof());
         note!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());
-        write_full_model(&tribometer, &self.output, |file| note!("{}", self.output.join(file).display()))?;
+        write_full_model(&tribometer, self.rotation, &self.output, |file| {
+            note!("{}", self.output.join(file).display())
+        })?;
         Ok(Outcome::Done)
     }
 }

@@ -46,8 +46,10 @@ pub fn basis_rig(
         .iter()
         .zip(full.model.offsets())
         .zip(&full.geometry)
-        .map(|((part, offset), geometry)| {
+        .enumerate()
+        .map(|(index, ((part, offset), geometry))| {
             let rows = geometry.interface_rows();
+            let of_part = projected.basis.subrows(offset, part.mass.nrows());
             ModalSide {
                 name: &part.name,
                 nodes_m: geometry.interface_m(),
@@ -58,10 +60,8 @@ pub fn basis_rig(
                 }),
                 residual: None,
                 damping_ratio: None,
-                mass_share: (part.name == "pad").then(|| {
-                    let rows = projected.basis.subrows(offset, part.mass.nrows());
-                    project_sparse(&part.mass, rows, true)
-                }),
+                mass_share: (part.name == "pad").then(|| project_sparse(&part.mass, of_part, true)),
+                matrices: full.model.matrices_of_part(index, of_part),
             }
         })
         .collect();

@@ -5,8 +5,9 @@ use std::path::Path;
 
 use anyhow::Context;
 
-use super::{write_deck, write_mesh, write_symmetric};
-use crate::fem::tribometer::{CONTACT_STIFFNESS_N_PER_M, Part, Tribometer};
+use super::{write_deck, write_mesh, write_skew, write_symmetric};
+use crate::fem::Turning;
+use crate::fem::tribometer::{AXIS, CONTACT_STIFFNESS_N_PER_M, Part, Tribometer};
 use crate::files::whole_file::write_whole;
 
 /// Upper end of the band: includes the paper's first 18 modes, which reach 3256 Hz, with a margin.
@@ -17,12 +18,17 @@ const MU_MAX: f64 = 1.0;
 const DECK_MODES: usize = 20;
 
 /// Writes the full model into `folder`, which is created if necessary. For each part: matrices, nodes, rows and a
-/// CalculiX deck; for both: the mesh as VTK. `tribometer.toml` is written last, so it exists only if everything else
+/// CalculiX deck; for both: the mesh as VTK. With `rotation` also the matrices of the turning disc. `tribometer.toml` is written last, so it exists only if everything else
 /// does. `say` receives the name of each file once it is written.
 ///
 /// # Errors
 /// A part that cannot be assembled, a file that cannot be written.
-pub fn write_full_model(tribometer: &Tribometer, folder: &Path, mut say: impl FnMut(&str)) -> anyhow::Result<()> {
+pub fn write_full_model(
+    tribometer: &Tribometer,
+    rotation: bool,
+    folder: &Path,
+    mut say: impl FnMut(&str),
+) -> anyhow::Result<()> {
     std::fs::create_dir_all(folder).with_context(|| format!("{}: the folder cannot be created", folder.display()))?;
     let mut toml = format!(
         "# A pad-on-disc tribometer of the paper's kind, with dimensions of this project: {} degrees of freedom.\n\
@@ -31,6 +37,10 @@ pub fn write_full_model(tribometer: &Tribometer, folder: &Path, mut say: impl Fn
     );
     for (name, part) in [("pad", &tribometer.pad), ("disc", &tribometer.disc)] {
         toml += &write_part(name, part, folder, &mut say)?;
+    }
+    // Keys of [disc], the table written last.
+    if rotation {
+        toml += &write_turning(&tribometer.disc, folder, &mut say)?;
     }
     let mesh = "tribometer.vtk";
     let meshes = [&tribometer.pad.structure.mesh, &tribometer.disc.structure.mesh];
@@ -79,4 +89,22 @@ fn write_part(name: &str, part: &Part, folder: &Path, say: &mut impl FnMut(&str)
         file("mass.mtx"),
         interface.join(", ")
     ))
+}
+
+/// Writes the matrices of the turning disc and returns their keys.
+fn write_turning(disc: &Part, folder: &Path, say: &mut impl FnMut(&str)) -> anyhow::Result<String> {
+    let Turning { gyroscopic, spin, stiffening } = disc.structure.turning(&AXIS).context("disc")?;
+    let mut keys = String::new();
+    let matrices = [("gyroscopic", &gyroscopic), ("spin", &spin), ("stress_stiffening", &stiffening)];
+    for (key, matrix) in matrices {
+        let file = format!("disc-{}.mtx", key.replace('_', "-"));
+        let comment = format!("{key} matrix of the disc, kg; rows as in disc-rows.csv");
+        write_whole(&folder.join(&file), |out| match key {
+            "gyroscopic" => write_skew(matrix, &comment, out),
+            _ => write_symmetric(matrix, &comment, out),
+        })?;
+        say(&file);
+        keys += &format!("{key} = \"{file}\"\n");
+    }
+    Ok(keys)
 }

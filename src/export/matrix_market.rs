@@ -1,4 +1,4 @@
-//! Writes symmetric sparse matrices and dense matrices as Matrix Market files.
+//! Writes symmetric and skew sparse matrices and dense matrices as Matrix Market files.
 //!
 //! Source: Boisvert, Pozo, Remington, "The Matrix Market exchange formats", NISTIR 5935 (1996).
 
@@ -12,8 +12,20 @@ use crate::reduction::SparseMatrix;
 /// # Errors
 /// Those of the writer.
 pub fn write_symmetric(matrix: &SparseMatrix, comment: &str, out: &mut impl Write) -> io::Result<()> {
+    write_lower(matrix, "symmetric", comment, out)
+}
+
+/// Writes a skew matrix like [`write_symmetric`], without its diagonal.
+///
+/// # Errors
+/// Those of the writer.
+pub fn write_skew(matrix: &SparseMatrix, comment: &str, out: &mut impl Write) -> io::Result<()> {
+    write_lower(matrix, "skew-symmetric", comment, out)
+}
+
+fn write_lower(matrix: &SparseMatrix, kind: &str, comment: &str, out: &mut impl Write) -> io::Result<()> {
     let lower = || matrix.as_ref().triplet_iter().filter(|entry| entry.row >= entry.col && *entry.val != 0.0);
-    writeln!(out, "%%MatrixMarket matrix coordinate real symmetric")?;
+    writeln!(out, "%%MatrixMarket matrix coordinate real {kind}")?;
     writeln!(out, "% {comment}")?;
     writeln!(out, "{} {} {}", matrix.nrows(), matrix.ncols(), lower().count())?;
     for entry in lower() {

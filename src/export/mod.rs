@@ -11,6 +11,6 @@ mod vtk;
 pub use basis::basis_rig;
 pub use calculix::write_deck;
 pub use full_model::write_full_model;
-pub use matrix_market::write_symmetric;
+pub use matrix_market::{write_skew, write_symmetric};
 pub use rig::{HASH_DIGITS, ModalSide, modal_rig, modal_sides, source_remarks};
 pub use vtk::write_mesh;

@@ -14,7 +14,7 @@ use sha2::{Digest, Sha256};
 use crate::full_model::certificate::Certificate;
 use crate::full_model::{FullModelFile, PartGeometry};
 use crate::physics::ResidualFlexibility;
-use crate::reduction::{FullPart, Kept, Residual};
+use crate::reduction::{FullPart, Kept, PartMatrices, Residual};
 use crate::rig::RigFile;
 use crate::text::hex::hex;
 
@@ -46,6 +46,8 @@ pub struct ModalSide<'a> {
     pub damping_ratio: Option<f64>,
     /// This side's contribution to the unit mass matrix, if the columns of `phi` also move the other side.
     pub mass_share: Option<Mat<f64>>,
+    /// Damping and rotation of this side.
+    pub matrices: PartMatrices,
 }
 
 /// The sides of a rig, from the modes kept of pad and disc of a full model.
@@ -62,7 +64,7 @@ pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Res
             bail!("{file}: `{field}` has a mode of {square:.3e} rad^2/s^2; expected at least {limit:.1e}");
         }
     }
-    let side = |((part, geometry), kept): ((&'a FullPart, &PartGeometry), &'a Kept)| {
+    let side = |(index, ((part, geometry), kept)): (usize, ((&'a FullPart, &PartGeometry), &'a Kept))| {
         let (rows, phi) = (geometry.interface_rows(), kept.modes.phi.as_ref());
         ModalSide {
             name: &part.name,
@@ -73,9 +75,10 @@ pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Res
             residual: kept.residual.as_ref(),
             damping_ratio: geometry.damping_ratio,
             mass_share: None,
+            matrices: full.model.matrices_of_part(index, phi),
         }
     };
-    Ok(full.model.parts.iter().zip(&full.geometry).zip(kept).map(side).collect())
+    Ok(full.model.parts.iter().zip(&full.geometry).zip(kept).enumerate().map(side).collect())
 }
 
 /// Comment lines that name the full model a rig was reduced from.
@@ -102,6 +105,10 @@ impl ModalSide<'_> {
         ];
         if let Some(share) = &self.mass_share {
             arrays.push(("mass_share", vec![modes, modes], by_rows(share)));
+        }
+        let PartMatrices { damping, gyroscopic, spin } = &self.matrices;
+        for (name, matrix) in [("damping", damping), ("gyroscopic", gyroscopic), ("spin", spin)] {
+            arrays.extend(matrix.as_ref().map(|matrix| (name, vec![modes, modes], by_rows(matrix))));
         }
         if let Some(residual) = self.residual {
             let n = residual.flexibility.nrows();

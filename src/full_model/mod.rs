@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use crate::files::input_file;
 use crate::physics::ContactLaw;
 use crate::reduction::{
-    FullContact, FullModel, FullPart, Kept, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
+    FullContact, FullModel, FullPart, Kept, PartTurning, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
     Substructure, Wanted, keep_modes,
 };
 use crate::rig::raw::{RawPatch, RawSystem, RawTerm};
@@ -242,8 +242,16 @@ fn matrix_files(raw: &raw::Own) -> Vec<(String, String)> {
     let named = parts.into_iter().filter_map(|(name, part)| Some((name, part.as_ref()?)));
     named
         .flat_map(|(name, part)| {
+            let optional = [
+                ("gyroscopic", &part.gyroscopic),
+                ("spin", &part.spin),
+                ("stress_stiffening", &part.stress_stiffening),
+            ];
             [("stiffness", &part.stiffness), ("mass", &part.mass)]
+                .into_iter()
+                .chain(optional.into_iter().filter_map(|(key, file)| Some((key, file.as_ref()?))))
                 .map(|(key, file)| (format!("{name}.{key}"), file.clone()))
+                .collect::<Vec<_>>()
         })
         .collect()
 }
@@ -264,9 +272,14 @@ fn read_parts(
     patches: &[RawPatch],
     contact_law: ContactLaw,
 ) -> Result<ReadModel, RigError> {
+    let toml = files.toml.clone();
+    let of_disc = [("gyroscopic", &pad.gyroscopic), ("spin", &pad.spin), ("stress_stiffening", &pad.stress_stiffening)];
+    if let Some((key, _)) = of_disc.into_iter().find(|(_, file)| file.is_some()) {
+        let (field, value) = (format!("pad.{key}"), "is given for the pad, which does not turn".to_owned());
+        return Err(RigError::Kind { file: toml, field, value, limit: format!("disc.{key}") });
+    }
     let pad = part::read(files, "pad", pad)?;
     let disc = disc.map(|disc| part::read(files, "disc", disc)).transpose()?;
-    let toml = files.toml.clone();
     let (pad_m, disc_m) = (pad.geometry.interface_m(), disc.as_ref().map(|disc| disc.geometry.interface_m()));
     let patch::Contacts { mut pairs, stiffness_n_per_m, damping_n_s_per_m } =
         patch::contacts(&toml, patches, &pad_m, disc_m.as_deref())?;
@@ -313,6 +326,21 @@ fn read_parts(
     if disc.is_none() {
         contents.push("disc       rigid".to_owned());
     }
+    for part in std::iter::once(&pad).chain(&disc) {
+        let [alpha, beta] = part.rayleigh;
+        if part.rayleigh != [0.0; 2] {
+            contents.push(format!(
+                "damping    of the {}: {alpha} 1/s times its mass, {beta} s times its stiffness",
+                part.part.name
+            ));
+        }
+        let PartTurning { gyroscopic, spin, stress_stiffening } = &part.turning;
+        let known = [("gyroscopic", gyroscopic), ("spin", spin), ("stress stiffening", stress_stiffening)];
+        let known: Vec<&str> = known.into_iter().filter_map(|(name, matrix)| matrix.as_ref().map(|_| name)).collect();
+        if !known.is_empty() {
+            contents.push(format!("rotation   of the {}: {} terms", part.part.name, known.join(", ")));
+        }
+    }
     let coincident = pairs.iter().filter(|pair| pair.disc.len() <= 1).count();
     contents.push(format!(
         "contact    {} pairs, {:.6e} N/m in all; {coincident} of coincident nodes, {} interpolated on the disc",
@@ -321,11 +349,17 @@ fn read_parts(
         pairs.len() - coincident
     ));
     let (mut parts, mut geometry): (Vec<FullPart>, Vec<PartGeometry>) = (vec![], vec![]);
+    let mut own = vec![];
     for part in std::iter::once(pad).chain(disc) {
         parts.push(part.part);
         geometry.push(part.geometry);
+        own.push((part.rayleigh, part.turning));
     }
-    let model = FullModel { parts, stiffness: vec![], damping: vec![], contact: Some(contact), contact_law };
+    let mut model = FullModel { parts, stiffness: vec![], damping: vec![], contact: Some(contact), contact_law };
+    for (part, ([alpha_per_s, beta_s], turning)) in own.iter().enumerate() {
+        let added = model.damp(part, *alpha_per_s, *beta_s).and_then(|()| model.turn(part, turning));
+        added.map_err(|source| RigError::Reduction { file: toml.clone(), source })?;
+    }
     Ok(ReadModel { model, geometry, pairs, contents })
 }
 
@@ -352,7 +386,7 @@ fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Resul
         return Err(RigError::MissingKey { file, field, limit });
     }
     system::check_terms(&file, raw)?;
-    let mass = part::symmetric(files, "system.mass", &raw.mass, true)?;
+    let mass = part::mass(files, "system.mass", &raw.mass)?;
     let n = mass.nrows();
     let mut contents = vec![
         "kind       system of matrices".to_owned(),

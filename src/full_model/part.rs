@@ -10,7 +10,7 @@ use super::files::Files;
 use super::raw::RawPart;
 use super::tables::{self, Nodes};
 use super::{INTERNAL, PartGeometry};
-use crate::reduction::{FullPart, SYMMETRY_TOLERANCE, SparseMatrix};
+use crate::reduction::{FullPart, PartTurning, SYMMETRY_TOLERANCE, SparseMatrix};
 use crate::rig::settings::within;
 use crate::rig::{RigError, lines, matrix_market};
 
@@ -20,6 +20,22 @@ pub struct Part {
     pub geometry: PartGeometry,
     /// Row of each node index and direction.
     pub row_of: HashMap<(usize, usize), usize>,
+    /// `α`, 1/s, and `β`, s, of Rayleigh damping `α M + β K`.
+    pub rayleigh: [f64; 2],
+    /// Matrices of a disc that turns.
+    pub turning: PartTurning,
+}
+
+/// Property that a matrix must have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Property {
+    /// Symmetric, with a complete diagonal that is not negative.
+    Stiffness,
+    /// Symmetric, with a complete diagonal above 0.
+    Mass,
+    Symmetric,
+    /// Mirrored entries have opposite signs.
+    Skew,
 }
 
 /// A matrix and the file it was read from.
@@ -65,16 +81,28 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
     let internal = extension(rows_file) == "dof";
     let (rows, row_of) = placed(rows_file, &labels, &nodes, &raw.nodes, internal)?;
     let mut held = HashSet::new();
-    let mut matrix = |key: &str, file: &str| -> Result<SparseMatrix, RigError> {
+    let mut matrix = |key: &str, file: &str, property: Property| -> Result<SparseMatrix, RigError> {
         let field = field(key);
         let expected = Expected { rows: rows.len(), source: rows_file, row_of: &row_of_label, held: &mut held };
         let matrix = self::matrix(files, &field, file, raw.units.of_matrices(), Some(expected))?;
         let read = Read { field, file, matrix, row_of: &row_of_label };
-        read.check(files, key == "mass")?;
+        read.check(files, property)?;
         Ok(read.matrix)
     };
-    let stiffness = matrix("stiffness", &raw.stiffness)?;
-    let mass = matrix("mass", &raw.mass)?;
+    let stiffness = matrix("stiffness", &raw.stiffness, Property::Stiffness)?;
+    let mass = matrix("mass", &raw.mass, Property::Mass)?;
+    let mut optional = |key: &str, file: &Option<String>, property: Property| {
+        file.as_ref().map(|file| matrix(key, file, property)).transpose()
+    };
+    let turning = PartTurning {
+        gyroscopic: optional("gyroscopic", &raw.gyroscopic, Property::Skew)?,
+        spin: optional("spin", &raw.spin, Property::Symmetric)?,
+        stress_stiffening: optional("stress_stiffening", &raw.stress_stiffening, Property::Symmetric)?,
+    };
+    let given = [("rayleigh_alpha_per_s", raw.rayleigh_alpha_per_s), ("rayleigh_beta_s", raw.rayleigh_beta_s)];
+    for (key, value) in given {
+        within(&toml, &field(key), value, value >= 0.0, "at least 0")?;
+    }
     let interface = interface(&toml, &field("interface_nodes"), &raw.interface_nodes, &nodes, &raw.nodes)?;
     let damping_ratio = raw
         .damping_ratio
@@ -84,6 +112,8 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
         part: FullPart { name: name.to_owned(), mass, stiffness },
         geometry: PartGeometry { nodes_m: nodes.positions, rows, interface, damping_ratio },
         row_of,
+        rayleigh: given.map(|(_, value)| value),
+        turning,
     })
 }
 
@@ -191,21 +221,52 @@ fn extension(name: &str) -> String {
     Path::new(name).extension().map(|extension| extension.to_string_lossy().to_lowercase()).unwrap_or_default()
 }
 
-/// Reads a symmetric matrix and checks it.
+/// Reads a mass matrix and checks it.
 ///
 /// # Errors
 /// [`RigError`].
-pub fn symmetric(files: &mut Files, field: &str, file: &str, mass: bool) -> Result<SparseMatrix, RigError> {
+pub fn mass(files: &mut Files, field: &str, file: &str) -> Result<SparseMatrix, RigError> {
     let matrix = matrix(files, field, file, 1.0, None)?;
     let read = Read { field: field.to_owned(), file, matrix, row_of: &HashMap::new() };
-    read.check(files, mass)?;
+    read.check(files, Property::Mass)?;
     Ok(read.matrix)
 }
 
 impl Read<'_> {
-    /// Checks that the matrix is symmetric, has a complete diagonal, and that no diagonal entry is negative (or zero,
-    /// for a mass matrix).
-    fn check(&self, files: &mut Files, mass: bool) -> Result<(), RigError> {
+    /// Checks that the matrix has the `property`.
+    fn check(&self, files: &mut Files, property: Property) -> Result<(), RigError> {
+        if let Property::Stiffness | Property::Mass = property {
+            self.check_diagonal(files, property == Property::Mass)?;
+        }
+        let view = self.matrix.as_ref();
+        let (sign, kind, minus) = match property {
+            Property::Stiffness | Property::Mass | Property::Symmetric => (1.0, "symmetric", ""),
+            Property::Skew => (-1.0, "skew-symmetric", " with opposite signs"),
+        };
+        let largest = self.matrix.val().iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+        let limit = SYMMETRY_TOLERANCE * largest;
+        for column in 0..self.matrix.ncols() {
+            for (row, &value) in view.row_idx_of_col(column).zip(view.val_of_col(column)) {
+                let mirrored = view.get(column, row).copied().unwrap_or(0.0);
+                if (value - sign * mirrored).abs() > limit {
+                    let problem = format!(
+                        "at row {}, column {} is {value}, but {mirrored} at row {}, column {}",
+                        row + 1,
+                        column + 1,
+                        column + 1,
+                        row + 1
+                    );
+                    let limit = format!("a {kind} matrix; mirrored entries{minus} may differ by {limit:.3e}");
+                    return Err(self.at_line(files, (row, column), problem, &limit));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that the matrix has a complete diagonal, and that no entry there is negative (or zero, for a mass
+    /// matrix).
+    fn check_diagonal(&self, files: &mut Files, mass: bool) -> Result<(), RigError> {
         let view = self.matrix.as_ref();
         for row in 0..self.matrix.nrows() {
             let listed = view.get(row, row).copied();
@@ -218,24 +279,6 @@ impl Read<'_> {
                 let limit = if mass { "more than 0 on the diagonal" } else { "at least 0 on the diagonal" };
                 let value = format!("at row {}, column {} is {value}", row + 1, row + 1);
                 return Err(self.at_line(files, (row, row), value, limit));
-            }
-        }
-        let largest = self.matrix.val().iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
-        let limit = SYMMETRY_TOLERANCE * largest;
-        for column in 0..self.matrix.ncols() {
-            for (row, &value) in view.row_idx_of_col(column).zip(view.val_of_col(column)) {
-                let mirrored = view.get(column, row).copied().unwrap_or(0.0);
-                if (value - mirrored).abs() > limit {
-                    let problem = format!(
-                        "at row {}, column {} is {value}, but {mirrored} at row {}, column {}",
-                        row + 1,
-                        column + 1,
-                        column + 1,
-                        row + 1
-                    );
-                    let limit = format!("a symmetric matrix; mirrored entries may differ by {limit:.3e}");
-                    return Err(self.at_line(files, (row, column), problem, &limit));
-                }
             }
         }
         Ok(())

@@ -45,6 +45,13 @@ pub struct RawPart {
     pub interface_nodes: Vec<u64>,
     pub damping_ratio: Option<f64>,
     #[serde(default)]
+    pub rayleigh_alpha_per_s: f64,
+    #[serde(default)]
+    pub rayleigh_beta_s: f64,
+    pub gyroscopic: Option<String>,
+    pub spin: Option<String>,
+    pub stress_stiffening: Option<String>,
+    #[serde(default)]
     pub units: Units,
 }
 

@@ -84,7 +84,10 @@ pub(super) fn build(
         law: Law::Constant,
     };
     let law = settings.contact_law;
-    let model = Model::new(k, vec![free], vec![], law, None)
+    // Both sides have all coordinates.
+    let terms = super::modal::terms(file, k, pad, Some((disc, 0)))?;
+    let stiffness = std::iter::once(free).chain(terms.stiffness).collect();
+    let model = Model::new(k, stiffness, terms.damping, law, None)
         .and_then(|model| model.with_contact(&contact))
         .and_then(|model| match &pad.data.mass_share {
             // The model takes its coordinates in ascending frequency.
@@ -107,6 +110,7 @@ pub(super) fn build(
         },
     ];
     contents.extend(free_frequencies("vectors", omega_rad_s));
+    contents.extend(terms.contents);
     let shapes = ["pad", "disc"]
         .map(|name| SideShapes { name, first_coordinate: 0, phi: Mat::zeros(0, k), nodes_m: vec![] })
         .into();

@@ -28,11 +28,21 @@ pub(super) fn build(
     let pad = substructure(file, "pad", pad)?;
     let disc = disc.map(|disc| substructure(file, "disc", disc)).transpose()?;
     let pairs = contact_pairs(file, contacts, &pad.modes, disc.as_ref().map(|disc| &disc.modes))?;
-    assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), pairs, settings, None)
+    assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), pairs, settings, None, Terms::default())
 }
 
-/// Builds the model of both sides: `K = diag(ω²)` and `C = diag(2 ζ ω)`, joined by the contact pairs. If `residual` is
-/// given, the contact acts in series with the residual flexibility of the truncated modes.
+/// Terms of a model in addition to modes, modal damping ratios and contact pairs.
+#[derive(Default)]
+pub(super) struct Terms {
+    pub stiffness: Vec<Term>,
+    pub damping: Vec<Term>,
+    /// A line for [`super::Rig::describe`] each.
+    pub contents: Vec<String>,
+}
+
+/// Builds the model of both sides: `K = diag(ω²)` and `C = diag(2 ζ ω)`, with `terms`, joined by the contact pairs. If
+/// `residual` is given, the contact acts in series with the residual flexibility of the truncated modes.
+#[expect(clippy::too_many_arguments, reason = "what a rig of modes is made of, each given once")]
 pub(super) fn assemble(
     file: &str,
     kind: &str,
@@ -41,6 +51,7 @@ pub(super) fn assemble(
     pairs: ContactPairs,
     settings: &Settings,
     residual: Option<ResidualFlexibility>,
+    terms: Terms,
 ) -> Result<Built, RigError> {
     let contact_law = settings.contact_law;
     let sides: Vec<&Side> = std::iter::once(pad).chain(disc).collect();
@@ -54,7 +65,10 @@ pub(super) fn assemble(
     let stiffness = diagonal(&|k| omega[k] * omega[k]);
     let damping = diagonal(&|k| 2.0 * zeta[k] * omega[k]);
     let pad_modes = pad.modes.omega_rad_s.len();
-    let model = Model::new(n, vec![stiffness], vec![damping], contact_law, Some(pad_modes))
+    let (mut stiffness, mut damping) = (vec![stiffness], vec![damping]);
+    stiffness.extend(terms.stiffness);
+    damping.extend(terms.damping);
+    let model = Model::new(n, stiffness, damping, contact_law, Some(pad_modes))
         .and_then(|model| match &residual {
             Some(residual) => model.with_flexible_contact(&pairs, residual, settings.largest_friction()),
             None => model.with_contact(&pairs),
@@ -90,6 +104,7 @@ pub(super) fn assemble(
         contact_law.slope_s_per_m,
         if contact_law.lateral_damping { "on" } else { "off" }
     ));
+    contents.extend(terms.contents);
     let mut first_coordinate = 0;
     let mut shapes = vec![];
     for (name, side) in ["pad", "disc"].into_iter().zip(sides) {

@@ -2,7 +2,7 @@
 
 use faer::Mat;
 
-use super::inline::{Side, assemble};
+use super::inline::{Side, Terms, assemble};
 use super::modal_data::{ModalData, Residual};
 use super::patch::{self, Pair};
 use super::raw::{RawPatch, RawResidual, RawRig, RawSubstructure};
@@ -10,8 +10,8 @@ use super::residual::{self, SideResidual};
 use super::settings::{MOST_COORDINATES, Settings, at_most, spread};
 use super::source::Source;
 use super::{Built, RigError, basis, npz};
-use crate::physics::{ContactPairs, ResidualFlexibility};
-use crate::reduction::Modes;
+use crate::physics::{ContactPairs, Law, ResidualFlexibility, Term};
+use crate::reduction::{Modes, PartMatrices};
 
 /// A substructure and its selected modes, in ascending frequency.
 pub(super) struct Part {
@@ -104,13 +104,57 @@ fn apart(
         Some(residual) => (Some(residual.flexibility), Some((residual.description, residual.band_max_hz))),
         None => (None, None),
     };
+    let pad_modes = pad.selected.len();
+    let n = pad_modes + disc.map_or(0, |disc| disc.selected.len());
+    let terms = terms(file, n, pad, disc.map(|disc| (disc, pad_modes)))?;
     let (kind, disc) = ("modal substructures (kind 2)", disc.map(|disc| &disc.side));
-    let mut built = assemble(file, kind, &pad.side, disc, contact, settings, flexibility)?;
+    let mut built = assemble(file, kind, &pad.side, disc, contact, settings, flexibility, terms)?;
     if let Some((description, band_max_hz)) = description {
         built.contents.push(description);
         built.band_max_hz = Some(band_max_hz);
     }
     Ok(built)
+}
+
+/// The terms of damping and rotation of pad and disc, over `n` coordinates: `C += C_part + 2 Ω H`, `K -= Ω² L`. `disc`
+/// is the disc with its first coordinate.
+///
+/// # Errors
+/// [`RigError::Kind`] if the pad has terms of rotation: in its own frame it does not turn.
+pub(super) fn terms(file: &str, n: usize, pad: &Part, disc: Option<(&Part, usize)>) -> Result<Terms, RigError> {
+    let PartMatrices { gyroscopic, spin, .. } = &pad.data.matrices;
+    if gyroscopic.is_some() || spin.is_some() {
+        let value = "holds `gyroscopic` or `spin` of the pad, which does not turn".to_owned();
+        let (file, field, limit) = (file.to_owned(), "pad.modal".to_owned(), "these arrays in disc.modal".to_owned());
+        return Err(RigError::Kind { file, field, value, limit });
+    }
+    let mut terms = Terms::default();
+    for (name, part, first) in std::iter::once(("pad", pad, 0)).chain(disc.map(|(disc, first)| ("disc", disc, first))) {
+        let range = first..first + part.selected.len();
+        let over_all = |matrix: &Mat<f64>, factor: f64| {
+            Mat::from_fn(n, n, |i, j| {
+                let inside = range.contains(&i) && range.contains(&j);
+                if inside { factor * matrix[(part.selected[i - first], part.selected[j - first])] } else { 0.0 }
+            })
+        };
+        let PartMatrices { damping, gyroscopic, spin } = &part.data.matrices;
+        if let Some(damping) = damping {
+            terms.damping.push(Term { matrix: over_all(damping, 1.0), law: Law::Constant });
+            terms.contents.push(format!("damping    matrix of the {name}"));
+        }
+        if let Some(gyroscopic) = gyroscopic {
+            terms.damping.push(Term { matrix: over_all(gyroscopic, 2.0), law: Law::DiscSpeed { power: 1 } });
+        }
+        if let Some(spin) = spin {
+            terms.stiffness.push(Term { matrix: over_all(spin, -1.0), law: Law::DiscSpeed { power: 2 } });
+        }
+        let known = [("gyroscopic", gyroscopic), ("spin", spin)];
+        let known: Vec<&str> = known.into_iter().filter_map(|(term, matrix)| matrix.as_ref().map(|_| term)).collect();
+        if !known.is_empty() {
+            terms.contents.push(format!("rotation   {} terms of the {name}", known.join(" and ")));
+        }
+    }
+    Ok(terms)
 }
 
 impl Part {

@@ -3,6 +3,7 @@
 use faer::Mat;
 
 use super::{RigError, npz, uff};
+use crate::reduction::PartMatrices;
 
 /// Modes of a part at the `c` nodes of its contact interface.
 #[derive(Clone, Debug, PartialEq)]
@@ -18,6 +19,8 @@ pub struct ModalData {
     /// This part's contribution `V_pᵀ M_p V_p` to the unit mass matrix, `i×i`, if given. Used if the columns of `phi`
     /// are motions of both parts.
     pub mass_share: Option<Mat<f64>>,
+    /// Damping and rotation of this part, `i×i`.
+    pub matrices: PartMatrices,
     /// Residual flexibility of the modes above these, if given.
     pub residual: Option<Residual>,
 }

@@ -11,6 +11,7 @@ use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 use super::RigError;
 use super::modal_data::{ModalData, Residual};
 use crate::physics::ResidualFlexibility;
+use crate::reduction::PartMatrices;
 
 /// Largest total size of the arrays of one archive, bytes.
 const MOST_BYTES: u64 = 1 << 30;
@@ -19,7 +20,7 @@ const MOST_BYTES: u64 = 1 << 30;
 const MOST_TIMES_ARCHIVE: (u64, u64) = (100, 64 << 20);
 /// Longest accepted header of an array, bytes; numpy writes 128.
 const LONGEST_HEADER: usize = 1024;
-/// Largest difference of two mirrored entries of a residual matrix, relative to its largest entry: the
+/// Largest difference of two mirrored entries of a symmetric or skew matrix, relative to its largest entry: the
 /// rounding of ten printed digits.
 const SYMMETRY: f64 = 1e-9;
 
@@ -61,8 +62,8 @@ pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<Residual
     Ok(ResidualFlexibility { normal, sliding, inertia: both("inertia")? })
 }
 
-/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and the optional arrays `damping_ratio` (i), `mass_share`
-/// (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
+/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and the optional arrays `damping_ratio` (i), `mass_share`,
+/// `damping`, `gyroscopic` and `spin` (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
 ///
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
@@ -88,6 +89,16 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     let mass_share = archive.array("mass_share", |shape| {
         expected(shape == [modes, modes], format!("({modes}, {modes}), by omega_rad_s"))
     })?;
+    let mut square = |name: &str, sign: f64| -> Result<Option<Mat<f64>>, RigError> {
+        let array = archive
+            .array(name, |shape| expected(shape == [modes, modes], format!("({modes}, {modes}), by omega_rad_s")))?;
+        array.map(|array| mirrored(file, name, modes, &array, sign)).transpose()
+    };
+    let matrices = PartMatrices {
+        damping: square("damping", 1.0)?,
+        gyroscopic: square("gyroscopic", -1.0)?,
+        spin: square("spin", 1.0)?,
+    };
     let mut residual = |name: &str| {
         let size = 3 * count;
         archive.array(name, |shape| expected(shape == [size, size], format!("({size}, {size}), by nodes_m")))
@@ -105,6 +116,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
         nodes_m,
         damping_ratio: damping.map(|damping| damping.values),
         mass_share,
+        matrices,
         residual,
     })
 }
@@ -114,20 +126,13 @@ fn symmetric_residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> R
     let names = ["residual_flexibility", "residual_inertia"];
     let symmetric = |name: &str, array: Array| -> Result<Mat<f64>, RigError> {
         let size = 3 * count;
-        let at = |row: usize, column: usize| array.values[row * size + column];
-        let limit = SYMMETRY * array.values.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
         for row in 0..size {
-            if at(row, row) < 0.0 {
-                let value = format!("is {}", at(row, row));
-                return Err(refuse(file, &format!("{name}[{row}, {row}]"), &value, "at least 0"));
-            }
-            if let Some(column) = (0..row).find(|&column| (at(row, column) - at(column, row)).abs() > limit) {
-                let value = format!("is {}, its mirror image {}", at(row, column), at(column, row));
-                let limit = format!("a difference of at most {limit:.3e}: a symmetric matrix");
-                return Err(refuse(file, &format!("{name}[{row}, {column}]"), &value, &limit));
+            let value = array.values[row * size + row];
+            if value < 0.0 {
+                return Err(refuse(file, &format!("{name}[{row}, {row}]"), &format!("is {value}"), "at least 0"));
             }
         }
-        Ok(Mat::from_fn(size, size, |row, column| 0.5 * (at(row, column) + at(column, row))))
+        mirrored(file, name, size, &array, 1.0)
     };
     match arrays {
         [None, None] => Ok(None),
@@ -137,6 +142,21 @@ fn symmetric_residual(file: &str, count: usize, arrays: [Option<Array>; 2]) -> R
             inertia: inertia.map(|inertia| symmetric(names[1], inertia)).transpose()?,
         })),
     }
+}
+
+/// The `size×size` matrix of an array, checked to be symmetric (`sign` 1) or skew (`sign` -1) and made exactly so.
+fn mirrored(file: &str, name: &str, size: usize, array: &Array, sign: f64) -> Result<Mat<f64>, RigError> {
+    let at = |row: usize, column: usize| array.values[row * size + column];
+    let limit = SYMMETRY * array.values.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+    let kind = if sign > 0.0 { "symmetric" } else { "skew-symmetric" };
+    for row in 0..size {
+        if let Some(column) = (0..=row).find(|&column| (at(row, column) - sign * at(column, row)).abs() > limit) {
+            let value = format!("is {}, its mirror image {}", at(row, column), at(column, row));
+            let limit = format!("a difference of at most {limit:.3e}: a {kind} matrix");
+            return Err(refuse(file, &format!("{name}[{row}, {column}]"), &value, &limit));
+        }
+    }
+    Ok(Mat::from_fn(size, size, |row, column| 0.5 * (at(row, column) + sign * at(column, row))))
 }
 
 fn refuse(file: &str, field: &str, value: &str, limit: &str) -> RigError {

@@ -9,7 +9,7 @@ use faer::{Mat, c64};
 use squealcast::export::{ModalSide, modal_rig};
 use squealcast::full_model::FullModelFile;
 use squealcast::physics::{OperatingPoint, Solver, Spectrum, Vectors};
-use squealcast::reduction::{Counted, FullSolver, FullVectors, match_roots};
+use squealcast::reduction::{Counted, FullSolver, FullVectors, PartMatrices, match_roots};
 use squealcast::rig::{Rig, RigFile};
 
 const NODES_M: [[f64; 3]; 4] = [[0.1, 0.0, 0.0], [0.12, 0.0, 0.01], [0.1, 0.0, 0.02], [0.09, 0.0, -0.01]];
@@ -20,7 +20,8 @@ fn shape(rows: usize, columns: usize, seed: f64) -> Mat<f64> {
 
 fn side(name: &str, omega_rad_s: Vec<f64>, phi: Mat<f64>) -> ModalSide<'_> {
     let nodes_m = NODES_M.to_vec();
-    ModalSide { name, nodes_m, omega_rad_s, phi, residual: None, damping_ratio: None, mass_share: None }
+    let matrices = PartMatrices::default();
+    ModalSide { name, nodes_m, omega_rad_s, phi, residual: None, damping_ratio: None, mass_share: None, matrices }
 }
 
 /// A rig of two sides with the tables `more` in addition to the patch.
@@ -45,7 +46,16 @@ fn a_shared_basis_of_both_sides_modes_is_the_same_rig() {
     let law = "[load]\nexponent = 0.3\n[friction]\nlateral_damping = true\nslope_s_per_m = -0.01\n";
     let (pad, disc) = (shape(12, 3, 0.2), shape(12, 2, 1.1));
     let (of_pad, of_disc) = (vec![300.0, 900.0, 1500.0], vec![500.0, 1100.0]);
-    let sides = [side("pad", of_pad.clone(), pad.clone()), side("disc", of_disc.clone(), disc.clone())];
+    let mut sides = [side("pad", of_pad.clone(), pad.clone()), side("disc", of_disc.clone(), disc.clone())];
+    let symmetric = |n: usize, size: f64| Mat::from_fn(n, n, |i, j| size * (1.0 + (i + j) as f64).sin());
+    let gyroscopic = Mat::from_fn(2, 2, |i, j| 1.5 * (i as f64 - j as f64));
+    sides[0].matrices.damping = Some(symmetric(3, 4.0));
+    sides[1].matrices = PartMatrices {
+        damping: Some(symmetric(2, 3.0)),
+        gyroscopic: Some(gyroscopic.clone()),
+        spin: Some(symmetric(2, 2.0)),
+    };
+    let of_sides = sides.each_ref().map(|side| side.matrices.clone());
     let apart = Rig::from_files(&rig_of(law, &sides)).unwrap();
     let all = [of_pad, of_disc].concat();
     let wide = |phi: &Mat<f64>, first: usize| {
@@ -53,6 +63,16 @@ fn a_shared_basis_of_both_sides_modes_is_the_same_rig() {
         Mat::from_fn(12, 5, |i, j| inside(j).map_or(0.0, |j| phi[(i, j)]))
     };
     let mut sides = [side("pad", all.clone(), wide(&pad, 0)), side("disc", all, wide(&disc, 3))];
+    for (side, (matrices, first)) in sides.iter_mut().zip(of_sides.iter().zip([0, 3])) {
+        let wide = |matrix: &Option<Mat<f64>>| {
+            matrix.as_ref().map(|matrix| {
+                let inside = |i: usize| i.checked_sub(first).filter(|i| *i < matrix.nrows());
+                Mat::from_fn(5, 5, |i, j| inside(i).zip(inside(j)).map_or(0.0, |(i, j)| matrix[(i, j)]))
+            })
+        };
+        let PartMatrices { damping, gyroscopic, spin } = matrices;
+        side.matrices = PartMatrices { damping: wide(damping), gyroscopic: wide(gyroscopic), spin: wide(spin) };
+    }
     sides[0].mass_share = Some(Mat::from_fn(5, 5, |i, j| f64::from(u8::from(i == j && i < 3))));
     let shared = Rig::from_files(&rig_of(&format!("{law}[basis]\nshared = true\n"), &sides)).unwrap();
     assert!(shared.describe().contains("shared basis (kind 2)"), "{}", shared.describe());
@@ -67,6 +87,18 @@ fn a_shared_basis_of_both_sides_modes_is_the_same_rig() {
             assert!((shares[0] - shares[1]).abs() < 1e-9 && (0.0..=1.0).contains(&shares[1]), "{p:?}: {shares:?}");
         }
     }
+    // The disc alone, contact open: `2 Ω H` couples its two modes, `-Ω² L` and the damping act on them.
+    let p = OperatingPoint { normal_load_n: 0.0, disc_speed_rad_s: 40.0, friction_coefficient: 0.0 };
+    let with_speed = modes(&apart, &p);
+    let at_rest = modes(&apart, &OperatingPoint { disc_speed_rad_s: 0.0, ..p });
+    assert!((with_speed[1] - at_rest[1]).norm() > 1.0, "{with_speed:?} {at_rest:?}");
+    let mut of_pad = [side("pad", vec![300.0], shape(12, 1, 0.2)), side("disc", vec![300.0], shape(12, 1, 1.0))];
+    of_pad[0].matrices.spin = Some(symmetric(1, 1.0));
+    let told = Rig::from_files(&rig_of("", &of_pad)).map(|_| ()).unwrap_err().to_string();
+    assert!(told.contains("pad.modal") && told.contains("does not turn"), "{told}");
+    of_pad[0].matrices = PartMatrices { gyroscopic: Some(symmetric(1, 1.0)), ..PartMatrices::default() };
+    let told = Rig::from_files(&rig_of("", &of_pad)).map(|_| ()).unwrap_err().to_string();
+    assert!(told.contains("`gyroscopic[0, 0]`") && told.contains("a skew-symmetric matrix"), "{told}");
     assert_eq!(shared.shapes.len(), 2);
     assert!(shared.shapes.iter().all(|shapes| shapes.first_coordinate == 0 && shapes.phi.ncols() == 5));
     assert_eq!(shared.model.pad_modes(), None);

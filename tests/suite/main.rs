@@ -15,6 +15,7 @@ mod examples;
 mod file_systems;
 mod forger;
 mod full_model;
+mod full_scipy;
 mod identify;
 mod identities;
 mod modal_rigs;

@@ -18,7 +18,7 @@ use faer::sparse::Triplet;
 use faer::{Mat, MatRef};
 
 use super::dense::symmetric_eigen;
-use super::sparse::{SparseMatrix, entries, is_symmetric, times, times_transposed};
+use super::sparse::{SparseMatrix, entries, is_symmetric, times, times_transposed, weighted_sum, worst_asymmetry};
 use super::{ReductionError, project_dense, project_sparse, whiten};
 use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Term};
 
@@ -89,6 +89,28 @@ pub struct Projected {
     pub stiffness: Vec<Term>,
     /// Terms of `C` in the coordinates of the basis, without contact pairs.
     pub damping: Vec<Term>,
+}
+
+/// Matrices of a part that turns with the disc speed in the frame of the other part, all `n×n`, kg.
+#[derive(Clone, Debug, Default)]
+pub struct PartTurning {
+    /// `H`, skew: the force is `2 Ω H u̇`.
+    pub gyroscopic: Option<SparseMatrix>,
+    /// `L`, symmetric: the force is `-Ω² L u`.
+    pub spin: Option<SparseMatrix>,
+    /// `K_σ`, symmetric: the force is `Ω² K_σ u`, of the stress of the centrifugal load at 1 rad/s.
+    pub stress_stiffening: Option<SparseMatrix>,
+}
+
+/// Damping and rotation of a part in mass-normalised coordinates, all `k×k`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PartMatrices {
+    /// Constant damping, 1/s, symmetric.
+    pub damping: Option<Mat<f64>>,
+    /// `Φᵀ H Φ`, skew.
+    pub gyroscopic: Option<Mat<f64>>,
+    /// `Φᵀ (L - K_σ) Φ`, symmetric.
+    pub spin: Option<Mat<f64>>,
 }
 
 /// A sum over contact pairs, `leftᵀ diag(weights) right`, with one row of `left` and `right` per pair.
@@ -300,34 +322,83 @@ impl FullModel {
         whitening.back(&mut mixed);
         let basis = basis * &mixed;
         let terms = |terms: &[SparseTerm]| -> Vec<Term> {
-            terms
-                .iter()
-                .map(|term| Term {
-                    matrix: project_sparse(&term.matrix, basis.as_ref(), is_symmetric(&term.matrix)),
-                    law: term.law.clone(),
-                })
-                .collect()
+            let on_basis = |term: &SparseTerm| Term { matrix: on_basis(term, basis.as_ref()), law: term.law.clone() };
+            terms.iter().map(on_basis).collect()
         };
         let (stiffness, damping) = (terms(&self.stiffness), terms(&self.damping));
         let contact = self.contact.as_ref().map(|contact| contact.on(basis.as_ref()));
         Ok(Projected { basis, omega_squared, contact, stiffness, damping })
     }
 
-    /// The terms of `K` and of `C` that lie within the rows `range` of a part, in the coordinates `phi` of its modes,
-    /// `Φᵀ A Φ`; `phi` has a row for each of the part.
-    pub fn terms_of_part(&self, range: std::ops::Range<usize>, phi: MatRef<'_, f64>) -> [Vec<Term>; 2] {
+    /// Adds the terms of part `part`, which turns with the disc speed `Ω`: `2 Ω H` to `C` and `Ω² (K_σ - L)` to `K`.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Shape`; `Factorisation` if memory is insufficient.
+    pub fn turn(&mut self, part: usize, turning: &PartTurning) -> Result<(), ReductionError> {
+        let PartTurning { gyroscopic, spin, stress_stiffening } = turning;
+        if let Some(gyroscopic) = gyroscopic {
+            let term = self.within_part(part, &[(2.0, gyroscopic)], Law::DiscSpeed { power: 1 })?;
+            self.damping.push(term);
+        }
+        let of_spin = [(-1.0, spin), (1.0, stress_stiffening)];
+        let of_spin: Vec<(f64, &SparseMatrix)> =
+            of_spin.into_iter().filter_map(|(factor, matrix)| Some((factor, matrix.as_ref()?))).collect();
+        if !of_spin.is_empty() {
+            let term = self.within_part(part, &of_spin, Law::DiscSpeed { power: 2 })?;
+            self.stiffness.push(term);
+        }
+        Ok(())
+    }
+
+    /// Adds Rayleigh damping `α M + β K` of part `part` to `C`; `alpha_per_s` in 1/s, `beta_s` in s.
+    ///
+    /// # Errors
+    /// [`ReductionError::Factorisation`] if memory is insufficient.
+    pub fn damp(&mut self, part: usize, alpha_per_s: f64, beta_s: f64) -> Result<(), ReductionError> {
+        let FullPart { mass, stiffness, .. } = &self.parts[part];
+        let terms = [(alpha_per_s, mass), (beta_s, stiffness)];
+        let terms: Vec<(f64, &SparseMatrix)> = terms.into_iter().filter(|(factor, _)| *factor != 0.0).collect();
+        if !terms.is_empty() {
+            let term = self.within_part(part, &terms, Law::Constant)?;
+            self.damping.push(term);
+        }
+        Ok(())
+    }
+
+    /// A term over the rows of all parts: the weighted sum of matrices of part `part`.
+    fn within_part(&self, part: usize, sum: &[(f64, &SparseMatrix)], law: Law) -> Result<SparseTerm, ReductionError> {
+        let (n, offset) = (self.dimension(), self.offsets()[part]);
+        let sum = weighted_sum(self.parts[part].mass.nrows(), sum)?;
+        let triplets: Vec<_> = entries(&sum).map(|(i, j, value)| Triplet::new(offset + i, offset + j, value)).collect();
+        let matrix =
+            SparseMatrix::try_new_from_triplets(n, n, &triplets).map_err(|error| ReductionError::Factorisation {
+                what: self.parts[part].name.clone(),
+                reason: format!("a term could not be stored: {error:?}"),
+            })?;
+        Ok(SparseTerm { matrix, law })
+    }
+
+    /// Damping and rotation of part `part` in the coordinates `phi`, with a row for each of the part.
+    pub fn matrices_of_part(&self, part: usize, phi: MatRef<'_, f64>) -> PartMatrices {
+        if self.stiffness.is_empty() && self.damping.is_empty() {
+            return PartMatrices::default();
+        }
+        let (offset, rows) = (self.offsets()[part], self.parts[part].mass.nrows());
+        let range = offset..offset + rows;
         let mut basis = Mat::zeros(self.dimension(), phi.ncols());
-        basis.subrows_mut(range.start, range.len()).copy_from(phi);
-        let within = |term: &&SparseTerm| {
-            entries(&term.matrix).all(|(row, column, _)| range.contains(&row) && range.contains(&column))
+        basis.subrows_mut(offset, rows).copy_from(phi);
+        let within =
+            |term: &SparseTerm| entries(&term.matrix).all(|(i, j, _)| range.contains(&i) && range.contains(&j));
+        let sum = |terms: &[SparseTerm], factor: f64, counts: &dyn Fn(&Law) -> bool| {
+            let of_part = terms.iter().filter(|term| counts(&term.law) && within(term));
+            let projected = of_part.map(|term| faer::Scale(factor) * on_basis(term, basis.as_ref()));
+            projected.reduce(|sum, matrix| sum + matrix)
         };
-        [&self.stiffness, &self.damping].map(|terms| {
-            let on_modes = |term: &SparseTerm| Term {
-                matrix: project_sparse(&term.matrix, basis.as_ref(), is_symmetric(&term.matrix)),
-                law: term.law.clone(),
-            };
-            terms.iter().filter(within).map(on_modes).collect()
-        })
+        PartMatrices {
+            damping: sum(&self.damping, 1.0, &|law| matches!(law, Law::Constant)),
+            gyroscopic: sum(&self.damping, 0.5, &|law| matches!(law, Law::DiscSpeed { power: 1 })),
+            spin: sum(&self.stiffness, -1.0, &|law| matches!(law, Law::DiscSpeed { power: 2 })),
+        }
     }
 
     /// `M X`.
@@ -387,6 +458,22 @@ impl FullModel {
     }
 }
 
+/// `Vᵀ A V` of a term, exactly symmetric or skew if `A` is up to rounding.
+fn on_basis(term: &SparseTerm, basis: MatRef<'_, f64>) -> Mat<f64> {
+    let matrix = project_sparse(&term.matrix, basis, is_symmetric(&term.matrix));
+    if turns(&term.law) && worst_asymmetry(&term.matrix, -1.0).is_none() { skew_part(&matrix) } else { matrix }
+}
+
+/// Whether a law is a power of the disc speed. Only matrices of such terms are made exactly skew.
+fn turns(law: &Law) -> bool {
+    matches!(law, Law::DiscSpeed { .. })
+}
+
+/// `(A - Aᵀ) / 2`.
+fn skew_part(matrix: &Mat<f64>) -> Mat<f64> {
+    Mat::from_fn(matrix.nrows(), matrix.ncols(), |i, j| 0.5 * (matrix[(i, j)] - matrix[(j, i)]))
+}
+
 impl FullContact {
     /// The contact pairs in the coordinates of a basis, `n×k`.
     pub fn on(&self, basis: MatRef<'_, f64>) -> ContactPairs {
@@ -426,14 +513,14 @@ impl Projected {
         whitening.back(&mut mixed);
         let turn = coefficients * &mixed;
         let terms = |terms: &[Term]| -> Vec<Term> {
-            let is_symmetric = |m: &Mat<f64>| (0..m.ncols()).all(|j| (0..j).all(|i| m[(i, j)] == m[(j, i)]));
-            terms
-                .iter()
-                .map(|term| Term {
-                    matrix: project_dense(term.matrix.as_ref(), turn.as_ref(), is_symmetric(&term.matrix)),
-                    law: term.law.clone(),
-                })
-                .collect()
+            let mirrors =
+                |m: &Mat<f64>, sign: f64| (0..m.ncols()).all(|j| (0..=j).all(|i| m[(i, j)] == sign * m[(j, i)]));
+            let turned = |term: &Term| {
+                let matrix = project_dense(term.matrix.as_ref(), turn.as_ref(), mirrors(&term.matrix, 1.0));
+                let skew = turns(&term.law) && mirrors(&term.matrix, -1.0);
+                Term { matrix: if skew { skew_part(&matrix) } else { matrix }, law: term.law.clone() }
+            };
+            terms.iter().map(turned).collect()
         };
         let contact = self.contact.as_ref().map(|pairs| ContactPairs {
             normal: &pairs.normal * &turn,

@@ -53,7 +53,7 @@ pub use compare::{
 };
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::{GIB, ReductionError};
-pub use full_model::{FullContact, FullModel, FullPart, Projected, SparseRow, SparseTerm};
+pub use full_model::{FullContact, FullModel, FullPart, PartMatrices, PartTurning, Projected, SparseRow, SparseTerm};
 pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
 pub use matching::{Counted, RootMatch, match_roots};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};

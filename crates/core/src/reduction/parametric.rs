@@ -667,6 +667,7 @@ fn hstack(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
 mod tests {
     use super::*;
     use crate::physics::ContactLaw;
+    use crate::reduction::PartTurning;
     use crate::reduction::test_models::chains;
 
     const LAW: ContactLaw =
@@ -724,6 +725,46 @@ mod tests {
                 assert!(error <= 1.1e-6, "{:?} {lambda}: {error:e}", held.point);
             }
         }
+    }
+
+    /// The same for a disc that turns, with Rayleigh damping of the pad: rotation shifts the roots by far more than the
+    /// tolerance, and its projection stays exactly skew.
+    #[test]
+    fn a_basis_holds_its_tolerance_over_the_speed_of_a_turning_disc() {
+        let mut full = chains(0.0, ContactLaw::default());
+        let n = full.parts[1].mass.nrows();
+        let triplet = |i: usize, j: usize, value: f64| faer::sparse::Triplet::new(i, j, value);
+        let mut entries = [vec![], vec![]];
+        for i in 0..n - 1 {
+            let value = 1.0 + (i as f64).sin();
+            entries[0].extend([triplet(i, i + 1, value), triplet(i + 1, i, -value)]);
+            entries[1].push(triplet(i, i, value));
+        }
+        let [gyroscopic, spin] = entries.map(|list| SparseMatrix::try_new_from_triplets(n, n, &list).ok());
+        full.turn(1, &PartTurning { gyroscopic, spin, stress_stiffening: None }).unwrap();
+        full.damp(0, 0.5, 1e-7).unwrap();
+        let mut request = request(1e-6);
+        request.range.disc_speed_rad_s = [1.0, 60.0];
+        let basis = parametric_basis(&full, &mut solver(&full), &request, &mut |_| {}).unwrap();
+        assert!(basis.worst() <= 1e-6 && basis.projected.omega_squared.len() < 70);
+        let model = basis.projected.model(full.contact_law).unwrap();
+        let modes =
+            |p: &OperatingPoint| oscillating(&Solver::new(model.dimension()).solve(&model, p, Vectors::None).unwrap());
+        let mut errors = vec![];
+        for (speed, friction) in [(0.0, 0.0), (7.0, 0.9), (60.0, 0.35)] {
+            let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: speed, friction_coefficient: friction };
+            for lambda in modes(&p).into_iter().filter(|lambda| request.counted.counts(*lambda)) {
+                errors.push(newton_step(&full, &p, lambda) / lambda.norm());
+            }
+        }
+        let worst = errors.iter().copied().fold(0.0, f64::max);
+        assert!(errors.len() > 15 && worst < 2e-6, "{} roots, {worst:e}", errors.len());
+        let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 1.0, friction_coefficient: 0.0 };
+        let [slow, fast] = [1.0, 60.0].map(|disc_speed_rad_s| modes(&OperatingPoint { disc_speed_rad_s, ..p }));
+        assert!((slow[3] - fast[3]).norm() > 1e-3 * slow[3].norm(), "{} {}", slow[3], fast[3]);
+        let gyroscopic = full.matrices_of_part(1, basis.projected.basis.subrows(40, n)).gyroscopic.unwrap();
+        assert_eq!(gyroscopic, faer::Scale(-1.0) * gyroscopic.transpose());
+        assert!(gyroscopic.norm_max() > 0.0);
     }
 
     #[test]

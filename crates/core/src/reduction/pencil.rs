@@ -404,7 +404,7 @@ fn check(field: &str, what: &str, matrix: &SparseMatrix, n: usize) -> Result<(),
     if let Some((row, column, value)) = entries(matrix).find(|(_, _, value)| !value.is_finite()) {
         return Err(ReductionError::NotFinite { what, row, column, value });
     }
-    match worst_asymmetry(matrix) {
+    match worst_asymmetry(matrix, 1.0) {
         None => Ok(()),
         Some((row, column, value, mirrored, limit)) => {
             Err(ReductionError::Unsymmetric { what, row, column, value, mirrored, limit })

@@ -18,17 +18,18 @@ pub(super) fn entries(matrix: &SparseMatrix) -> impl Iterator<Item = (usize, usi
 
 /// Whether the matrix is symmetric up to [`SYMMETRY_TOLERANCE`] times its largest entry.
 pub fn is_symmetric(matrix: &SparseMatrix) -> bool {
-    worst_asymmetry(matrix).is_none()
+    worst_asymmetry(matrix, 1.0).is_none()
 }
 
 /// First pair of mirrored entries that differ by more than [`SYMMETRY_TOLERANCE`] times the largest entry:
-/// `(row, column, value, mirrored, limit)`.
-pub(super) fn worst_asymmetry(matrix: &SparseMatrix) -> Option<(usize, usize, f64, f64, f64)> {
+/// `(row, column, value, mirrored, limit)`. `sign` is 1 for a symmetric matrix and -1 for a skew one, whose mirrored
+/// entries have the opposite sign.
+pub(super) fn worst_asymmetry(matrix: &SparseMatrix, sign: f64) -> Option<(usize, usize, f64, f64, f64)> {
     let limit = SYMMETRY_TOLERANCE * entries(matrix).fold(0.0, |largest: f64, (_, _, value)| largest.max(value.abs()));
     let view = matrix.as_ref();
     entries(matrix).find_map(|(row, column, value)| {
         let mirrored = view.get(column, row).copied().unwrap_or(0.0);
-        ((value - mirrored).abs() > limit).then_some((row, column, value, mirrored, limit))
+        ((value - sign * mirrored).abs() > limit).then_some((row, column, value, mirrored, limit))
     })
 }
 
