@@ -4,12 +4,14 @@
 //! they are measured with SQUEALCAST_MEASURE=1. `squealcast bench` measures the same routes against their error, and LAPACK.
 
 use std::hint::black_box;
+use std::sync::Arc;
 
 use criterion::{Criterion, criterion_group, criterion_main};
+use squealcast::contact::PressureLaw;
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::chart::build::{ChartOptions, build};
 use squealcast::physics::{Chart, ContactLaw, Model, OperatingPoint, Root, Solver, Summary, Traces, Vectors};
-use squealcast::proof::synthetic::{Synthetic, Uniform, rig};
+use squealcast::proof::synthetic::{STIFFNESS_N_PER_M, Synthetic, Uniform, parts, rig, statics};
 
 const BAND_MAX_HZ: f64 = 5000.0;
 /// More than caches keep of one condition for the next.
@@ -91,5 +93,47 @@ fn routes(criterion: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, routes);
+/// A dense prediction with a contact state beside one with springs that are always closed, 160 modes and 294 pairs.
+fn states(criterion: &mut Criterion) {
+    let contact_law = ContactLaw::default();
+    let synthetic = Synthetic { modes: 160, pairs: 294, damping_ratio: 0.0, contact_law, seed: 1 };
+    let parts = parts(&synthetic).expect("the rig is well formed");
+    let stiffness = STIFFNESS_N_PER_M / synthetic.pairs as f64;
+    // Equally stiff where a pair carries its share of 500 N.
+    let share = 500.0 / synthetic.pairs as f64;
+    let laws = [
+        ("linear law", PressureLaw::Linear { stiffness }),
+        ("exponential law", PressureLaw::Exponential { pressure: 0.1 * share, roughness_m: share / stiffness }),
+    ];
+    let mut uniform = Uniform::new(3);
+    let points: Vec<OperatingPoint> = (0..CONDITIONS)
+        .map(|_| OperatingPoint { normal_load_n: 500.0 + 200.0 * uniform.draw(), ..point(0.3 + 0.3 * uniform.draw()) })
+        .collect();
+    let mut group = criterion.benchmark_group("160 modes, 294 pairs");
+    let closed = parts.free.clone().with_contact(&parts.pairs).expect("the rig is well formed");
+    let mut models = vec![("always closed", closed)];
+    for (name, law) in laws {
+        let statics = Arc::new(statics(&parts, law, 1e-6).expect("the statics are well formed"));
+        let model = parts.free.clone().with_steady_contact(&parts.pairs, statics.clone(), None);
+        models.push((name, model.expect("the rig is well formed")));
+        let mut next = points.iter().cycle();
+        group.sample_size(10).bench_function(format!("state, {name}"), |bencher| {
+            bencher.iter(|| next.next().map(|p| black_box(statics.state(p.normal_load_n, p.friction_coefficient))));
+        });
+    }
+    let mut solver = Solver::new(synthetic.modes);
+    for (name, model) in &models {
+        for p in &points[..4] {
+            let spectrum = solver.solve(model, p, Vectors::Both).expect("it solves");
+            assert!(spectrum.roots.iter().all(|root| root.residual < 1e-12));
+        }
+        let mut next = points.iter().cycle();
+        group.sample_size(10).bench_function(format!("dense, {name}"), |bencher| {
+            bencher.iter(|| next.next().map(|p| black_box(solver.solve(model, p, Vectors::Both))));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, routes, states);
 criterion_main!(benches);

@@ -15,7 +15,7 @@ macro_rules! note {
     ($($text:tt)*) => { $crate::text::notes::line(format_args!($($text)*)) };
 }
 
-pub use squealcast_core::{fem, physics, proof, reduction};
+pub use squealcast_core::{contact, fem, physics, proof, reduction};
 pub use squealcast_msgs as msgs;
 
 pub mod bus;

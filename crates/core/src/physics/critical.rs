@@ -13,6 +13,7 @@ use super::model::Model;
 use super::solver::Solver;
 use super::spectrum::{Root, Spectrum, Vectors};
 use super::stability_map::{MapError, MapOptions, Node, StabilityMap, mirror};
+use super::steady_contact::Jumps;
 use super::tracking::{Continuation, tracked};
 
 /// Cause of an instability.
@@ -64,22 +65,28 @@ const CLEARANCE: f64 = 0.25;
 /// Whether the interval between two neighbouring spectra hides nothing: no pair merges without the ends showing it,
 /// and no growth rate crosses its threshold and returns.
 ///
-/// Pair discriminants and growth rates are interpolated by cubics through values and sensitivities at both ends.
-pub(super) fn is_resolved(left: &Spectrum, right: &Spectrum, link: &Continuation, options: &MapOptions) -> bool {
+/// Pair discriminants and growth rates are interpolated by cubics through values and sensitivities at both ends. Where
+/// contact pairs open or close in the interval, roots jump: see [`Jumps`].
+pub(super) fn is_resolved(
+    left: &Spectrum,
+    right: &Spectrum,
+    link: &Continuation,
+    jumps: &Jumps,
+    options: &MapOptions,
+) -> bool {
     let step = right.point.friction_coefficient - left.point.friction_coefficient;
     let branches: Vec<(usize, usize)> = (0..tracked(right))
         .filter_map(|j| link.source[j].map(|i| (i, j)))
         .filter(|&(i, j)| is_judged(&left.roots[i], options) || is_judged(&right.roots[j], options))
         .collect();
     let no_hidden_growth = |&(i, j): &(usize, usize)| {
-        left.undamped || growth_is_resolved(left, i, right, j, step, options.instability_threshold)
+        left.undamped || growth_is_resolved(left, i, right, j, step, options.instability_threshold, jumps.of(i, j))
     };
     branches.iter().all(|branch| partner_is_kept(left, right, branch, link))
         && branches.iter().all(no_hidden_growth)
-        && branches
-            .iter()
-            .enumerate()
-            .all(|(k, &first)| branches[..k].iter().all(|&second| pair_is_resolved(left, right, first, second, step)))
+        && branches.iter().enumerate().all(|(k, &first)| {
+            branches[..k].iter().all(|&second| pair_is_resolved(left, right, first, second, step, jumps))
+        })
 }
 
 /// Whether the partner of a branch changes at most once within the interval. A coupled pair may separate or two
@@ -114,10 +121,12 @@ fn pair_is_resolved(
     first: (usize, usize),
     second: (usize, usize),
     step: f64,
+    jumps: &Jumps,
 ) -> bool {
     let ends = [(left, first.0, second.0), (right, first.1, second.1)];
+    let jump = jumps.of(first.0, first.1) + jumps.of(second.0, second.1);
     let far = |&(spectrum, i, j): &(&Spectrum, usize, usize)| {
-        let reach = step * (spectrum.friction_sensitivity[i].norm() + spectrum.friction_sensitivity[j].norm());
+        let reach = step * (spectrum.friction_sensitivity[i].norm() + spectrum.friction_sensitivity[j].norm()) + jump;
         (spectrum.roots[i].square - spectrum.roots[j].square).norm() > 4.0 * reach
     };
     if ends.iter().all(far) {
@@ -128,6 +137,11 @@ fn pair_is_resolved(
         let half_slope = 0.5 * (spectrum.friction_sensitivity[i] - spectrum.friction_sensitivity[j]);
         (half * half, 2.0 * half * half_slope)
     });
+    match jumps.pairs() {
+        0 => {}
+        1 => return parts_are_resolved([d_left, slope_left * step], [d_right, slope_right * step]),
+        _ => return false,
+    }
     let samples: Vec<c64> =
         (1..=SAMPLES).map(|k| hermite(d_left, slope_left, d_right, slope_right, step, fraction(k))).collect();
     let least = samples.iter().map(|d| d.norm()).fold(f64::INFINITY, f64::min);
@@ -146,13 +160,30 @@ fn pair_is_resolved(
         && path.windows(2).all(|pair| (pair[1] - pair[0]) * rises > 0.0)
 }
 
+/// Whether a discriminant that jumps once in an interval keeps away from zero on both sides of the jump, wherever it
+/// is. Given are its value at each end, and its change over the interval if it did not jump.
+fn parts_are_resolved(left: [c64; 2], right: [c64; 2]) -> bool {
+    let keeps = |[value, change]: [c64; 2]| change.norm() <= (1.0 - CLEARANCE) * value.norm();
+    keeps(left) && keeps(right)
+}
+
 /// Whether the growth rate of one branch stays on its side of the threshold or crosses it exactly once.
-fn growth_is_resolved(left: &Spectrum, i: usize, right: &Spectrum, j: usize, step: f64, threshold: f64) -> bool {
+fn growth_is_resolved(
+    left: &Spectrum,
+    i: usize,
+    right: &Spectrum,
+    j: usize,
+    step: f64,
+    threshold: f64,
+    jump: f64,
+) -> bool {
     let slope = |spectrum: &Spectrum, k: usize| spectrum.friction_sensitivity[k] / (2.0 * spectrum.roots[k].lambda);
     let (from, to) = (left.roots[i].lambda, right.roots[j].lambda);
     let (slope_from, slope_to) = (slope(left, i), slope(right, j));
     // The error of the trapezoidal rule serves as the uncertainty of the cubic through the same data.
     let off = (to - from - 0.5 * step * (slope_from + slope_to)).re.abs();
+    // A jump of `λ²`, as one of `λ`.
+    let off = if jump > 0.0 { off + jump / (2.0 * from.norm().min(to.norm())) } else { off };
     let limit = threshold * from.norm().max(to.norm());
     let samples = (1..=SAMPLES).map(|k| hermite(from, slope_from, to, slope_to, step, fraction(k)).re);
     match (from.re > limit, to.re > limit) {

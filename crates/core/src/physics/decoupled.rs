@@ -67,6 +67,7 @@ impl Division {
                 (0..model.dimension).all(|i| i == k || matrix[(i, k)] == 0.0 && matrix[(k, i)] == 0.0)
             };
             terms().all(|known| zero(&known.term.matrix))
+                && model.steady.as_ref().is_none_or(|contact| contact.is_free_of(k))
         };
         let (alone, places): (Vec<_>, Vec<_>) = (0..model.dimension).partition(|&k| is_alone(k));
         if alone.is_empty() || places.is_empty() {
@@ -85,6 +86,7 @@ impl Division {
             pad_mass: model.pad_mass.as_ref().map(part),
             contact_law: model.contact_law,
             has_contact: model.has_contact,
+            steady: model.steady.as_ref().map(|contact| Box::new(contact.part(&places))),
             division: None,
         };
         Some(Self { coupled: coupled.finished(), places, alone })
@@ -228,7 +230,8 @@ mod tests {
             for step in 0..50 {
                 let p = REFERENCE.with_friction(0.04 * f64::from(step));
                 let damped = damping_ratio > 0.0;
-                let whole = solver.solve_coupled(&model, &p, Vectors::Both, damped).expect("it solves");
+                let here = model.at(&p).expect("a finite operating point");
+                let whole = solver.solve_coupled(&model, &here, Vectors::Both, damped).expect("it solves");
                 let parted = solver.solve(&model, &p, Vectors::Both).expect("it solves");
                 assert_eq!((parted.roots.len(), parted.mode_count), (whole.roots.len(), whole.mode_count));
                 for (j, root) in parted.roots.iter().enumerate() {

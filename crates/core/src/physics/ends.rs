@@ -5,12 +5,14 @@
 //! method started from the extrapolated end converges in two or three solves.
 
 use super::critical::{Window, WindowKind};
-use super::model::{Model, Parameter};
+use super::model::{Model, ModelError, Parameter};
 use super::operating_point::OperatingPoint;
 use super::sensitivity::{of_pair, of_roots};
 use super::solver::Solver;
-use super::spectrum::{Spectrum, Vectors};
+use super::spectrum::{SolveError, Spectrum, Vectors};
 use super::stability_map::{MapError, StabilityMap};
+use super::steady_contact::{Situation, changed_pairs};
+use crate::contact::StateSlope;
 
 /// Largest relative change of load and speed over which ends are extrapolated with an error bound.
 pub const REACH: f64 = 0.02;
@@ -25,6 +27,9 @@ const LONGEST: f64 = 0.1;
 /// same vector; near it the discriminant has the same slope, and the difference of the roots has more accurate
 /// digits.
 const OFFSET: f64 = 1e-10;
+/// Error of the closure of a contact pair, relative to the largest closure: the residual of a state is at most 1e-11,
+/// and near rounding in most.
+const CLOSURE_ERROR: f64 = 1e-12;
 /// The conditions other than friction that change while a rig runs; ends are extrapolated in them.
 const MOVING: [Parameter; 2] = [Parameter::Load, Parameter::Speed];
 
@@ -39,6 +44,8 @@ enum Condition {
     Square(u32),
     /// The static root of a damped model that is nearest to zero.
     Static,
+    /// The closure of this contact pair: the pair opens or closes, and the roots jump.
+    Jump(usize),
     /// No condition: the end is the edge of the searched range.
     Edge,
 }
@@ -92,6 +99,11 @@ pub struct Bounded {
 }
 
 impl End {
+    /// Whether the roots jump here, because a contact pair opens or closes.
+    pub fn is_jump(&self) -> bool {
+        matches!(self.condition, Condition::Jump(_))
+    }
+
     /// The end extrapolated by `moved`, the change of load (N) and speed (rad/s).
     ///
     /// `μ + μ' δ + δᵀ μ'' δ / 2`. The error bound adds the magnitude of the quadratic term; it is NaN unless
@@ -237,9 +249,15 @@ impl Search<'_> {
         }
         let map = self.map;
         let unknown = End { error: f64::NAN, ..end };
-        let Some(mut end) = self.carry(&end, mu, &map.point)?.filter(|found| (found.mu - mu).abs() < 1e-6) else {
-            return Ok(unknown);
-        };
+        let near = |found: &End| (found.mu - mu).abs() < 1e-6;
+        let mut found = self.carry(&end, mu, &map.point)?.filter(near);
+        if found.is_none()
+            && let Some(pair) = self.opening(mu)
+        {
+            let end = End { condition: Condition::Jump(pair), ..end };
+            found = self.carry(&end, mu, &map.point)?.filter(near);
+        }
+        let Some(mut end) = found else { return Ok(unknown) };
         // The value of the map is at least as accurate.
         end.mu = mu;
         let depends: [bool; 2] = self.model.depends_on_load_and_speed().into();
@@ -256,6 +274,15 @@ impl Search<'_> {
             end.curvature[k] = std::array::from_fn(|j| (there.slope[j] - end.slope[j]) / step);
         }
         Ok(end)
+    }
+
+    /// The contact pair that opens or closes at `mu`, at the load and speed of the map.
+    fn opening(&self, mu: f64) -> Option<usize> {
+        let step = OFFSET * mu.abs().max(1e-3);
+        let beside = |mu: f64| self.model.at(&self.map.point.with_friction(mu)).ok()?.state;
+        let (below, above) = (beside(mu - step)?, beside(mu + step)?);
+        let size = |pair: &usize| below.closure_m[*pair].abs();
+        changed_pairs(&below, &above).min_by(|a, b| size(a).total_cmp(&size(b)))
     }
 
     /// The condition that is zero at the end `mu` of `window`.
@@ -319,7 +346,14 @@ impl Search<'_> {
 
     /// The condition at `mu`; `None` if a root is not found or its derivatives are not available.
     fn value(&mut self, condition: Condition, point: &OperatingPoint, mu: f64) -> Result<Option<Value>, MapError> {
-        let spectrum = self.solve(point, mu)?;
+        if let Condition::Jump(pair) = condition {
+            return Ok(self.model.at(&point.with_friction(mu)).ok().and_then(|here| closure(&here, pair)));
+        }
+        let spectrum = match self.solve(point, mu) {
+            // There is no end without a state of steady sliding.
+            Err(MapError::Solve { source: SolveError::Model(ModelError::State(_)), .. }) => return Ok(None),
+            solved => solved?,
+        };
         let ids = self.map.identify(&spectrum);
         let find = |id: u32| ids.iter().position(|&other| other == Some(id));
         let single = |k: usize| {
@@ -343,9 +377,20 @@ impl Search<'_> {
                     single(k).map(|(slope, error)| Value { f: spectrum.roots[k].lambda.re, slope, error })
                 })
             }
-            Condition::Edge => None,
+            Condition::Jump(_) | Condition::Edge => None,
         })
     }
+}
+
+/// The closure of a contact pair, which is zero where the pair opens or closes.
+fn closure(here: &Situation, pair: usize) -> Option<Value> {
+    let state = here.state()?;
+    let sign = here.point().disc_speed_rad_s.signum();
+    let along = |slope: &StateSlope| slope.closure[pair];
+    let (friction, stiffness) = (sign * along(&state.per_friction), along(&state.per_stiffness));
+    let slope = [friction, along(&state.per_load), 0.0, stiffness, 0.0];
+    let largest = state.closure_m.iter().fold(0.0, |largest: f64, closure| largest.max(closure.abs()));
+    Some(Value { f: state.closure_m[pair], slope, error: CLOSURE_ERROR * largest })
 }
 
 #[cfg(test)]

@@ -16,6 +16,9 @@ pub mod sensitivity;
 pub(crate) mod solver;
 pub mod spectrum;
 pub mod stability_map;
+mod steady_contact;
+#[cfg(test)]
+mod steady_tests;
 pub mod summary;
 #[cfg(test)]
 pub(crate) mod test_models;
@@ -34,5 +37,6 @@ pub use operating_point::{ContactState, OperatingPoint};
 pub use solver::Solver;
 pub use spectrum::{Root, RootError, SolveError, Spectrum, Vectors};
 pub use stability_map::{MapError, MapOptions, NextWindow, StabilityMap};
+pub use steady_contact::Situation;
 pub use summary::{Mode, Summary};
 pub use traces::{Exact, Traces};

@@ -11,7 +11,9 @@ use faer::{Mat, MatRef};
 
 use super::decoupled::Division;
 use super::operating_point::{ContactState, OperatingPoint};
+use super::steady_contact::{Response, Situation, SteadyContact, signed_friction};
 use crate::chebyshev;
+use crate::contact::StaticsError;
 
 /// A constant matrix times a scalar law of the operating point.
 #[derive(Clone, Debug)]
@@ -147,6 +149,25 @@ pub struct ContactPairs {
     pub radius_m: Vec<f64>,
 }
 
+impl ContactPairs {
+    /// Checks that every pair is at a distance from the disc's axis.
+    fn check_radius(&self) -> Result<(), ModelError> {
+        match self.radius_m.iter().position(|radius_m| radius_m.is_nan() || *radius_m <= 0.0) {
+            Some(pair) => Err(ModelError::Radius { pair, radius_m: self.radius_m[pair] }),
+            None => Ok(()),
+        }
+    }
+
+    /// `1 / r` of each pair.
+    ///
+    /// # Errors
+    /// [`ModelError::Radius`].
+    pub(super) fn inverse_radius(&self) -> Result<Vec<f64>, ModelError> {
+        self.check_radius()?;
+        Ok(self.radius_m.iter().map(|radius_m| radius_m.recip()).collect())
+    }
+}
+
 /// The parameter of a derivative.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Parameter {
@@ -198,6 +219,19 @@ pub enum ModelError {
     FlexibilityFit { range: f64, degrees: usize, value: f64, limit: f64 },
     #[error("contact pair {pair}: radius_m is {radius_m}, expected more than 0 for lateral damping")]
     Radius { pair: usize, radius_m: f64 },
+    #[error(
+        "contact pair {pair}: damping {damping} N·s/m with stiffness {stiffness} N/m; with a contact state the damping \
+         of a pair is proportional to its stiffness"
+    )]
+    StateDamping { pair: usize, stiffness: f64, damping: f64 },
+    #[error("residual inertia with a contact state, expected residual flexibility only")]
+    StateInertia,
+    #[error(
+        "[load] exponent {exponent} with a contact state, expected 0: the law of the contact state gives the stiffness"
+    )]
+    StateLoadExponent { exponent: f64 },
+    #[error("contact state: {0}")]
+    State(#[source] StaticsError),
     #[error(
         "operating point ({normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}) is not finite"
     )]
@@ -261,6 +295,8 @@ pub struct Model {
     pub(super) has_contact: bool,
     pub(super) pad_modes: Option<usize>,
     pub(super) pad_mass: Option<Mat<f64>>,
+    /// Contact whose springs follow the state of steady sliding. The other contact terms are then absent.
+    pub(super) steady: Option<Box<SteadyContact>>,
     /// Division into coupled and uncoupled coordinates; `None` if all are coupled, and also if none are. Computed by
     /// [`Model::finished`], with which every constructor ends.
     pub(super) division: Option<Box<Division>>,
@@ -302,6 +338,7 @@ impl Model {
             has_contact: false,
             pad_modes,
             pad_mass: None,
+            steady: None,
             division: None,
         };
         Ok(model.finished())
@@ -360,12 +397,8 @@ impl Model {
         let each_n_0 = 1.0 / count.max(1) as f64;
         let mut inverse_radius = vec![0.0; count];
         if self.contact_law.lateral_damping {
-            for (pair, &radius_m) in pairs.radius_m.iter().enumerate() {
-                if radius_m.is_nan() || radius_m <= 0.0 {
-                    return Err(ModelError::Radius { pair, radius_m });
-                }
-                inverse_radius[pair] = each_n_0 / radius_m;
-            }
+            pairs.check_radius()?;
+            inverse_radius = pairs.radius_m.iter().map(|radius_m| each_n_0 / radius_m).collect();
         }
         let slope = vec![each_n_0 * self.contact_law.slope_s_per_m; count];
         let (t, b) = (pairs.sliding.as_ref(), pairs.lateral.as_ref());
@@ -435,6 +468,7 @@ impl Model {
             damping: constant(&self.damping),
             has_contact: false,
             pad_mass: self.pad_mass.clone(),
+            steady: None,
             division: None,
             ..*self
         };
@@ -467,23 +501,67 @@ impl Model {
     /// Writes `K(p)` and `C(p)`, both `n×n`, and returns their properties.
     ///
     /// # Errors
-    /// [`ModelError::PointNotFinite`], [`ModelError::LawNotFinite`].
+    /// [`ModelError::PointNotFinite`], [`ModelError::LawNotFinite`], [`ModelError::State`].
     pub fn assemble(
         &self,
         p: &OperatingPoint,
         stiffness: &mut Mat<f64>,
         damping: &mut Mat<f64>,
     ) -> Result<Structure, ModelError> {
-        if !p.is_finite() {
-            return Err(ModelError::PointNotFinite {
-                normal_load_n: p.normal_load_n,
-                disc_speed_rad_s: p.disc_speed_rad_s,
-                friction_coefficient: p.friction_coefficient,
-            });
-        }
+        self.assemble_at(&self.at(p)?, stiffness, damping)
+    }
+
+    /// Does the same as [`Model::assemble`] for an operating point whose contact state is known.
+    ///
+    /// # Errors
+    /// [`ModelError::LawNotFinite`].
+    pub fn assemble_at(
+        &self,
+        here: &Situation,
+        stiffness: &mut Mat<f64>,
+        damping: &mut Mat<f64>,
+    ) -> Result<Structure, ModelError> {
+        self.assemble_known(here, self.response(here).as_ref(), stiffness, damping)
+    }
+
+    /// Writes `K` and `C` to `values`, and to `slopes` their derivatives with respect to the friction coefficient.
+    ///
+    /// # Errors
+    /// [`ModelError::LawNotFinite`].
+    pub(super) fn assemble_with_friction_slopes(
+        &self,
+        here: &Situation,
+        values: [&mut Mat<f64>; 2],
+        slopes: [&mut Mat<f64>; 2],
+    ) -> Result<Structure, ModelError> {
+        let response = self.response(here);
+        let ([stiffness, damping], [stiffness_slope, damping_slope]) = (values, slopes);
+        let structure = self.assemble_known(here, response.as_ref(), stiffness, damping)?;
+        self.derive_known(here, response.as_ref(), Parameter::Friction, stiffness_slope, damping_slope)?;
+        Ok(structure)
+    }
+
+    fn response<'a>(&'a self, here: &'a Situation) -> Option<Response<'a>> {
+        let (contact, state) = self.steady.as_ref().zip(here.state.as_ref())?;
+        Some(contact.response(&here.point, state))
+    }
+
+    fn assemble_known(
+        &self,
+        here: &Situation,
+        response: Option<&Response<'_>>,
+        stiffness: &mut Mat<f64>,
+        damping: &mut Mat<f64>,
+    ) -> Result<Structure, ModelError> {
+        let p = &here.point;
         let coefficient = |law: &Law| self.coefficient(law, p);
-        let (_, symmetric_stiffness) = sum(&self.stiffness, coefficient, p, stiffness)?;
-        let (damped, _) = sum(&self.damping, coefficient, p, damping)?;
+        let (_, mut symmetric_stiffness) = sum(&self.stiffness, coefficient, p, stiffness)?;
+        let (mut damped, _) = sum(&self.damping, coefficient, p, damping)?;
+        if let (Some(contact), Some(response)) = (&self.steady, response) {
+            contact.add(p, response, stiffness, damping);
+            symmetric_stiffness &= signed_friction(p) == 0.0;
+            damped |= contact.is_damped(p);
+        }
         Ok(Structure { damped, symmetric_stiffness })
     }
 
@@ -491,7 +569,7 @@ impl Model {
     /// differentiated by central differences, which are exact up to rounding for a linear law.
     ///
     /// # Errors
-    /// [`ModelError::LawNotFinite`].
+    /// [`ModelError::PointNotFinite`], [`ModelError::LawNotFinite`], [`ModelError::State`].
     pub fn assemble_derivative(
         &self,
         p: &OperatingPoint,
@@ -499,9 +577,39 @@ impl Model {
         stiffness: &mut Mat<f64>,
         damping: &mut Mat<f64>,
     ) -> Result<(), ModelError> {
+        self.assemble_derivative_at(&self.at(p)?, parameter, stiffness, damping)
+    }
+
+    /// Does the same as [`Model::assemble_derivative`] for an operating point whose contact state is known. The state
+    /// follows the parameter.
+    ///
+    /// # Errors
+    /// [`ModelError::LawNotFinite`].
+    pub fn assemble_derivative_at(
+        &self,
+        here: &Situation,
+        parameter: Parameter,
+        stiffness: &mut Mat<f64>,
+        damping: &mut Mat<f64>,
+    ) -> Result<(), ModelError> {
+        self.derive_known(here, self.response(here).as_ref(), parameter, stiffness, damping)
+    }
+
+    fn derive_known(
+        &self,
+        here: &Situation,
+        response: Option<&Response<'_>>,
+        parameter: Parameter,
+        stiffness: &mut Mat<f64>,
+        damping: &mut Mat<f64>,
+    ) -> Result<(), ModelError> {
+        let p = &here.point;
         let derivative = |law: &Law| self.derivative(law, p, parameter);
         sum(&self.stiffness, derivative, p, stiffness)?;
         sum(&self.damping, derivative, p, damping)?;
+        if let (Some(contact), Some(response)) = (&self.steady, response) {
+            contact.add_derivative(p, response, parameter, stiffness, damping);
+        }
         Ok(())
     }
 
@@ -598,6 +706,7 @@ impl Model {
     /// Whether any damping term has a nonzero coefficient at `p`.
     pub fn is_damped(&self, p: &OperatingPoint) -> bool {
         self.damping.iter().any(|known| self.coefficient(&known.term.law, p) != 0.0)
+            || self.steady.as_ref().is_some_and(|contact| contact.is_damped(p))
     }
 
     /// Number of terms with a coefficient of zero at `p`; their matrices need not be added.
@@ -627,7 +736,8 @@ impl Model {
     /// Whether any coefficient depends on the load, and whether any depends on the speed, apart from opening,
     /// stopping and reversing.
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
-        let (mut load, mut speed) = (false, false);
+        let mut load = self.steady.is_some();
+        let mut speed = self.steady.as_ref().is_some_and(|contact| contact.depends_on_speed());
         for known in self.stiffness.iter().chain(&self.damping) {
             match &known.term.law {
                 Law::Constant | Law::ContactDamping | Law::FrictionDamping | Law::FrictionChebyshev { .. } => {}
@@ -655,7 +765,9 @@ impl Model {
             Law::Custom(custom) => !custom.depends_on_load && !custom.depends_on_speed,
         };
         let rest = || self.stiffness.iter().chain(&self.damping).filter(|known| !constant(&known.term.law));
-        rest().count() > 0 && rest().all(|known| matches!(known.term.law, Law::LateralFriction))
+        self.steady.is_none()
+            && rest().count() > 0
+            && rest().all(|known| matches!(known.term.law, Law::LateralFriction))
     }
 }
 

@@ -254,7 +254,7 @@ impl Operator {
     fn new(model: &Model, spectrum: &Spectrum) -> Result<Self, ModelError> {
         let n = model.dimension();
         let (mut stiffness, mut damping) = (Mat::zeros(n, n), Mat::zeros(n, n));
-        model.assemble(&spectrum.point, &mut stiffness, &mut damping)?;
+        model.assemble_at(&spectrum.situation(), &mut stiffness, &mut damping)?;
         let scale = (!spectrum.undamped).then(|| displacement_scale(stiffness.as_ref()));
         Ok(Self { stiffness, damping, scale })
     }
@@ -360,9 +360,10 @@ fn blocks(
     let image = operator.apply(chosen.as_ref());
     let n = model.dimension();
     let (mut stiffness, mut damping) = (Mat::zeros(n, n), Mat::zeros(n, n));
+    let here = spectrum.situation();
     let mut slopes = vec![];
     for parameter in Parameter::ALL {
-        model.assemble_derivative(&spectrum.point, parameter, &mut stiffness, &mut damping)?;
+        model.assemble_derivative_at(&here, parameter, &mut stiffness, &mut damping)?;
         slopes.push(operator.forced(&stiffness, &damping, chosen.as_ref()));
     }
     let backward_error = ROUNDING * f64::EPSILON * spectrum.matrix_norm;

@@ -13,9 +13,10 @@ use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par, c64};
 
 use super::dense_eigen::{Dense, Packed, Packing, packing};
-use super::model::{Model, Parameter};
+use super::model::Model;
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, SolveError, Spectrum, Vectors, order, square_root};
+use super::steady_contact::Situation;
 
 /// Residual above which a root is rejected.
 pub const RESIDUAL_LIMIT: f64 = 1e-9;
@@ -91,10 +92,11 @@ impl Solver {
     /// [`SolveError::Trace`] and [`SolveError::Residual`] if the result fails a check.
     pub fn solve(&mut self, model: &Model, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, SolveError> {
         let damped = model.is_damped(p);
+        let here = model.at(p)?;
         match &model.division {
-            None => self.solve_coupled(model, p, vectors, damped),
+            None => self.solve_coupled(model, &here, vectors, damped),
             Some(division) => {
-                let coupled = self.solve_coupled(&division.coupled, p, vectors, damped)?;
+                let coupled = self.solve_coupled(&division.coupled, &here, vectors, damped)?;
                 division.complete(model, coupled, vectors)
             }
         }
@@ -105,17 +107,21 @@ impl Solver {
     pub(super) fn solve_coupled(
         &mut self,
         model: &Model,
-        p: &OperatingPoint,
+        here: &Situation,
         vectors: Vectors,
         damped: bool,
     ) -> Result<Spectrum, SolveError> {
         if self.stiffness.nrows() != model.dimension() {
             *self = Self::new(model.dimension());
         }
-        let structure = model.assemble(p, &mut self.stiffness, &mut self.damping)?;
-        if vectors == Vectors::Both {
-            model.assemble_derivative(p, Parameter::Friction, &mut self.stiffness_slope, &mut self.damping_slope)?;
-        }
+        let values = [&mut self.stiffness, &mut self.damping];
+        let structure = if vectors == Vectors::Both {
+            let slopes = [&mut self.stiffness_slope, &mut self.damping_slope];
+            model.assemble_with_friction_slopes(here, values, slopes)?
+        } else {
+            let [stiffness, damping] = values;
+            model.assemble_at(here, stiffness, damping)?
+        };
         let stiffness_norm = self.stiffness.norm_l2();
         let (problem, matrix_norm) = if damped {
             self.assemble_state();
@@ -142,7 +148,8 @@ impl Solver {
         bound_errors(&mut raw, problem == Problem::Damped, matrix_norm);
         let (shapes, left) = self.vectors(&raw, problem);
         Ok(Spectrum {
-            point: *p,
+            point: here.point,
+            state: here.state.clone(),
             mode_count: raw.iter().filter(|r| r.root.oscillates()).count(),
             undamped: problem != Problem::Damped,
             matrix_norm,

@@ -1,10 +1,14 @@
 //! Roots of the characteristic equation with their error bounds, and the spectrum of all roots at one operating
 //! point.
 
+use std::sync::Arc;
+
 use faer::{Mat, c64};
 
 use super::model::ModelError;
 use super::operating_point::OperatingPoint;
+use super::steady_contact::Situation;
+use crate::contact::SteadyState;
 
 /// One root of the characteristic equation.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -113,6 +117,8 @@ pub enum Vectors {
 pub struct Spectrum {
     /// The operating point.
     pub point: OperatingPoint,
+    /// The state of steady sliding there, if the model's contact has one.
+    pub state: Option<Arc<SteadyState>>,
     /// All roots, in the order given above.
     pub roots: Vec<Root>,
     /// Number of modes.
@@ -146,6 +152,11 @@ pub enum SolveError {
 }
 
 impl Spectrum {
+    /// The operating point with its contact state.
+    pub(super) fn situation(&self) -> Situation {
+        Situation { point: self.point, state: self.state.clone() }
+    }
+
     /// The modes: roots with `ω > 0`, ascending in frequency.
     pub fn modes(&self) -> &[Root] {
         &self.roots[..self.mode_count]

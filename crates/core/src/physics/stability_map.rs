@@ -6,11 +6,12 @@ use faer::c64;
 
 use super::critical::{self, Window};
 use super::ends::{Ends, NearestEnd};
-use super::model::Model;
+use super::model::{Model, ModelError};
 use super::numbering::Numbering;
 use super::operating_point::OperatingPoint;
 use super::solver::Solver;
 use super::spectrum::{SolveError, Spectrum, Vectors};
+use super::steady_contact::Jumps;
 use super::tracking::{Continuation, continue_roots, tracked};
 
 /// Number of equal intervals the range of friction coefficients is divided into before refinement.
@@ -83,6 +84,17 @@ pub struct StabilityMap {
     pub resolution: f64,
     /// False if refinement stopped at the maximum number of nodes.
     pub complete: bool,
+    /// Where steady sliding ends inside the range; the map ends there.
+    pub sliding_ends: Option<SlidingEnd>,
+}
+
+/// The friction coefficient beyond which a contact has no state of steady sliding.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SlidingEnd {
+    /// The largest friction coefficient that has a state, to the resolution of the map.
+    pub mu: f64,
+    /// Why there is none beyond it.
+    pub reason: ModelError,
 }
 
 /// The window of instability whose end is nearest to the present friction coefficient: the one that squeals, or
@@ -112,13 +124,14 @@ impl StabilityMap {
         if !(mu_min.is_finite() && mu_max.is_finite() && mu_min <= 0.0 && mu_max >= 0.0) {
             return Err(MapError::Range { mu_min, mu_max });
         }
+        let grid = first_grid(mu_min, mu_max, FIRST_INTERVALS);
+        let resolution = (mu_max - mu_min) * 0.5f64.powi(HALVINGS);
+        let (grid, sliding_ends) = with_states(model, point, grid, resolution)?;
         let mut solve = |mu: f64| {
             let result = solver.solve(model, &point.with_friction(mu), Vectors::Both);
             result.map_err(|source| MapError::Solve { mu, source })
         };
-        let resolution = (mu_max - mu_min) * 0.5f64.powi(HALVINGS);
-        let mut ahead: Vec<Spectrum> =
-            first_grid(mu_min, mu_max, FIRST_INTERVALS).into_iter().rev().map(&mut solve).collect::<Result<_, _>>()?;
+        let mut ahead: Vec<Spectrum> = grid.into_iter().rev().map(&mut solve).collect::<Result<_, _>>()?;
         let mut spectra = Vec::with_capacity(ahead.len());
         let mut links: Vec<Continuation> = vec![];
         let mut complete = true;
@@ -126,7 +139,8 @@ impl StabilityMap {
         while let (Some(left), Some(right)) = (spectra.last(), ahead.last()) {
             let (from, to) = (left.point.friction_coefficient, right.point.friction_coefficient);
             let link = continue_roots(left, right);
-            let resolved = link.clear && critical::is_resolved(left, right, &link, options);
+            let jumps = Jumps::between(model, left, right);
+            let resolved = link.clear && critical::is_resolved(left, right, &link, &jumps, options);
             let full = spectra.len() + ahead.len() >= MAX_NODES;
             if resolved || to - from <= resolution || full {
                 complete &= resolved || !full;
@@ -139,8 +153,8 @@ impl StabilityMap {
         let nodes = identify_all(spectra, &links);
         let ends = Ends { point: *point, windows: vec![] };
         let (numbering, band_max_hz) = (Numbering::new(&nodes), options.band_max_hz);
-        let mut map =
-            Self { point: *point, nodes, numbering, band_max_hz, windows: vec![], ends, resolution, complete };
+        let (point, windows) = (*point, vec![]);
+        let mut map = Self { point, nodes, numbering, band_max_hz, windows, ends, resolution, complete, sliding_ends };
         if options.windows {
             map.windows = critical::windows(model, solver, &map, options)?;
             map.ends = Ends::of_map(model, solver, &map)?;
@@ -191,6 +205,7 @@ impl StabilityMap {
         for window in &self.windows {
             words.extend([window.mu_from.to_bits(), window.mu_to.map_or(u64::MAX, f64::to_bits)]);
         }
+        words.extend(self.sliding_ends.iter().map(|end| end.mu.to_bits()));
         words.extend(self.ends.words());
         words
     }
@@ -208,6 +223,39 @@ fn first_grid(mu_min: f64, mu_max: f64, intervals: usize) -> Vec<f64> {
     grid.iter_mut().filter(|mu| mu.abs() < 1e-9 * step).for_each(|mu| *mu = 0.0);
     grid.dedup();
     grid
+}
+
+/// The values of an ascending `grid` up to the first one without a state of steady sliding; the last one is then where
+/// the states end, to the `resolution`.
+fn with_states(
+    model: &Model,
+    point: &OperatingPoint,
+    mut grid: Vec<f64>,
+    resolution: f64,
+) -> Result<(Vec<f64>, Option<SlidingEnd>), MapError> {
+    if model.statics().is_none() {
+        return Ok((grid, None));
+    }
+    let failed = |mu: f64| model.at(&point.with_friction(mu)).err();
+    let Some((first, mut reason)) = grid.iter().enumerate().find_map(|(k, &mu)| Some((k, failed(mu)?))) else {
+        return Ok((grid, None));
+    };
+    let (mut sound, mut without) = match first.checked_sub(1) {
+        Some(before) if grid[first] > 0.0 => (grid[before], grid[first]),
+        _ => return Err(MapError::Solve { mu: grid[first], source: reason.into() }),
+    };
+    while without - sound > resolution {
+        let middle = 0.5 * (sound + without);
+        match failed(middle) {
+            Some(error) => (without, reason) = (middle, error),
+            None => sound = middle,
+        }
+    }
+    grid.truncate(first);
+    if grid.last().is_some_and(|&last| last < sound) {
+        grid.push(sound);
+    }
+    Ok((grid, Some(SlidingEnd { mu: sound, reason })))
 }
 
 /// Numbers the roots at friction coefficient 0 and carries the identities along the links in both directions.

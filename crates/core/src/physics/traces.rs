@@ -26,15 +26,39 @@ pub struct Exact {
     pub powers: [f64; 2],
     /// Frobenius norms of `I`, `C` and `K`.
     pub norms: [f64; 3],
+    /// Error bounds of `powers`: 0 where they follow from the laws of the terms. NaN where nothing is known.
+    pub errors: [f64; 2],
+}
+
+impl Exact {
+    /// Nothing is known: no set of roots agrees with it.
+    pub const UNKNOWN: Self = Self { powers: [f64::NAN; 2], norms: [f64::NAN; 3], errors: [f64::NAN; 2] };
+
+    /// Sums and norms of the matrices `K` and `C`.
+    pub fn of(stiffness: &Mat<f64>, damping: &Mat<f64>, damped: bool) -> Self {
+        let norms = [(stiffness.nrows() as f64).sqrt(), damping.norm_l2(), stiffness.norm_l2()];
+        let powers = if damped {
+            [-trace(damping), trace_of_product(damping, damping) - 2.0 * trace(stiffness)]
+        } else {
+            [-trace(stiffness), trace_of_product(stiffness, stiffness)]
+        };
+        Self { powers, norms, errors: [0.0; 2] }
+    }
+}
+
+/// `tr A`.
+pub(super) fn trace(m: &Mat<f64>) -> f64 {
+    (0..m.nrows()).map(|i| m[(i, i)]).sum()
+}
+
+/// `tr(A B)`.
+pub(super) fn trace_of_product(a: &Mat<f64>, b: &Mat<f64>) -> f64 {
+    (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(j, i)] * b[(i, j)]).sum::<f64>()).sum()
 }
 
 impl Traces {
     /// Precomputes the traces of all terms and products of terms.
     pub fn new(model: &Model) -> Self {
-        let trace = |m: &Mat<f64>| (0..m.nrows()).map(|i| m[(i, i)]).sum();
-        let product = |a: &Mat<f64>, b: &Mat<f64>| -> f64 {
-            (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(j, i)] * b[(i, j)]).sum::<f64>()).sum()
-        };
         let all = |terms: &[KnownTerm]| terms.iter().map(|k| trace(&k.term.matrix)).collect::<Vec<f64>>();
         let inner = |a: &Mat<f64>, b: &Mat<f64>| -> f64 {
             (0..a.nrows()).map(|j| (0..a.nrows()).map(|i| a[(i, j)] * b[(i, j)]).sum::<f64>()).sum()
@@ -45,15 +69,19 @@ impl Traces {
         Self {
             stiffness: all(&model.stiffness),
             damping: all(&model.damping),
-            stiffness_products: pairs(&model.stiffness, &product),
-            damping_products: pairs(&model.damping, &product),
+            stiffness_products: pairs(&model.stiffness, &trace_of_product),
+            damping_products: pairs(&model.damping, &trace_of_product),
             stiffness_norms: pairs(&model.stiffness, &inner),
             damping_norms: pairs(&model.damping, &inner),
         }
     }
 
-    /// Sums and norms at `p`.
+    /// Sums and norms at `p`. With a contact state they are unknown: they would take the state. A chart of such a
+    /// model holds its own.
     pub fn at(&self, model: &Model, p: &OperatingPoint) -> Exact {
+        if model.statics().is_some() {
+            return Exact::UNKNOWN;
+        }
         let weighted = |terms: &[KnownTerm], traces: &[f64]| -> f64 {
             terms.iter().zip(traces).map(|(known, trace)| model.coefficient(&known.term.law, p) * trace).sum()
         };
@@ -75,6 +103,6 @@ impl Traces {
             norm(&model.damping, &self.damping_norms),
             norm(&model.stiffness, &self.stiffness_norms),
         ];
-        Exact { powers, norms }
+        Exact { powers, norms, errors: [0.0; 2] }
     }
 }

@@ -4,6 +4,7 @@
 
 use faer::Mat;
 
+use crate::contact::{FreeModes, MeasuredLoad, PressureLaw, StaticResponse, Statics, StaticsError, StaticsParts};
 use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, Term};
 
 /// A pseudo-random stream, uniform in `[-1, 1)` (Marsaglia's xorshift, 2003), identical on every machine.
@@ -41,16 +42,36 @@ pub struct Synthetic {
 }
 
 /// Total contact stiffness of all pairs, N/m.
-const STIFFNESS_N_PER_M: f64 = 4e7;
+pub const STIFFNESS_N_PER_M: f64 = 4e7;
 /// Amplitude of a mass-normalised shape, kg^-1/2: that of a part of about 2 kg.
 const AMPLITUDE: f64 = 0.7;
 
-/// Builds the rig.
+/// A synthetic rig before pad and disc are joined.
+#[derive(Clone, Debug)]
+pub struct Parts {
+    /// The model without contact.
+    pub free: Model,
+    /// The contact pairs, undamped.
+    pub pairs: ContactPairs,
+    /// Angular frequency of each mode, rad/s; none is 0.
+    pub omega: Vec<f64>,
+}
+
+/// Builds the rig, with springs that are always closed.
 ///
 /// # Errors
 /// [`ModelError`] if `contact_law` is not valid.
 pub fn rig(synthetic: &Synthetic) -> Result<Model, ModelError> {
-    let Synthetic { modes, pairs, damping_ratio, contact_law, seed } = *synthetic;
+    let Parts { free, pairs, .. } = parts(synthetic)?;
+    free.with_contact(&pairs)
+}
+
+/// Builds the parts of the rig.
+///
+/// # Errors
+/// [`ModelError`] if `contact_law` is not valid.
+pub fn parts(synthetic: &Synthetic) -> Result<Parts, ModelError> {
+    let Synthetic { modes, pairs: count, damping_ratio, contact_law, seed } = *synthetic;
     let mut uniform = Uniform::new(seed);
     let pad = modes / 2;
     let disc = modes - pad;
@@ -64,9 +85,9 @@ pub fn rig(synthetic: &Synthetic) -> Result<Model, ModelError> {
         omega.push(between(400.0, 1e4, rank / disc as f64) * split);
     }
     // The contact patch is a sector of a ring, 0.08 to 0.12 m from the axis and 0.5 rad wide.
-    let place: Vec<(f64, f64)> = (0..pairs).map(|_| (0.25 * uniform.draw(), 0.1 + 0.02 * uniform.draw())).collect();
+    let place: Vec<(f64, f64)> = (0..count).map(|_| (0.25 * uniform.draw(), 0.1 + 0.02 * uniform.draw())).collect();
     let (mut normal, mut sliding, mut lateral) =
-        (Mat::zeros(pairs, modes), Mat::zeros(pairs, modes), Mat::zeros(pairs, modes));
+        (Mat::zeros(count, modes), Mat::zeros(count, modes), Mat::zeros(count, modes));
     for k in 0..modes {
         let on_disc = k >= pad;
         let wave = if on_disc { 1.0 + ((k - pad) / 2) as f64 % 9.0 } else { 2.0 + 6.0 * uniform.draw().abs() };
@@ -85,15 +106,39 @@ pub fn rig(synthetic: &Synthetic) -> Result<Model, ModelError> {
         matrix: Mat::from_fn(modes, modes, |i, j| if i == j { value(omega[i]) } else { 0.0 }),
         law: Law::Constant,
     };
-    let contact = ContactPairs {
+    let pairs = ContactPairs {
         normal,
         sliding,
         lateral,
-        stiffness_n_per_m: vec![STIFFNESS_N_PER_M / pairs as f64; pairs],
-        damping_n_s_per_m: vec![0.0; pairs],
+        stiffness_n_per_m: vec![STIFFNESS_N_PER_M / count as f64; count],
+        damping_n_s_per_m: vec![0.0; count],
         radius_m: place.iter().map(|&(_, radius)| radius).collect(),
     };
     let stiffness = vec![diagonal(&|w| w * w)];
     let damping = vec![diagonal(&|w| 2.0 * damping_ratio * w)];
-    Model::new(modes, stiffness, damping, contact_law, Some(pad))?.with_contact(&contact)
+    let free = Model::new(modes, stiffness, damping, contact_law, Some(pad))?;
+    Ok(Parts { free, pairs, omega })
+}
+
+/// Statics of the parts of a rig in steady sliding with contact law `law`, all pairs with a factor of 1. The load presses
+/// the pad at its contact points, the initial gaps grow from 0 at the first pair to `gap_m` at the last one.
+///
+/// # Errors
+/// [`StaticsError`] if `law` or `gap_m` is not valid.
+///
+/// # Panics
+/// If the parts do not fit together: they come from [`parts`].
+pub fn statics(parts: &Parts, law: PressureLaw, gap_m: f64) -> Result<Statics, StaticsError> {
+    let Parts { free, pairs, omega } = parts;
+    let (n, c) = (omega.len(), pairs.normal.nrows());
+    let pad = free.pad_modes().unwrap_or(n);
+    let mean = |k: usize| (0..c).map(|i| pairs.normal[(i, k)]).sum::<f64>() / c as f64;
+    let load: Vec<f64> = (0..n).map(|k| if k < pad { -mean(k) } else { 0.0 }).collect();
+    let omega_squared: Vec<f64> = omega.iter().map(|omega| omega * omega).collect();
+    let [normal, sliding] = [&pairs.normal, &pairs.sliding].map(|rows| rows.as_ref());
+    let modes = FreeModes { omega_squared: &omega_squared, normal, sliding, load: &load };
+    let response = StaticResponse::from_modes(&modes, None).expect("every mode has a row and a frequency");
+    let gap = |i: usize| gap_m * i as f64 / c.max(2).saturating_sub(1) as f64;
+    let gap_m = (0..c).map(gap).collect();
+    Statics::new(StaticsParts { law, area: vec![1.0; c], gap_m, response, measured: MeasuredLoad::Back })
 }

@@ -14,6 +14,7 @@ use super::fit::{Basis, Fit};
 use super::leaf::Branches;
 use super::pairing::within_bounds;
 use super::samples::{Sample, Sampler, follow, spread};
+use super::totals::{Domain, Totals};
 use super::{Axis, Branch, Chart, Leaf, MAX_AXES, Scratch};
 use crate::physics::model::Model;
 use crate::physics::operating_point::OperatingPoint;
@@ -48,6 +49,10 @@ pub enum ChartError {
     Range { what: &'static str, low: f64, high: f64, limit: &'static str },
     #[error(transparent)]
     Solve(#[from] SolveError),
+    #[error(
+        "the contact law is not analytic: roots jump or bend wherever a pair opens or closes, so every condition is solved"
+    )]
+    NotAnalytic,
     #[error("stopped")]
     Stopped,
 }
@@ -94,6 +99,9 @@ pub fn resume(
     go_on: &mut dyn FnMut(&Progress<'_>) -> bool,
 ) -> Result<Chart, ChartError> {
     let (axes, low, high) = domain(model, options)?;
+    if !model.has_analytic_contact() {
+        return Err(ChartError::NotAnalytic);
+    }
     let sampler = Sampler { model, traces: Traces::new(model), axes: axes.clone(), low, high, base: options.low };
     let mut solvers: Vec<Solver> = (0..options.threads.max(1)).map(|_| Solver::new(model.dimension())).collect();
     let chart = match begun {
@@ -102,7 +110,18 @@ pub fn resume(
             let middle = std::array::from_fn(|k| 0.5 * (low[k] + high[k]));
             let undamped = sampler.solve(&mut solvers[0], &middle)?.spectrum.undamped;
             let basis = Basis::for_axes(axes.len());
-            Chart { axes, low, high, basis, branches: vec![Branch::Pending], leaves: vec![], undamped, solves: 1 }
+            let branches = vec![Branch::Pending];
+            let mut chart =
+                Chart { axes, low, high, basis, branches, leaves: vec![], undamped, solves: 1, totals: None };
+            if model.statics().is_some() {
+                let smallest_share = options.smallest_share;
+                let (axes, base) = (&sampler.axes, options.low);
+                let domain = Domain { model, axes, low, high, base, smallest_share };
+                let mut go_on = || go_on(&Progress { chart: &chart, share: 0.0, unit_finished: false });
+                let totals = Totals::build(&domain, &mut go_on).ok_or(ChartError::Stopped)?;
+                chart.totals = Some(totals);
+            }
+            chart
         }
     };
     let mut builder = Builder { options, sampler, solvers, chart };

@@ -15,10 +15,12 @@ mod fit;
 mod leaf;
 pub(crate) mod pairing;
 mod samples;
+mod totals;
 mod words;
 
 use faer::c64;
 
+use super::model::Parameter;
 use super::numbering::Census;
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, magnitude, square_root};
@@ -26,6 +28,7 @@ use super::traces::Exact;
 use channels::Channels;
 use cluster::MAX_SIZE;
 use fit::Basis;
+use totals::Totals;
 
 #[cfg(any(test, feature = "proof"))]
 pub(crate) use leaf::MERGING;
@@ -62,6 +65,17 @@ impl Axis {
             Self::Load => p.normal_load_n = coordinate.exp(),
             Self::Speed => p.disc_speed_rad_s = -1.0 / coordinate,
             Self::LoadOverSpeed => p.normal_load_n = coordinate * p.disc_speed_rad_s,
+        }
+    }
+
+    /// The parameter along this axis, and its derivative with respect to the coordinate. For a ratio of load to speed,
+    /// the load.
+    fn derivative(self, p: &OperatingPoint) -> (Parameter, f64) {
+        match self {
+            Self::Friction => (Parameter::Friction, 1.0),
+            Self::Load => (Parameter::Load, p.normal_load_n),
+            Self::Speed => (Parameter::Speed, p.disc_speed_rad_s * p.disc_speed_rad_s),
+            Self::LoadOverSpeed => (Parameter::Load, p.disc_speed_rad_s),
         }
     }
 
@@ -157,6 +171,8 @@ pub struct Chart {
     undamped: bool,
     /// Number of dense solves the build has taken.
     solves: usize,
+    /// Traces and norms of a model whose contact follows a state.
+    totals: Option<Totals>,
 }
 
 /// Work arrays of an evaluation. Reusing them makes evaluation free of allocation.
@@ -228,7 +244,16 @@ impl Chart {
             leaves: vec![leaf.clone()],
             undamped: self.undamped,
             solves: 0,
+            totals: None,
         }
+    }
+
+    /// The chart without one of the roots of each leaf.
+    #[cfg(test)]
+    pub(super) fn without_a_root(&self) -> Self {
+        let mut lost = self.clone();
+        lost.leaves.iter_mut().for_each(|leaf| drop(leaf.clusters.pop()));
+        lost
     }
 
     /// Whether no box is pending; otherwise a build can be resumed from this chart.
@@ -238,7 +263,7 @@ impl Chart {
 
     /// Appends the charted roots at `p` to `out`, in no particular order, with bounds of their residuals and, where
     /// charted, pad participations. The roots are checked against `known`, the exact sums and norms at `p` (see
-    /// [`Traces`](super::Traces)). The returned census counts the roots that numbering needs. A chart gives no
+    /// [`Traces`](super::Traces)); with a contact state, against the chart's own expansions of these. The returned census counts the roots that numbering needs. A chart gives no
     /// identities: [`StabilityMap`](super::StabilityMap) does.
     ///
     /// # Errors
@@ -251,6 +276,10 @@ impl Chart {
         out: &mut Vec<Root>,
     ) -> Result<Census, NotCharted> {
         let leaf = self.expand(p, scratch)?;
+        let known = match &self.totals {
+            Some(totals) => totals.at(&self.coordinates(p)?)?,
+            None => known,
+        };
         leaf.auxiliary.evaluate(&self.basis, &scratch.basis, &mut scratch.auxiliary);
         let (values, auxiliary) = (&scratch.functions, &scratch.auxiliary);
         let before = out.len();
@@ -277,7 +306,7 @@ impl Chart {
         for moment in 0..2 {
             let rest = auxiliary[moment];
             let difference = (found[moment] + rest - known.powers[moment]).abs();
-            let limit = limit[moment] + leaf.remainder_errors[moment];
+            let limit = limit[moment] + leaf.remainder_errors[moment] + known.errors[moment];
             if difference.is_nan() || difference > limit {
                 out.truncate(before);
                 return Err(NotCharted::Incomplete { difference, limit });

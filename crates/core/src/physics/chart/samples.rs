@@ -9,7 +9,8 @@ use crate::physics::model::Model;
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::{ROUNDING, Solver};
 use crate::physics::spectrum::{SolveError, Spectrum, Vectors};
-use crate::physics::traces::{Exact, Traces};
+use crate::physics::steady_contact::Situation;
+use crate::physics::traces::{Exact, Traces, trace, trace_of_product};
 use crate::physics::tracking::{continue_roots, tracked};
 use crate::sampling::radical_inverse;
 
@@ -21,6 +22,10 @@ const STEP: f64 = 1e-5;
 /// Step of a second difference, relative to half the width of the box. Rounding is near 1e-10 of a law, and a
 /// curvature has less than a hundredth of the weight of a value.
 const WIDE_STEP: f64 = 1e-3;
+
+/// Step of a difference of slopes of a model with a contact state, relative to half the width of the box. A slope is
+/// known to about 1e-13, so rounding is near 1e-9 and truncation near 1e-8 of a slope.
+const STATE_STEP: f64 = 2e-4;
 
 /// A solved point.
 pub struct Sample {
@@ -54,6 +59,13 @@ impl Sample {
     pub fn has_curvature(&self, k: usize) -> bool {
         self.curvatures[k].iter().all(|curvature| curvature.is_finite())
     }
+}
+
+/// Exact sums of powers of the roots at a point, with slopes and curvatures.
+struct Totals {
+    totals: Exact,
+    total_slopes: [[f64; 2]; MAX_AXES],
+    total_curvatures: [[f64; 2]; PAIRS],
 }
 
 /// Solves at points of a box.
@@ -90,10 +102,43 @@ impl Sampler<'_> {
         let value = |k: usize| if spectrum.undamped { spectrum.roots[k].square } else { spectrum.roots[k].lambda };
         let z: Vec<c64> = (0..count).map(value).collect();
         let axes = self.axes.len();
-        let first = (0..axes).map(|axis| self.change(&[self.difference(x, axis)])).collect::<Result<Vec<_>, _>>()?;
-        let second =
-            pairs(axes).map(|pair| self.change(&self.second_difference(x, pair))).collect::<Result<Vec<_>, _>>()?;
+        let with_state = self.model.statics().is_some();
+        let (first, second) = if with_state {
+            self.changes_with_state(x, &spectrum.situation())?
+        } else {
+            let first = (0..axes).map(|axis| self.change(&[self.difference(x, axis)]));
+            let second = pairs(axes).map(|pair| self.change(&self.second_difference(x, pair)));
+            (first.collect::<Result<Vec<_>, _>>()?, second.collect::<Result<Vec<_>, _>>()?)
+        };
         let Derivatives { slopes, curvatures } = Derivatives::new(&spectrum, left.as_ref(), &first, &second);
+        let Totals { totals, total_slopes, total_curvatures } = if with_state {
+            self.totals_with_state(&spectrum.situation(), spectrum.undamped, &first, &second)?
+        } else {
+            self.totals(x, &point)
+        };
+        let conditions = (0..count)
+            .map(|k| {
+                let size = (0..n).map(|i| left[(i, k)].norm_sqr()).sum::<f64>().sqrt();
+                if spectrum.undamped { size } else { 2.0 * z[k].norm() * size }
+            })
+            .collect();
+        Ok(Sample {
+            at: *x,
+            z,
+            slopes,
+            curvatures,
+            conditions,
+            totals,
+            total_slopes,
+            total_curvatures,
+            rounding: ROUNDING * f64::EPSILON * spectrum.matrix_norm,
+            spectrum,
+        })
+    }
+
+    /// The exact sums at `point`, which has coordinates `x`.
+    fn totals(&self, x: &[f64; MAX_AXES], point: &OperatingPoint) -> Totals {
+        let axes = self.axes.len();
         let total = |p: &OperatingPoint| self.traces.at(self.model, p).powers;
         let mut total_slopes = [[0.0; 2]; MAX_AXES];
         for (axis, slope) in total_slopes[..axes].iter_mut().enumerate() {
@@ -108,24 +153,85 @@ impl Sampler<'_> {
                 (0..2).for_each(|k| curvature[k] += (above[k] - below[k]) * per);
             }
         }
-        let conditions = (0..count)
-            .map(|k| {
-                let size = (0..n).map(|i| left[(i, k)].norm_sqr()).sum::<f64>().sqrt();
-                if spectrum.undamped { size } else { 2.0 * z[k].norm() * size }
-            })
-            .collect();
-        Ok(Sample {
-            at: *x,
-            z,
-            slopes,
-            curvatures,
-            conditions,
-            totals: self.traces.at(self.model, &point),
-            total_slopes,
-            total_curvatures,
-            rounding: ROUNDING * f64::EPSILON * spectrum.matrix_norm,
-            spectrum,
-        })
+        Totals { totals: self.traces.at(self.model, point), total_slopes, total_curvatures }
+    }
+
+    /// First and second derivatives of the matrices of a model with a contact state, which follows the conditions.
+    /// Slopes follow from the derivatives of the state; second derivatives are central differences of slopes.
+    fn changes_with_state(
+        &self,
+        x: &[f64; MAX_AXES],
+        here: &Situation,
+    ) -> Result<(Vec<Change>, Vec<Change>), SolveError> {
+        let axes = self.axes.len();
+        let first = (0..axes).map(|axis| self.slope_with_state(here, axis)).collect::<Result<Vec<_>, _>>()?;
+        let mut second = vec![];
+        for b in 0..axes {
+            let step = 0.5 * STATE_STEP * (self.high[b] - self.low[b]);
+            let beside = [-step, step].map(|step| {
+                let mut beside = *x;
+                if self.axes[b] == Axis::Speed {
+                    beside[b] = x[b].clamp(self.low[b] + step.abs(), self.high[b] - step.abs());
+                }
+                beside[b] += step;
+                self.model.at(&self.point(&beside))
+            });
+            let [below, above] = beside;
+            let (below, above) = (below?, above?);
+            for a in 0..=b {
+                let (below, above) = (self.slope_with_state(&below, a)?, self.slope_with_state(&above, a)?);
+                let quotient = |below: Mat<f64>, above: Mat<f64>| (above - below) * faer::Scale(0.5 / step);
+                let parts = below.into_iter().zip(above).map(|(below, above)| below.zip(above));
+                let mut parts = parts.map(|part| part.map(|(below, above)| quotient(below, above)));
+                second.push([parts.next().flatten(), parts.next().flatten()]);
+            }
+        }
+        Ok((first, second))
+    }
+
+    /// The derivatives of the matrices along an axis at `here`.
+    fn slope_with_state(&self, here: &Situation, axis: usize) -> Result<Change, SolveError> {
+        let n = self.model.dimension();
+        let [mut stiffness, mut damping] = [Mat::zeros(n, n), Mat::zeros(n, n)];
+        let (parameter, per) = self.axes[axis].derivative(here.point());
+        self.model.assemble_derivative_at(here, parameter, &mut stiffness, &mut damping)?;
+        Ok([Some(stiffness * faer::Scale(per)), Some(damping * faer::Scale(per))])
+    }
+
+    /// The exact sums of a model with a contact state, from its matrices and their derivatives.
+    fn totals_with_state(
+        &self,
+        here: &Situation,
+        undamped: bool,
+        first: &[Change],
+        second: &[Change],
+    ) -> Result<Totals, SolveError> {
+        let n = self.model.dimension();
+        let [mut stiffness, mut damping] = [Mat::zeros(n, n), Mat::zeros(n, n)];
+        self.model.assemble_at(here, &mut stiffness, &mut damping)?;
+        let zero = Mat::zeros(n, n);
+        let each =
+            |change: &Change| change.each_ref().map(|part| part.as_ref().map_or_else(|| zero.clone(), Mat::clone));
+        let first: Vec<[Mat<f64>; 2]> = first.iter().map(each).collect();
+        let mut total_slopes = [[0.0; 2]; MAX_AXES];
+        for (slope, [k, c]) in total_slopes.iter_mut().zip(&first) {
+            *slope = if undamped {
+                [-trace(k), 2.0 * trace_of_product(&stiffness, k)]
+            } else {
+                [-trace(c), 2.0 * trace_of_product(&damping, c) - 2.0 * trace(k)]
+            };
+        }
+        let mut total_curvatures = [[0.0; 2]; PAIRS];
+        for ((curvature, change), [a, b]) in total_curvatures.iter_mut().zip(second).zip(pairs(self.axes.len())) {
+            let ([k, c], [k_a, c_a], [k_b, c_b]) = (each(change), &first[a], &first[b]);
+            *curvature = if undamped {
+                [-trace(&k), 2.0 * (trace_of_product(k_a, k_b) + trace_of_product(&stiffness, &k))]
+            } else {
+                let bent = trace_of_product(c_a, c_b) + trace_of_product(&damping, &c);
+                [-trace(&c), 2.0 * bent - 2.0 * trace(&k)]
+            };
+        }
+        Ok(Totals { totals: Exact::of(&stiffness, &damping, !undamped), total_slopes, total_curvatures })
     }
 
     /// The sum of differences of the stiffness and of the damping; `None` for a matrix that does not change.

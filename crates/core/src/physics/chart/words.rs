@@ -2,6 +2,7 @@
 
 use super::cluster::MAX_SIZE;
 use super::fit::Basis;
+use super::totals::Totals;
 use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
 /// Format version: incremented when the meaning of the words or the result of a build changes.
@@ -9,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 17] = [
+pub const BUILDER: [&str; 25] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -18,12 +19,20 @@ pub const BUILDER: [&str; 17] = [
     include_str!("leaf.rs"),
     include_str!("mod.rs"),
     include_str!("samples.rs"),
+    include_str!("totals.rs"),
     include_str!("words.rs"),
     include_str!("../decoupled.rs"),
     include_str!("../dense_eigen.rs"),
     include_str!("../flexible_contact.rs"),
     include_str!("../model.rs"),
     include_str!("../solver.rs"),
+    include_str!("../steady_contact.rs"),
+    include_str!("../traces.rs"),
+    include_str!("../../contact/law.rs"),
+    include_str!("../../contact/path.rs"),
+    include_str!("../../contact/response.rs"),
+    include_str!("../../contact/spline.rs"),
+    include_str!("../../contact/statics.rs"),
     include_str!("../tracking.rs"),
     include_str!("../../chebyshev.rs"),
     include_str!("../../sampling.rs"),
@@ -63,6 +72,7 @@ impl Chart {
             let coefficients = leaf.functions.coefficients.iter().chain(&leaf.auxiliary.coefficients);
             words.extend(coefficients.map(|x| x.to_bits()));
         }
+        words.extend(self.totals.iter().flat_map(Totals::words));
         words
     }
 
@@ -84,8 +94,12 @@ impl Chart {
         let leaves: Vec<Leaf> =
             (0..words.count(words.0.len())?).map(|_| words.leaf(&basis, undamped)).collect::<Option<_>>()?;
         let known = branches.iter().all(|branch| !matches!(branch, Branch::Leaf(leaf) if *leaf >= leaves.len()));
-        let whole = words.0.is_empty() && known && count > 0;
-        whole.then_some(Self { axes, low, high, basis, branches, leaves, undamped, solves })
+        let totals = match words.0 {
+            [] => None,
+            words => Some(Totals::from_words(words).filter(|totals| totals.axes() == axes.len())?),
+        };
+        let whole = known && count > 0;
+        whole.then_some(Self { axes, low, high, basis, branches, leaves, undamped, solves, totals })
     }
 }
 

@@ -1,0 +1,406 @@
+//! Tests of vibration about a state of steady sliding, from the matrices to charts.
+
+use std::sync::Arc;
+
+use faer::Mat;
+
+use super::chart::Chart;
+use super::chart::build::{ChartError, ChartOptions, build};
+use super::ends::{Bounded, Ends};
+use super::flexible_contact::ResidualFlexibility;
+use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Parameter, Term};
+use super::operating_point::OperatingPoint;
+use super::solver::Solver;
+use super::spectrum::{SolveError, Vectors};
+use super::stability_map::{MapOptions, StabilityMap};
+use crate::contact::{FreeModes, MeasuredLoad, PressureLaw, StaticResponse, Statics, StaticsParts, TruncatedResponse};
+use crate::proof::held_out::hold_out;
+use crate::proof::identities::compare;
+use crate::proof::synthetic::Uniform;
+
+const MODES: usize = 8;
+const PAIRS: usize = 6;
+/// Springs that only push.
+const LINEAR: PressureLaw = PressureLaw::Linear { stiffness: 0.3 };
+/// Rough surfaces.
+const ROUGH: PressureLaw = PressureLaw::Exponential { pressure: 20.0, roughness_m: 150.0 };
+
+/// A random pad and disc before they are joined, with the statics of the contact.
+struct Rig {
+    free: Model,
+    pairs: ContactPairs,
+    omega: Vec<f64>,
+    /// Generalised force of a load of 1 N.
+    pressed: Vec<f64>,
+    gaps_m: Vec<f64>,
+    residual: ResidualFlexibility,
+}
+
+impl Rig {
+    /// The rig of `seed`; gaps are random, up to `gap_m`.
+    fn new(seed: u64, damping: f64, contact_law: ContactLaw, gap_m: f64) -> Self {
+        let mut uniform = Uniform::new(seed);
+        let omega: Vec<f64> = (0..MODES).map(|_| 1.0 + 4.0 * uniform.draw().abs()).collect();
+        let mut rows = || Mat::from_fn(PAIRS, MODES, |_, _| uniform.draw());
+        let [normal, sliding, lateral] = [rows(), rows(), rows()];
+        let diagonal = |value: &dyn Fn(f64) -> f64| Term {
+            matrix: Mat::from_fn(MODES, MODES, |i, j| if i == j { value(omega[i]) } else { 0.0 }),
+            law: Law::Constant,
+        };
+        let structural = diagonal(&|omega| 2.0 * damping * omega);
+        let free = Model::new(MODES, vec![diagonal(&|omega| omega * omega)], vec![structural], contact_law, Some(4));
+        let pressed = (0..MODES).map(|k| -(0..PAIRS).map(|i| normal[(i, k)]).sum::<f64>()).collect();
+        let flexible = Mat::from_fn(PAIRS, 3, |_, _| 0.3 * uniform.draw());
+        let skewed = Mat::from_fn(PAIRS, 3, |_, _| 0.3 * uniform.draw());
+        let residual = ResidualFlexibility {
+            normal: &flexible * flexible.transpose(),
+            sliding: &flexible * skewed.transpose(),
+            inertia: None,
+        };
+        let pairs = ContactPairs {
+            normal,
+            sliding,
+            lateral,
+            stiffness_n_per_m: vec![0.3; PAIRS],
+            damping_n_s_per_m: vec![0.06 * damping; PAIRS],
+            // Far from the axis, so that lateral damping is small beside these soft springs.
+            radius_m: (0..PAIRS).map(|_| 1e3 + 200.0 * uniform.draw()).collect(),
+        };
+        let gaps_m = (0..PAIRS).map(|_| gap_m * uniform.draw().abs()).collect();
+        Self { free: free.expect("well formed"), pairs, omega, pressed, gaps_m, residual }
+    }
+
+    /// The statics with contact law `law`: `K_0 = diag(Ω²)`, and the residual flexibility if it is `flexible`.
+    fn statics(&self, law: &PressureLaw, flexible: bool) -> Arc<Statics> {
+        let omega_squared: Vec<f64> = self.omega.iter().map(|omega| omega * omega).collect();
+        let [normal, sliding] = [&self.pairs.normal, &self.pairs.sliding].map(|rows| rows.as_ref());
+        let modes = FreeModes { omega_squared: &omega_squared, normal, sliding, load: &self.pressed };
+        let [normal, sliding] = [&self.residual.normal, &self.residual.sliding].map(|matrix| matrix.as_ref());
+        let truncated = TruncatedResponse { normal, sliding, gap_per_load: &[0.0; PAIRS] };
+        let response = StaticResponse::from_modes(&modes, flexible.then_some(&truncated)).expect("well formed");
+        let parts = StaticsParts {
+            law: law.clone(),
+            area: vec![1.0; PAIRS],
+            gap_m: self.gaps_m.clone(),
+            response,
+            measured: MeasuredLoad::Back,
+        };
+        Arc::new(Statics::new(parts).expect("well formed"))
+    }
+
+    fn model(&self, law: &PressureLaw, flexible: bool) -> Model {
+        let residual = flexible.then_some(&self.residual);
+        let model = self.free.clone().with_steady_contact(&self.pairs, self.statics(law, flexible), residual);
+        model.expect("well formed")
+    }
+}
+
+const FRICTION: ContactLaw =
+    ContactLaw { exponent: 0.0, reference_n: 500.0, slope_s_per_m: -1e-4, lateral_damping: true };
+
+fn point(normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64) -> OperatingPoint {
+    OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient }
+}
+
+const REFERENCE: OperatingPoint =
+    OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.35 };
+
+fn matrices(model: &Model, p: &OperatingPoint) -> [Mat<f64>; 2] {
+    let n = model.dimension();
+    let (mut k, mut c) = (Mat::zeros(n, n), Mat::zeros(n, n));
+    model.assemble(p, &mut k, &mut c).expect("there is a state");
+    [k, c]
+}
+
+fn options(mu_max: f64) -> MapOptions {
+    MapOptions { mu_min: 0.0, mu_max, band_max_hz: None, instability_threshold: 1e-6, windows: true }
+}
+
+fn map(model: &Model, p: &OperatingPoint, mu_max: f64) -> StabilityMap {
+    StabilityMap::build(model, &mut Solver::new(model.dimension()), p, &options(mu_max)).expect("it can be mapped")
+}
+
+/// With the linear law the state only decides which pairs are closed: the matrices are those of springs that are
+/// always closed, with the open pairs left out. Tolerance with residual flexibility: the expansion of that model is
+/// truncated at 1e-9.
+#[test]
+fn open_pairs_are_as_if_left_out() {
+    let (mut open, mut closed) = (0, 0);
+    for seed in 0..20 {
+        let rig = Rig::new(seed, 1e-2, ContactLaw::default(), 30.0);
+        for flexible in [false, true] {
+            let model = rig.model(&LINEAR, flexible);
+            for p in [point(500.0, 13.0, 0.3), point(500.0, -13.0, 0.2), point(900.0, 0.0, 0.3)] {
+                let here = model.at(&p).expect("there is a state");
+                let state = here.state().expect("the contact is loaded");
+                let mut pairs = rig.pairs.clone();
+                for (pair, _) in state.tangent_n_per_m.iter().enumerate().filter(|(_, k)| **k == 0.0) {
+                    (pairs.stiffness_n_per_m[pair], pairs.damping_n_s_per_m[pair]) = (0.0, 0.0);
+                    open += 1;
+                }
+                closed += state.pairs_closed();
+                let expected = match flexible {
+                    false => rig.free.clone().with_contact(&pairs),
+                    true => rig.free.clone().with_flexible_contact(&pairs, &rig.residual, 1.0),
+                };
+                let expected = matrices(&expected.expect("well formed"), &p);
+                for (found, expected) in matrices(&model, &p).iter().zip(&expected) {
+                    let off = (found - expected).norm_max() / expected.norm_max();
+                    assert!(off < if flexible { 1e-8 } else { 1e-14 }, "seed {seed}, {p:?}: {off:e}");
+                }
+                assert!(model.is_damped(&p));
+            }
+        }
+    }
+    assert!(open > 50 && closed > 200, "worth testing: {open} open, {closed} closed");
+}
+
+/// Slope and lateral friction act with the forces of the state, by the formula.
+#[test]
+fn friction_damps_with_the_forces_of_the_state() {
+    let rig = Rig::new(3, 0.0, FRICTION, 0.0);
+    let model = rig.model(&ROUGH, false);
+    for p in [point(500.0, 13.0, 0.3), point(300.0, -7.0, 0.5)] {
+        let here = model.at(&p).expect("there is a state");
+        let force = &here.state().expect("the contact is loaded").force_n;
+        let [_, found] = matrices(&model, &p);
+        let ContactPairs { sliding, lateral, radius_m, .. } = &rig.pairs;
+        let expected = Mat::from_fn(MODES, MODES, |i, j| {
+            let along = |k: usize| -1e-4 * force[k] * sliding[(k, i)] * sliding[(k, j)];
+            let across = |k: usize| {
+                let damping = p.friction_coefficient * force[k] / (p.disc_speed_rad_s.abs() * radius_m[k]);
+                damping * lateral[(k, i)] * lateral[(k, j)]
+            };
+            (0..PAIRS).map(|k| along(k) + across(k)).sum::<f64>()
+        });
+        assert!((&found - &expected).norm_max() < 1e-13 * expected.norm_max(), "{p:?}");
+    }
+    assert!(!model.is_damped(&point(0.0, 13.0, 0.3)) && !model.is_damped(&point(500.0, 0.0, 0.3)));
+}
+
+/// Derivatives of `K` and `C` through the state agree with central differences. A relative step of 1e-5 leaves
+/// truncation near 1e-10 and, with states known to 1e-13, rounding near 1e-8.
+#[test]
+fn matrices_follow_load_friction_and_speed() {
+    let mut checked = 0;
+    for seed in 0..6 {
+        let rig = Rig::new(seed, 1e-2, FRICTION, 20.0);
+        for flexible in [false, true] {
+            let model = rig.model(&ROUGH, flexible);
+            for p in
+                [point(500.0, 13.0, 0.3), point(200.0, -13.0, 0.4), point(500.0, 13.0, 0.0), point(500.0, 0.0, 0.3)]
+            {
+                for (parameter, step) in
+                    [(Parameter::Friction, 1e-5), (Parameter::Load, 1e-5 * p.normal_load_n), (Parameter::Speed, 1e-4)]
+                {
+                    let moved = |by: f64| match parameter {
+                        Parameter::Friction => p.with_friction(p.friction_coefficient + by),
+                        Parameter::Load => point(p.normal_load_n + by, p.disc_speed_rad_s, p.friction_coefficient),
+                        _ => point(p.normal_load_n, p.disc_speed_rad_s + by, p.friction_coefficient),
+                    };
+                    let (mut k, mut c) = (Mat::zeros(MODES, MODES), Mat::zeros(MODES, MODES));
+                    model.assemble_derivative(&p, parameter, &mut k, &mut c).expect("there is a state");
+                    let (up, down) = (matrices(&model, &moved(step)), matrices(&model, &moved(-step)));
+                    for (part, found) in [k, c].iter().enumerate() {
+                        let difference = (&up[part] - &down[part]) * faer::Scale(0.5 / step);
+                        let size = difference.norm_max() + 1e-3 * up[part].norm_max() / step * 1e-5;
+                        let off = (found - &difference).norm_max() / size;
+                        assert!(off < 1e-6, "seed {seed}, {parameter:?} at {p:?}, part {part}: {off:e}");
+                        checked += usize::from(difference.norm_max() > 1e-6);
+                    }
+                }
+            }
+        }
+    }
+    assert!(checked > 100, "{checked} derivatives other than zero");
+}
+
+/// The friction sensitivity of every root contains the motion of the state.
+#[test]
+fn roots_follow_the_state() {
+    let model = Rig::new(1, 1e-2, FRICTION, 0.0).model(&ROUGH, false);
+    let mut solver = Solver::new(MODES);
+    let (p, step) = (point(500.0, 13.0, 0.3), 1e-5);
+    let spectrum = solver.solve(&model, &p, Vectors::Both).expect("it solves");
+    let mut beside = |mu| solver.solve(&model, &p.with_friction(mu), Vectors::Right).expect("it solves");
+    let (up, down) = (beside(0.3 + step), beside(0.3 - step));
+    for (k, found) in spectrum.friction_sensitivity.iter().enumerate() {
+        let difference = (up.roots[k].square - down.roots[k].square) / (2.0 * step);
+        assert!((found - difference).norm() < 1e-6 * (1.0 + difference.norm()), "root {k}: {found} {difference}");
+    }
+}
+
+/// Points of a fine scan grow exactly in the windows, for a linear law whose pairs open and close.
+#[test]
+fn windows_hold_where_roots_jump() {
+    let (mut windows, mut jumps, mut changes) = (0, 0, 0);
+    for seed in 0..30 {
+        let damping = [0.0, 2e-2][seed as usize % 2];
+        let model = Rig::new(seed, damping, ContactLaw::default(), 300.0).model(&LINEAR, false);
+        let map = map(&model, &REFERENCE, 6.0);
+        assert!(map.complete, "seed {seed}");
+        windows += map.windows.len();
+        let ends = map.ends.windows.iter().flat_map(|(from, to)| std::iter::once(from).chain(to));
+        let ends: Vec<_> = ends.collect();
+        jumps += ends.iter().filter(|end| end.is_jump()).count();
+        assert!(ends.iter().all(|end| end.error < 1e-9), "seed {seed}: {ends:?}");
+        let last = map.sliding_ends.as_ref().map_or(6.0, |end| end.mu);
+        let mut solver = Solver::new(MODES);
+        let mut before: Option<Vec<bool>> = None;
+        for mu in (0..500).map(|k| 0.012 * f64::from(k) + 3.7e-5).take_while(|&mu| mu < last) {
+            let spectrum = solver.solve(&model, &REFERENCE.with_friction(mu), Vectors::Right).expect("it solves");
+            let unstable = spectrum.roots.iter().any(|root| root.is_unstable(1e-6));
+            let inside = |slack: f64| {
+                map.windows.iter().any(|w| mu > w.mu_from + slack && w.mu_to.is_none_or(|to| mu < to - slack))
+            };
+            assert!(!unstable || inside(-1e-9), "seed {seed}: {mu} grows in none of {:?}", map.windows);
+            let grows = spectrum.roots.iter().any(|root| root.is_unstable(1e-11));
+            assert!(grows || !inside(1e-5), "seed {seed}: {mu} does not grow in {:?}", map.windows);
+            let closed = spectrum.state.as_ref().map(|state| state.force_n.iter().map(|force| *force > 0.0).collect());
+            changes += usize::from(before.is_some() && before != closed);
+            before = closed;
+        }
+    }
+    eprintln!("{windows} windows, {jumps} jumps, {changes} changes");
+    assert!(windows > 15 && jumps > 1 && changes > 10, "{windows} windows, {jumps} jumps, {changes} changes");
+}
+
+/// Ends carried to another load agree with those of a map there, whether roots move smoothly or jump.
+#[test]
+fn ends_follow_the_load_through_the_state() {
+    let (mut carried_ends, mut jumps, mut moved) = (0, 0, 0.0f64);
+    for seed in 0..40 {
+        let (law, limit) = [(&LINEAR, 1e-9), (&ROUGH, 1e-9)][seed as usize % 2];
+        let model = Rig::new(seed, 0.0, ContactLaw::default(), 200.0).model(law, false);
+        let here = map(&model, &REFERENCE, 2.0);
+        let p = point(503.0, 13.0, 0.0);
+        let there = map(&model, &p, 2.0);
+        let Some(carried) = Ends::carried(&model, &mut Solver::new(MODES), &here, &p).expect("it solves") else {
+            continue;
+        };
+        if there.windows.len() != here.windows.len() {
+            continue; // a window came or went
+        }
+        let both = |ends: &Ends, at: &OperatingPoint| -> Vec<Bounded> {
+            ends.at(at).flat_map(|(from, to)| std::iter::once(from).chain(to)).collect()
+        };
+        let (exact, found, guessed) = (both(&there.ends, &p), both(&carried, &p), both(&here.ends, &p));
+        for k in 0..exact.len() {
+            let off = (found[k].value - exact[k].value).abs();
+            assert!(off < limit, "seed {seed}: {:?} {:?}", found[k], exact[k]);
+            let bound = guessed[k].error + exact[k].error;
+            assert!((guessed[k].value - exact[k].value).abs() <= bound, "seed {seed}: {:?} {:?}", guessed[k], exact[k]);
+            carried_ends += 1;
+            moved = moved.max((guessed[k].value - both(&here.ends, &REFERENCE)[k].value).abs());
+        }
+        let all = here.ends.windows.iter().flat_map(|(from, to)| std::iter::once(from).chain(to));
+        jumps += all.filter(|end| end.is_jump()).count();
+    }
+    eprintln!("{carried_ends} ends, {jumps} jumps, moved by {moved}");
+    assert!(carried_ends > 20 && jumps > 0 && moved > 1e-5, "{carried_ends} ends, {jumps} jumps, moved by {moved}");
+}
+
+/// Without a state there is a reason and no root, and the map ends there.
+#[test]
+fn nothing_is_predicted_without_a_state() {
+    let mut ended = 0;
+    for seed in 0..30 {
+        let model = Rig::new(seed, 0.0, ContactLaw::default(), 0.0).model(&LINEAR, false);
+        let map = map(&model, &REFERENCE, 8.0);
+        let Some(end) = &map.sliding_ends else { continue };
+        assert_eq!(map.nodes.last().map(|node| node.mu()), Some(end.mu), "seed {seed}");
+        assert!(matches!(end.reason, ModelError::State(_)), "{:?}", end.reason);
+        let beyond = REFERENCE.with_friction(end.mu + 2.0 * map.resolution);
+        let refused = Solver::new(MODES).solve(&model, &beyond, Vectors::Both);
+        assert!(matches!(refused, Err(SolveError::Model(ModelError::State(_)))), "seed {seed}: {refused:?}");
+        assert!(map.windows.iter().all(|window| window.mu_to.is_none_or(|to| to <= end.mu)), "{:?}", map.windows);
+        ended += 1;
+    }
+    assert!(ended > 2, "{ended} maps ended");
+}
+
+fn chart_options(high_speed: f64) -> ChartOptions {
+    ChartOptions {
+        low: point(200.0, 10.0, 0.0),
+        high: point(1000.0, high_speed, 0.6),
+        band_max_hz: None,
+        tolerance: 1e-8,
+        smallest_share: 1e-3,
+        max_solves: 4000,
+        threads: 1,
+    }
+}
+
+/// A chart of a model with an analytic contact law holds at held-out loads and friction coefficients: no bound is
+/// broken and no root missing. Its words give the same chart.
+#[test]
+fn charts_hold_through_the_state() {
+    for (seed, damping, law, axes) in
+        [(1, 0.0, ContactLaw::default(), 2), (4, 2e-2, ContactLaw::default(), 2), (7, 2e-2, FRICTION, 3)]
+    {
+        let model = Rig::new(seed, damping, law, 20.0).model(&ROUGH, seed == 4);
+        let options = chart_options(if axes == 3 { 12.0 } else { 20.0 });
+        let chart = build(&model, &options, &|_| true).expect("it can be charted");
+        let found = hold_out(&model, &options, &chart, 1000, seed).expect("it solves");
+        assert_eq!((found.violations, found.incomplete), (0, 0), "{found:?}");
+        assert!(found.charted > 950, "{} leaves, {} solves: {found:?}", chart.leaf_count(), chart.solve_count());
+        assert!(found.largest_error < 1e-7, "{found:?}");
+        let words = chart.words();
+        let again = Chart::from_words(&words).expect("words of a chart");
+        assert!(again.words() == words);
+        assert!(Chart::from_words(&words[..words.len() - 1]).is_none());
+        eprintln!("{} leaves, {} solves: {found:?}", chart.leaf_count(), chart.solve_count());
+    }
+}
+
+/// A lost root violates the chart's own traces.
+#[test]
+fn a_lost_root_is_told_by_the_traces_of_the_chart() {
+    let model = Rig::new(1, 0.0, ContactLaw::default(), 20.0).model(&ROUGH, false);
+    let options = chart_options(20.0);
+    let chart = build(&model, &options, &|_| true).expect("it can be charted");
+    let lost = chart.without_a_root();
+    let found = hold_out(&model, &options, &lost, 100, 1).expect("it solves");
+    assert_eq!(found.charted, 0, "{found:?}");
+    assert!(found.incomplete > 90, "{found:?}");
+}
+
+/// A law that is not analytic is not charted, and the reason says so.
+#[test]
+fn laws_that_open_are_not_charted() {
+    let model = Rig::new(1, 0.0, ContactLaw::default(), 20.0).model(&LINEAR, false);
+    let refused = build(&model, &chart_options(20.0), &|_| true).map(|_| ());
+    assert_eq!(refused, Err(ChartError::NotAnalytic));
+}
+
+/// Charted modes have the identities of solved ones.
+#[test]
+fn identities_hold_through_the_state() {
+    let model = Rig::new(4, 0.0, ContactLaw::default(), 20.0).model(&ROUGH, false);
+    let charted = chart_options(20.0);
+    let chart = build(&model, &charted, &|_| true).expect("it can be charted");
+    let mapped = MapOptions { windows: false, ..options(0.6) };
+    let found = compare(&model, &mapped, &charted, &chart, [4, 50], 3).expect("it solves");
+    assert_eq!(found.different, 0, "{found:?}");
+    assert!(found.charted > 190, "{found:?}");
+}
+
+#[test]
+fn what_is_inconsistent_is_refused() {
+    let rig = Rig::new(1, 1e-2, ContactLaw::default(), 0.0);
+    let with = |change: &dyn Fn(&mut ContactPairs, &mut ResidualFlexibility)| {
+        let (mut pairs, mut residual) = (rig.pairs.clone(), rig.residual.clone());
+        change(&mut pairs, &mut residual);
+        let model = rig.free.clone().with_steady_contact(&pairs, rig.statics(&LINEAR, true), Some(&residual));
+        model.map(|_| ()).unwrap_err()
+    };
+    assert!(matches!(with(&|pairs, _| pairs.stiffness_n_per_m[2] = 0.0), ModelError::StateDamping { pair: 2, .. }));
+    let zero = Mat::<f64>::zeros(PAIRS, PAIRS);
+    let inertia = |residual: &mut ResidualFlexibility| residual.inertia = Some([zero.clone(), zero.clone()]);
+    assert_eq!(with(&|_, residual| inertia(residual)), ModelError::StateInertia);
+    assert!(matches!(with(&|_, residual| residual.normal = Mat::zeros(2, 2)), ModelError::Shape { .. }));
+    assert!(matches!(with(&|_, residual| residual.sliding[(1, 2)] = f64::NAN), ModelError::NotFinite { .. }));
+    let hertzian = Rig::new(1, 1e-2, ContactLaw { exponent: 0.3, ..ContactLaw::default() }, 0.0);
+    let refused = hertzian.free.clone().with_steady_contact(&rig.pairs, rig.statics(&LINEAR, false), None);
+    assert_eq!(refused.map(|_| ()).unwrap_err(), ModelError::StateLoadExponent { exponent: 0.3 });
+}
