@@ -6,7 +6,8 @@ use serde::Serialize;
 use super::{LoadAndSpeed, Outcome, RigName, format, not_negative, print, write_file};
 use crate::display::curves::Curves;
 use crate::figures::plot;
-use crate::physics::{MapOptions, Solver, StabilityMap, Window};
+use crate::physics::stability_map::SlidingEnd;
+use crate::physics::{End, MapOptions, Solver, StabilityMap, Window};
 use crate::rig::Rig;
 use crate::session::map_options;
 
@@ -37,6 +38,21 @@ struct Report<'a> {
     /// Windows narrower than this may have been missed.
     narrowest_window: f64,
     complete: bool,
+    /// Only where a contact state ends inside the searched range.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    sliding_ends: Option<SlidingEndReport>,
+}
+
+#[derive(Serialize)]
+struct SlidingEndReport {
+    mu: f64,
+    reason: String,
+}
+
+impl From<&SlidingEnd> for SlidingEndReport {
+    fn from(end: &SlidingEnd) -> Self {
+        Self { mu: end.mu, reason: end.reason.to_string() }
+    }
 }
 
 #[derive(Serialize)]
@@ -46,11 +62,15 @@ struct WindowReport<'a> {
     mu_to: Option<f64>,
     frequency_hz: f64,
     kind: &'static str,
+    /// Whether the window begins or ends where a contact pair opens or closes and the roots jump.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    at_jump: bool,
 }
 
-impl<'a> From<&'a Window> for WindowReport<'a> {
-    fn from(window: &'a Window) -> Self {
+impl<'a> WindowReport<'a> {
+    fn new(window: &'a Window, (from, to): &(End, Option<End>)) -> Self {
         Self {
+            at_jump: from.is_jump() || to.is_some_and(|to| to.is_jump()),
             mode_ids: &window.mode_ids,
             mu_from: window.mu_from,
             mu_to: window.mu_to,
@@ -76,9 +96,15 @@ impl Options {
         if self.json {
             let report = Report {
                 critical_friction: map.critical_friction(),
-                windows: map.windows.iter().map(WindowReport::from).collect(),
+                windows: map
+                    .windows
+                    .iter()
+                    .zip(&map.ends.windows)
+                    .map(|(w, ends)| WindowReport::new(w, ends))
+                    .collect(),
                 narrowest_window: map.resolution,
                 complete: map.complete,
+                sliding_ends: map.sliding_ends.as_ref().map(SlidingEndReport::from),
             };
             print(&(serde_json::to_string(&report)? + "\n"))?;
         } else {

@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 
+use crate::contact::SteadyState;
 use crate::physics::{OperatingPoint, StabilityMap, Summary};
 use crate::rig::Rig;
 pub use crate::text::number::significant;
@@ -18,8 +19,17 @@ fn conditions(rig: &Rig, point: &OperatingPoint) -> String {
 }
 
 /// A prediction as a table.
-pub fn prediction(rig: &Rig, point: &OperatingPoint, summary: &Summary) -> String {
+pub fn prediction(rig: &Rig, point: &OperatingPoint, summary: &Summary, state: Option<&SteadyState>) -> String {
     let mut text = conditions(rig, point);
+    if let Some(state) = state {
+        let _ = writeln!(
+            text,
+            "contact: {} of {} pairs closed, contact force {} N",
+            state.pairs_closed(),
+            state.force_n.len(),
+            significant(state.contact_force_n(), 6)
+        );
+    }
     text += "\n  id   frequency     growth rate  damping ratio  pad share  residual\n";
     text += "              Hz             1/s                                     \n";
     for mode in &summary.modes {
@@ -74,6 +84,9 @@ pub fn windows(rig: &Rig, map: &StabilityMap, mu_max: f64) -> String {
                 );
             }
         }
+    }
+    if let Some(end) = &map.sliding_ends {
+        let _ = writeln!(text, "\nno steady sliding beyond friction coefficient {:.6}: {}", end.mu, end.reason);
     }
     let _ = writeln!(text, "\nwindows narrower than {:.2e} may have been missed", map.resolution);
     if !map.complete {

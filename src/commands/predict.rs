@@ -1,7 +1,10 @@
+use std::sync::Arc;
+
 use clap::Args;
 use serde::Serialize;
 
 use super::{Conditions, Outcome, RigName, format, print};
+use crate::contact::SteadyState;
 use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors};
 use crate::rig::Rig;
 use crate::session::map_options;
@@ -29,7 +32,33 @@ struct Report<'a> {
     unstable_modes: u32,
     max_growth_rate_per_s: Option<f64>,
     nonoscillatory_growth_per_s: &'a [f64],
+    /// Only for a rig whose contact follows a state.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    contact: Option<ContactReport>,
     modes: Vec<ModeReport>,
+}
+
+/// The state of steady sliding.
+#[derive(Serialize)]
+struct ContactReport {
+    pairs: usize,
+    /// Pairs that carry a force.
+    pairs_closed: usize,
+    /// Sum of the contact forces.
+    contact_force_n: f64,
+    /// Force on the back of the pad.
+    back_force_n: f64,
+}
+
+impl From<&SteadyState> for ContactReport {
+    fn from(state: &SteadyState) -> Self {
+        Self {
+            pairs: state.force_n.len(),
+            pairs_closed: state.pairs_closed(),
+            contact_force_n: state.contact_force_n(),
+            back_force_n: state.back_force_n,
+        }
+    }
 }
 
 #[derive(Serialize)]
@@ -59,7 +88,8 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
         let point = self.conditions.point(&rig.name, &rig.reference, &rig.limits)?;
-        let summary = predict(&rig, &point)?;
+        let (summary, state) = predict(&rig, &point)?;
+        let state = state.as_deref();
         if self.json {
             let report = Report {
                 rig: &rig.name,
@@ -69,18 +99,19 @@ impl Options {
                 unstable_modes: summary.unstable_modes,
                 max_growth_rate_per_s: summary.max_growth_rate_per_s,
                 nonoscillatory_growth_per_s: &summary.nonoscillatory_growth_per_s,
+                contact: state.map(ContactReport::from),
                 modes: summary.modes.iter().map(ModeReport::from).collect(),
             };
             print(&(serde_json::to_string(&report)? + "\n"))?;
         } else {
-            print(&format::prediction(&rig, &point, &summary))?;
+            print(&format::prediction(&rig, &point, &summary, state))?;
         }
         Ok(Outcome::Done)
     }
 }
 
-/// The modes at `point`, with identities from the map that a session uses there.
-fn predict(rig: &Rig, point: &OperatingPoint) -> anyhow::Result<Summary> {
+/// The modes at `point`, with identities from the map that a session uses there, and the contact state.
+fn predict(rig: &Rig, point: &OperatingPoint) -> anyhow::Result<(Summary, Option<Arc<SteadyState>>)> {
     let mut solver = Solver::new(rig.model.dimension());
     let spectrum = solver.solve(&rig.model, point, Vectors::Right)?;
     let mu = point.friction_coefficient;
@@ -88,5 +119,6 @@ fn predict(rig: &Rig, point: &OperatingPoint) -> anyhow::Result<Summary> {
     let path =
         MapOptions { mu_min: mu.min(searched.mu_min), mu_max: mu.max(searched.mu_max), windows: false, ..searched };
     let map = StabilityMap::build(&rig.model, &mut solver, point, &path)?;
-    Ok(Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold))
+    let summary = Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold);
+    Ok((summary, spectrum.state))
 }

@@ -119,7 +119,11 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
     let (mu_min, mu_max) = (range.from.min(searched.mu_min), range.to.max(searched.mu_max));
     let followed = MapOptions { mu_min, mu_max, windows, ..searched };
     let map = StabilityMap::build(&rig.model, &mut solver, point, &followed)?;
-    let values: Vec<f64> = range.values().collect();
+    let mut values: Vec<f64> = range.values().collect();
+    if let Some(end) = &map.sliding_ends {
+        values.retain(|&mu| mu <= end.mu);
+        note!("the sweep ends at friction coefficient {:.6}: {}", end.mu, end.reason);
+    }
     let modes_at = |solver: &mut Solver, mu: f64| -> anyhow::Result<Vec<Swept>> {
         let spectrum = solver.solve(&rig.model, &point.with_friction(mu), Vectors::Right)?;
         let summary = Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold);
