@@ -185,8 +185,8 @@ impl PressureLaw {
     }
 
     /// The closure `δ` with `δ + flexibility · p(δ) = total`: of the `total` approach of two bodies, what a pair in series
-    /// with a spring of that `flexibility` takes. Accurate to about 1e-14 of the larger of both shares; a starting point for
-    /// Newton steps, which do not depend on its last digits.
+    /// with a spring of that `flexibility` takes. A starting point for Newton steps, which do not depend on its last
+    /// digits.
     pub(super) fn shared_closure(&self, total: f64, flexibility: f64) -> f64 {
         if let Self::Linear { stiffness } = *self {
             return if total > 0.0 { total / (1.0 + flexibility * stiffness) } else { total };
@@ -220,7 +220,7 @@ impl PressureLaw {
             let next = if newton >= low && newton <= high { newton } else { 0.5 * (low + high) };
             let moved = (next - delta).abs();
             delta = next;
-            if moved <= 1e-15 * (delta.abs() + total.abs()) || low >= high {
+            if moved <= 1e-15 * delta.abs() || low >= high {
                 break;
             }
         }

@@ -16,6 +16,13 @@ const LIMIT: f64 = 1e-11;
 const ROUNDING: f64 = 1e-15;
 /// Below this residual steps are taken in the closures at full length.
 const POLISH: f64 = 1e-9;
+/// Below this residual the Jacobian no longer changes.
+const SETTLED: f64 = 1e-12;
+/// Most steps with the Jacobian of an anchor, and the reduction of the residual by one below which they end.
+const MOST_CHORDS: usize = 12;
+const CONTRACTION: f64 = 0.3;
+/// Change of the friction coefficient that counts as much as a change of the load by a factor of e.
+const FRICTION_SCALE: f64 = 0.1;
 /// Most Newton steps, and most halvings of one.
 const MOST_STEPS: usize = 60;
 const MOST_HALVINGS: usize = 25;
@@ -28,6 +35,8 @@ const SHORTEST: f64 = 1e-13;
 /// Largest difference between predicted and found forces of a step, relative to their sum: larger ones could lead to
 /// another branch.
 const DEVIATION: f64 = 0.1;
+/// Share of the load below which forces are too small to be compared: the first pair may just have closed.
+const BARELY: f64 = 1e-3;
 /// Growth of the forces that counts as unlimited.
 const GROWTH: f64 = 1e6;
 
@@ -79,8 +88,12 @@ struct Evaluated {
 }
 
 /// Factorised Jacobian over closed pairs and other unknowns.
+#[derive(Clone, Debug)]
 struct Jacobian {
     lu: PartialPivLu<f64>,
+    /// Pairs with a tangent stiffness, and the tangent stiffness of every pair.
+    closed: Vec<usize>,
+    tangent: Vec<f64>,
     /// Sign of the determinant; 0 where the matrix is singular to working precision.
     sign: i8,
 }
@@ -126,6 +139,11 @@ impl<'a> Equations<'a> {
             MeasuredLoad::Back => self.load,
             MeasuredLoad::Contact => point.others[self.rigid()],
         }
+    }
+
+    /// Whether the pad is pushed on its back, if it is pushed at all.
+    fn pushes(&self, point: &Point) -> bool {
+        self.load <= 0.0 || self.back_force(point) > 0.0
     }
 
     /// Factor of the equations of balance, which makes them lengths.
@@ -244,14 +262,16 @@ impl<'a> Equations<'a> {
         }
         let lu = matrix.partial_piv_lu();
         let sign = determinant_sign(&lu, m + others);
-        Jacobian { lu, sign }
+        let tangent = at.law.iter().map(|value| value.tangent).collect();
+        Jacobian { lu, closed: closed.clone(), tangent, sign }
     }
 
     /// Solves `J d = right` for several right-hand sides, `(c + others)×n`, in place.
-    fn solve(&self, at: &Evaluated, jacobian: &Jacobian, right: &mut Mat<f64>) {
+    fn solve(&self, jacobian: &Jacobian, right: &mut Mat<f64>) {
         let parts = &self.statics.parts;
-        let (c, m, others, rigid) = (self.statics.pairs(), at.closed.len(), at.point.others.len(), self.rigid());
-        let mut reduced = Mat::from_fn(m + others, right.ncols(), |row, column| match at.closed.get(row) {
+        let (c, m, rigid) = (self.statics.pairs(), jacobian.closed.len(), self.rigid());
+        let others = right.nrows() - c;
+        let mut reduced = Mat::from_fn(m + others, right.ncols(), |row, column| match jacobian.closed.get(row) {
             Some(&k) => right[(k, column)],
             None => right[(c + row - m, column)],
         });
@@ -259,10 +279,10 @@ impl<'a> Equations<'a> {
         let mut moved = vec![0.0; c];
         let mut increments = vec![0.0; c];
         for column in 0..right.ncols() {
-            for (row, &k) in at.closed.iter().enumerate() {
-                increments[k] = at.law[k].tangent * reduced[(row, column)];
+            for (row, &k) in jacobian.closed.iter().enumerate() {
+                increments[k] = jacobian.tangent[k] * reduced[(row, column)];
             }
-            times_columns(self.flexibility.as_ref(), &increments, &at.closed, &mut moved);
+            times_columns(self.flexibility.as_ref(), &increments, &jacobian.closed, &mut moved);
             for k in 0..c {
                 // An open pair follows the others.
                 let mut value = right[(k, column)] - moved[k];
@@ -276,7 +296,7 @@ impl<'a> Equations<'a> {
                 }
                 right[(k, column)] = value;
             }
-            for (row, &k) in at.closed.iter().enumerate() {
+            for (row, &k) in jacobian.closed.iter().enumerate() {
                 right[(k, column)] = reduced[(row, column)];
             }
             for other in 0..others {
@@ -288,7 +308,7 @@ impl<'a> Equations<'a> {
     /// Newton's direction.
     fn direction(&self, at: &Evaluated, jacobian: &Jacobian) -> Vec<f64> {
         let mut right = Mat::from_fn(at.residual.len(), 1, |row, _| -at.residual[row]);
-        self.solve(at, jacobian, &mut right);
+        self.solve(jacobian, &mut right);
         right.col(0).iter().copied().collect()
     }
 
@@ -344,14 +364,53 @@ impl<'a> Equations<'a> {
             }
             match better {
                 Some(tried) => {
+                    // A step that only removes rounding errors leaves the Jacobian as it is.
+                    let settled = at.accuracy < SETTLED && tried.closed == jacobian.closed;
                     at = tried;
-                    jacobian = self.jacobian(&at);
+                    if !settled {
+                        jacobian = self.jacobian(&at);
+                    }
                 }
                 None if at.accuracy <= LIMIT => return Ok((at, jacobian)),
                 None => return Err(at.accuracy),
             }
         }
         if at.accuracy <= LIMIT { Ok((at, jacobian)) } else { Err(at.accuracy) }
+    }
+
+    /// First-order prediction from `state`, `along` steps of load and friction coefficient.
+    fn predicted(&self, state: &SteadyState, [load, friction]: [f64; 2]) -> Point {
+        let moved = |value: f64, per_load: f64, per_friction: f64| value + load * per_load + friction * per_friction;
+        let (by_load, by_friction) = (&state.per_load, &state.per_friction);
+        let pairs = state.closure_m.iter().zip(&by_load.closure).zip(&by_friction.closure);
+        let motions = state.rigid.iter().zip(&by_load.rigid).zip(&by_friction.rigid);
+        let mut others: Vec<f64> = motions.map(|((value, load), friction)| moved(*value, *load, *friction)).collect();
+        if self.statics.parts.measured == MeasuredLoad::Contact {
+            others.push(moved(state.back_force_n, by_load.back_force, by_friction.back_force));
+        }
+        let closure = pairs.map(|((value, load), friction)| moved(*value, *load, *friction)).collect();
+        Point { closure, others }
+    }
+
+    /// Whether a solution is the continuation of `state`: the determinant has the sign it had without friction, the pad is
+    /// pushed, and the forces are those predicted.
+    fn is_near(
+        &self,
+        state: &SteadyState,
+        [load, friction]: [f64; 2],
+        sign: i8,
+        (at, jacobian): &(Evaluated, Jacobian),
+    ) -> bool {
+        let slopes = state.per_load.force.iter().zip(&state.per_friction.force);
+        let (mut difference, mut total) = (0.0, 0.0);
+        for ((before, (by_load, by_friction)), value) in state.force_n.iter().zip(slopes).zip(&at.law) {
+            let predicted = (before + load * by_load + friction * by_friction).max(0.0);
+            difference += (predicted - value.pressure).abs();
+            total += value.pressure;
+        }
+        jacobian.sign == sign
+            && self.pushes(&at.point)
+            && difference <= DEVIATION * f64::max(total, BARELY * self.scales.force)
     }
 
     /// The negative derivatives of the equations with respect to the load, `s μ` and `ln κ`, `(c + others)×3`.
@@ -385,7 +444,7 @@ impl<'a> Equations<'a> {
     fn state(&self, at: &Evaluated, jacobian: &Jacobian) -> SteadyState {
         let c = self.statics.pairs();
         let mut slopes = self.parameters(at);
-        self.solve(at, jacobian, &mut slopes);
+        self.solve(jacobian, &mut slopes);
         let slope = |parameter: usize| {
             let direct = if parameter == 2 { 1.0 } else { 0.0 };
             let closure: Vec<f64> = (0..c).map(|k| slopes[(k, parameter)]).collect();
@@ -451,42 +510,31 @@ pub(super) fn follow(statics: &Statics, load: f64, s_mu: f64) -> Result<SteadySt
     let scales = Scales::new(statics, load);
     let (at, jacobian) = at_rest(statics, load, &scales)?;
     let sign = jacobian.sign;
-    let mut state = Equations::new(statics, load, 0.0, 0.0, &scales).state(&at, &jacobian);
-    let mut others = at.point.others;
+    let equations = Equations::new(statics, load, 0.0, 0.0, &scales);
+    if !equations.pushes(&at.point) {
+        let end = PathEnd::Jams;
+        return Err(StaticsError::NoEquilibrium { load_n: load, asked: s_mu, friction_coefficient: 0.0, end });
+    }
+    let mut state = equations.state(&at, &jacobian);
     let (mut x, mut step) = (0.0, s_mu.clamp(-LONGEST, LONGEST));
     while x != s_mu {
         let rest = s_mu - x;
         let next = if step.abs() >= rest.abs() { s_mu } else { x + step };
         let equations = Equations::new(statics, load, next, 0.0, &scales);
         let along = next - x;
-        let slope = &state.per_friction;
-        let moved = |value: &f64, slope: &f64| value + along * slope;
-        let predicted = Point {
-            closure: state.closure_m.iter().zip(&slope.closure).map(|(value, slope)| moved(value, slope)).collect(),
-            others: others
-                .iter()
-                .zip(slope.rigid.iter().chain([&slope.back_force]))
-                .map(|(value, slope)| moved(value, slope))
-                .collect(),
-        };
-        let forces = state.force_n.iter().zip(&slope.force).map(|(force, slope)| moved(force, slope).max(0.0));
-        let accepted = equations.newton(predicted).ok().filter(|(at, jacobian)| {
-            let difference: f64 = forces.zip(&at.law).map(|(force, value)| (force - value.pressure).abs()).sum();
-            let total: f64 = at.law.iter().map(|value| value.pressure).sum();
-            let pushes = load <= 0.0 || equations.back_force(&at.point) > 0.0;
-            jacobian.sign == sign && pushes && difference <= DEVIATION * total.max(f64::MIN_POSITIVE)
-        });
+        let predicted = equations.predicted(&state, [0.0, along]);
+        let accepted =
+            equations.newton(predicted).ok().filter(|found| equations.is_near(&state, [0.0, along], sign, found));
         match accepted {
             Some((at, jacobian)) => {
                 state = equations.state(&at, &jacobian);
-                others = at.point.others;
                 x = next;
                 step = (2.0 * step).clamp(-LONGEST, LONGEST);
             }
             None => {
                 step = 0.5 * along;
                 if step.abs() < SHORTEST * x.abs().max(1.0) {
-                    let end = classify(statics, &scales, &state, &others, step.signum(), sign);
+                    let end = classify(&equations, &state, step.signum(), sign);
                     return Err(StaticsError::NoEquilibrium {
                         load_n: load,
                         asked: s_mu,
@@ -521,24 +569,23 @@ fn at_rest(statics: &Statics, load: f64, scales: &Scales) -> Result<(Evaluated, 
 }
 
 /// How the path ends just beyond `state`, in the direction `toward`.
-fn classify(statics: &Statics, scales: &Scales, state: &SteadyState, others: &[f64], toward: f64, sign: i8) -> PathEnd {
+fn classify(near: &Equations<'_>, state: &SteadyState, toward: f64, sign: i8) -> PathEnd {
+    let (statics, scales) = (near.statics, near.scales);
     let back_vanishes = statics.parts.measured == MeasuredLoad::Contact
         && state.back_force_n.abs() <= 1e-9 * scales.force * (1.0 + state.per_friction.back_force.abs());
     if back_vanishes || state.contact_force_n() > GROWTH * scales.force {
         return PathEnd::Jams;
     }
-    if others.is_empty() || state.rigid.is_empty() {
+    if state.rigid.is_empty() {
         return PathEnd::Turns;
     }
-    // Forces that stay put while the motions of a part do not, or a singular Jacobian beyond the last kink: it tips.
-    let largest = |values: &[f64]| values.iter().fold(0.0f64, |most, value| most.max(value.abs()));
+    // A singular Jacobian beyond the last kink, or one that becomes singular while forces stay put: a part tips.
     let beyond = 1e3 * SHORTEST * toward;
-    let closure: Vec<f64> =
-        state.closure_m.iter().zip(&state.per_friction.closure).map(|(value, slope)| value + beyond * slope).collect();
     let equations = Equations::new(statics, state.load_n, state.friction + beyond, 0.0, scales);
-    let at = equations.evaluate(Point { closure, others: others.to_vec() });
+    let at = equations.evaluate(equations.predicted(state, [0.0, beyond]));
     let jacobian = equations.jacobian(&at);
-    if jacobian.sign == -sign && largest(&state.per_friction.force) > GROWTH * scales.force {
+    let largest = state.per_friction.force.iter().fold(0.0f64, |most, value| most.max(value.abs()));
+    if jacobian.sign == -sign && largest > GROWTH * scales.force {
         return PathEnd::Turns;
     }
     let upper = jacobian.lu.U();
@@ -546,4 +593,55 @@ fn classify(statics: &Statics, scales: &Scales, state: &SteadyState, others: &[f
     let (least, most) =
         pivots.fold((f64::INFINITY, 0.0f64), |(least, most), pivot| (least.min(pivot), most.max(pivot)));
     if least <= 1e-9 * most { PathEnd::Tips } else { PathEnd::Turns }
+}
+
+/// A state that others are started from.
+#[derive(Clone, Debug)]
+pub(super) struct Anchor {
+    state: SteadyState,
+    jacobian: Jacobian,
+}
+
+/// Anchors at the given conditions; those without a state are left out.
+pub(super) fn anchors(statics: &Statics, loads_n: &[f64], s_mus: &[f64]) -> Vec<Anchor> {
+    let mut anchors = vec![];
+    for &load in loads_n {
+        let scales = Scales::new(statics, load);
+        for &s_mu in s_mus {
+            let Ok(state) = follow(statics, load, s_mu) else { continue };
+            let equations = Equations::new(statics, load, s_mu, 0.0, &scales);
+            let at = equations.evaluate(equations.predicted(&state, [0.0; 2]));
+            let jacobian = equations.jacobian(&at);
+            anchors.push(Anchor { state, jacobian });
+        }
+    }
+    anchors
+}
+
+/// The state near the nearest of `anchors`; `None` if it cannot be told to be the one continued from `μ = 0`.
+pub(super) fn from_anchor(statics: &Statics, anchors: &[Anchor], load: f64, s_mu: f64) -> Option<SteadyState> {
+    let away = |anchor: &Anchor| {
+        let [by_load, by_friction] =
+            [(load / anchor.state.load_n).ln(), (s_mu - anchor.state.friction) / FRICTION_SCALE];
+        by_load * by_load + by_friction * by_friction
+    };
+    let anchor = anchors.iter().min_by(|one, other| away(one).total_cmp(&away(other)))?;
+    let scales = Scales::new(statics, load);
+    let equations = Equations::new(statics, load, s_mu, 0.0, &scales);
+    let along = [load - anchor.state.load_n, s_mu - anchor.state.friction];
+    let mut at = equations.evaluate(equations.predicted(&anchor.state, along));
+    for _ in 0..MOST_CHORDS {
+        let direction = equations.direction(&at, &anchor.jacobian);
+        let tried = equations.evaluate(equations.step(&at, &direction, 1.0, true));
+        let contracts = tried.accuracy < CONTRACTION * at.accuracy;
+        if tried.accuracy < at.accuracy {
+            at = tried;
+        }
+        if !contracts || at.accuracy < SETTLED {
+            break;
+        }
+    }
+    let found = equations.newton(at.point).ok()?;
+    let near = equations.is_near(&anchor.state, along, anchor.jacobian.sign, &found);
+    near.then(|| equations.state(&found.0, &found.1))
 }

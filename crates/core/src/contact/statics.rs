@@ -32,6 +32,7 @@ pub struct StaticsParts {
 pub struct Statics {
     pub(super) parts: StaticsParts,
     pub(super) total_area: f64,
+    anchors: Vec<path::Anchor>,
 }
 
 /// How the states that follow from frictionless contact end.
@@ -181,7 +182,24 @@ impl Statics {
             return Err(StaticsError::Condition { what: "number of contact pairs", value: 0.0, limit: "at least 1" });
         }
         let total_area = parts.area.iter().sum();
-        Ok(Self { parts, total_area })
+        Ok(Self { parts, total_area, anchors: vec![] })
+    }
+
+    /// Solves the states at all combinations of `loads_n` (N, positive) and `s_mus`, and starts later states from the
+    /// nearest of them. States do not change but for rounding, and remain pure functions of statics, load and friction
+    /// coefficient; they are found in a few solves with kept factors instead of a path from `s_mu = 0`. Combinations without
+    /// a state are left out.
+    #[must_use]
+    pub fn with_anchors(mut self, loads_n: &[f64], s_mus: &[f64]) -> Self {
+        let loads: Vec<f64> = loads_n.iter().copied().filter(|load| load.is_finite() && *load > 0.0).collect();
+        let s_mus: Vec<f64> = s_mus.iter().copied().filter(|s_mu| s_mu.is_finite()).collect();
+        self.anchors = path::anchors(&self, &loads, &s_mus);
+        self
+    }
+
+    /// Number of anchors, see [`Self::with_anchors`].
+    pub fn anchors(&self) -> usize {
+        self.anchors.len()
     }
 
     /// Number of contact pairs, `c`.
@@ -211,7 +229,8 @@ impl Statics {
         if needs_load && load_n <= 0.0 {
             return Err(StaticsError::Condition { what: "load", value: load_n, limit: "more than 0" });
         }
-        let found = path::follow(self, load_n, s_mu)?;
+        let near = (load_n > 0.0).then(|| path::from_anchor(self, &self.anchors, load_n, s_mu)).flatten();
+        let found = near.map_or_else(|| path::follow(self, load_n, s_mu), Ok)?;
         if let PressureLaw::Table(table) = &self.parts.law {
             let limit_m = table.last_closure_m();
             if let Some(pair) = found.closure_m.iter().position(|closure| *closure > limit_m) {
