@@ -14,7 +14,8 @@ use faer::{Mat, c64};
 
 use super::ReductionError;
 use super::full_model::FullModel;
-use super::full_order::{FullProgress, FullSolver, FullSpectrum, FullVectors};
+use super::full_order::FullSolver;
+use super::full_root::{FullProgress, FullSpectrum, FullVectors};
 use super::matching::pair_off;
 use crate::physics::{
     MapError, MapOptions, Model, ModelError, OperatingPoint, SolveError, Solver, StabilityMap, Vectors, Window,
@@ -43,21 +44,41 @@ const PAIRED: f64 = 0.2;
 /// Error of a comparison.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum CompareError {
+    /// A solve of the full model failed.
     #[error("full model: {0}")]
     Full(#[from] ReductionError),
+    /// The full model projected on its own vectors is no valid model.
     #[error("full model on its own vectors: {0}")]
     Basis(#[from] ModelError),
+    /// A solve of the reduced model failed.
     #[error("reduced model: {0}")]
     Reduced(#[from] SolveError),
+    /// A stability map failed.
     #[error("windows of instability: {0}")]
     Map(#[from] MapError),
+    /// The window ends of the full model did not converge.
     #[error("ends of windows of the full model still move by {moved:.1e} after {rounds} rounds, limit {limit:.1e}")]
-    NotStill { moved: f64, rounds: usize, limit: f64 },
+    NotStill {
+        /// Largest movement in the last round.
+        moved: f64,
+        /// Number of rounds.
+        rounds: usize,
+        /// Largest movement accepted.
+        limit: f64,
+    },
+    /// The full model on its own vectors is not accurate enough between the samples.
     #[error(
         "full model on its own vectors is off by {error:.1e} between the friction coefficients that they are of, after \
          {rounds} rounds, limit {limit:.1e}"
     )]
-    NotHeld { error: f64, rounds: usize, limit: f64 },
+    NotHeld {
+        /// Largest relative error of a root.
+        error: f64,
+        /// Number of rounds.
+        rounds: usize,
+        /// Largest error accepted.
+        limit: f64,
+    },
 }
 
 /// Scope and threshold of a comparison.

@@ -18,7 +18,7 @@ use faer::{Mat, MatRef, Par, c64};
 
 use super::ReductionError;
 use super::full_model::{FullModel, LowRank, SparseRow};
-use super::krylov_schur::Number;
+use super::krylov::Number;
 use super::pencil::{Ldlt, Pencil};
 
 /// The parts of a full model, ordered and symbolically analysed.

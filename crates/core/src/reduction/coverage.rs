@@ -3,65 +3,11 @@
 use faer::{Mat, MatRef, c64};
 
 use super::ReductionError;
-use super::full_order::{FullRoot, FullSpectrum};
+use super::full_root::{CoveredDisc, FullRoot, FullSpectrum};
 
-/// Half the stretch of the imaginary axis that a disc counts as covering, relative to its radius. At the ends of that
-/// stretch the half width of the disc is 0.31 of its radius.
-const CHORD: f64 = 0.95;
 /// Largest distance, relative to `|λ|`, of two computed values of the same root: ten times the square root of the
 /// residual limit of an eigenpair, because merging roots are only that accurate.
 pub(super) const SAME: f64 = 1e-5;
-
-/// Disc around a shift within which every root has converged.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CoveredDisc {
-    /// Angular frequency `ω` of the shift, rad/s. The centre is `λ = iω`, or `-λ² = ω²` if `squared`.
-    pub shift_rad_s: f64,
-    /// Radius in the `λ` plane, 1/s, or in the `λ²` plane, 1/s², if `squared`.
-    pub radius: f64,
-    /// The disc lies in the `λ²` plane, as for undamped models.
-    pub squared: bool,
-}
-
-impl CoveredDisc {
-    /// Covered stretch of the imaginary axis, rad/s.
-    pub fn stretch_rad_s(&self) -> [f64; 2] {
-        let (omega, half) = (self.shift_rad_s, CHORD * self.radius);
-        if self.squared {
-            let square = omega * omega;
-            let low = if half >= square { 0.0 } else { (square - half).sqrt() };
-            return [low, (square + half).sqrt()];
-        }
-        [(omega - half).max(0.0), omega + half]
-    }
-
-    /// Largest magnitude of growth rate covered at the frequency `omega`, rad/s; 1/s.
-    pub fn growth_per_s(&self, omega: f64) -> f64 {
-        if self.radius == f64::INFINITY {
-            return f64::INFINITY;
-        }
-        if self.squared {
-            // |ω² - σ² - ω₀² - 2 i σ ω|² < ρ², quadratic in σ².
-            let (a, b) = (omega * omega, self.shift_rad_s * self.shift_rad_s);
-            return ((4.0 * a * b + self.radius * self.radius).sqrt() - a - b).max(0.0).sqrt();
-        }
-        let off = (omega - self.shift_rad_s).abs().min(self.radius);
-        (self.radius * self.radius - off * off).sqrt()
-    }
-
-    /// Whether the disc covers the stretch `[from, to]`, rad/s, with growth rates up to `growth`, 1/s, in magnitude.
-    pub(super) fn covers(&self, [from, to]: [f64; 2], growth: f64) -> bool {
-        let [low, high] = self.stretch_rad_s();
-        low <= from && high >= to && self.growth_per_s(from).min(self.growth_per_s(to)) >= growth
-    }
-
-    /// Whether `λ` lies in the disc shrunk by [`CHORD`].
-    pub(super) fn holds(&self, lambda: c64) -> bool {
-        let centre = c64::new(0.0, self.shift_rad_s);
-        let distance = if self.squared { (lambda * lambda - centre * centre).norm() } else { (lambda - centre).norm() };
-        distance < CHORD * self.radius
-    }
-}
 
 /// Roots and vectors found around one shift.
 pub(super) struct Found {

@@ -25,15 +25,13 @@ use faer::{Mat, c64};
 
 use super::ReductionError;
 use super::contact_solver::{PartBytes, Parts, Shifted};
-pub use super::coverage::CoveredDisc;
 use super::coverage::{Found, agree, assemble, first_gap};
 use super::full_model::FullModel;
-use super::full_problem::{Problem, unit};
+use super::full_problem::{Problem, WANTED, unit};
+use super::full_root::{FullProgress, FullRoot, FullSpectrum, FullVectors};
 use super::krylov_schur::{BLOCK, capacity, most_found};
 use crate::physics::{self, OperatingPoint, Vectors};
 
-/// Number of roots sought around each shift.
-pub(super) const WANTED: usize = 48;
 /// Largest residual of a linear solve at a shift, relative to `|Q| |x| + |b|`.
 const SOLVE_LIMIT: f64 = 1e-13;
 /// Smallest magnitude of growth rate that the discs must cover, relative to the highest angular frequency of the band.
@@ -50,55 +48,6 @@ const WORKING: usize = 12;
 const CHECKING: usize = 64;
 /// Below this many degrees of freedom a dense solve is faster.
 const DENSE_BELOW: usize = 240;
-
-/// Which eigenvectors to compute.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum FullVectors {
-    /// No vectors.
-    None,
-    /// Right vectors `x` and left vectors `y`: `(λ² M + λ C + K) x = 0`, `yᴴ (λ² M + λ C + K) = 0`.
-    Both,
-}
-
-/// A root of the full model.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct FullRoot {
-    /// `λ`, 1/s, with an imaginary part of at least 0.
-    pub lambda: c64,
-    /// Scaled residual `|(λ² M + λ C + K) x| / ((|λ|² |M| + |λ| |C| + |K|) |x|)`, with 1-norms of matrices and 2-norms
-    /// of vectors.
-    pub residual: f64,
-}
-
-/// The roots of a frequency band and the discs that were searched.
-#[derive(Clone, Debug)]
-pub struct FullSpectrum {
-    /// Ascending in frequency.
-    pub roots: Vec<FullRoot>,
-    /// Right eigenvectors, `n×roots`, 2-norm 1; no columns unless requested.
-    pub right: Mat<c64>,
-    /// Left eigenvectors, `n×roots`, 2-norm 1; no columns unless requested.
-    pub left: Mat<c64>,
-    /// Discs in ascending order of their shifts. Together they cover the imaginary axis from 0 to the end of the band.
-    /// Empty for a small model solved densely, which yields all roots.
-    pub discs: Vec<CoveredDisc>,
-    /// Magnitude of growth rate, 1/s, up to which every root was found at every frequency of the band.
-    pub covered_growth_per_s: f64,
-}
-
-/// Progress of a full solve.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum FullProgress {
-    /// The model is ordered and symbolically analysed. `bytes` is a lower estimate of the memory needed in addition to
-    /// memory already in use.
-    Analysed { bytes: usize },
-    /// The matrix at this shift, rad/s, is factorised.
-    Factored { shift_rad_s: f64 },
-    /// Krylov vectors built so far around the shift, and how many of the wanted roots have converged.
-    Iterated { shift_rad_s: f64, vectors: usize, converged: usize, wanted: usize },
-    /// A disc is complete and contains `roots` roots.
-    Covered { disc: CoveredDisc, roots: usize },
-}
 
 /// Solver for one full model at many operating points. The model is ordered and analysed once. Factors do not depend on
 /// the operating point and are kept between solves.

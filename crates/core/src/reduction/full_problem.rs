@@ -7,16 +7,19 @@ use faer::sparse::{SparseColMat, Triplet};
 use faer::{Mat, MatRef, c64};
 
 use super::contact_solver::{Coupled, Shifted};
-use super::coverage::{CoveredDisc, Found, SAME};
+use super::coverage::{Found, SAME};
 use super::full_model::{FullModel, LowRank};
-use super::full_order::{FullProgress, FullRoot, FullVectors, WANTED};
-use super::krylov_schur::{Iteration, Largest, Number, random};
+use super::full_root::{CoveredDisc, FullProgress, FullRoot, FullVectors};
+use super::krylov::{Number, random};
+use super::krylov_schur::{Iteration, Largest};
 use super::sparse::{entries, one_norm, times, times_transposed};
 use super::{ReductionError, SparseMatrix};
 use crate::physics::OperatingPoint;
 
 /// Largest residual of an eigenpair of the inverse, relative to its `θ`.
 const KRYLOV_LIMIT: f64 = 1e-12;
+/// Number of roots sought around each shift.
+pub(super) const WANTED: usize = 48;
 /// Largest scaled residual of a root, see [`FullRoot::residual`]. An eigenpair `(θ, x)` of the inverse with residual
 /// `e` has the residual `Q(s) e/θ` in the original problem. That is at most [`KRYLOV_LIMIT`] times the norms at the
 /// shift. They differ from the norms at the root by the mass term only, which weighs no more than the stiffness, and so

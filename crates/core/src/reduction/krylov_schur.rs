@@ -13,86 +13,18 @@
 //! Zhou, Saad, "Block Krylov-Schur method for large symmetric eigenvalue problems", Numer. Algorithms 47 (2008)
 //! 341-359.
 
-use faer::traits::ComplexField;
 use faer::{Mat, MatRef, c64};
 
 use super::ReductionError;
-use super::lanczos::random_block;
+use super::krylov::{Basis, Number, random};
 use super::schur::Schur;
 
 /// Block size: number of vectors added per step.
 pub(super) const BLOCK: usize = 4;
 /// Largest number of restarts.
 const MOST_RESTARTS: usize = 40;
-/// Number of rows of the basis recombined at a time.
-const ROWS_TOGETHER: usize = 4096;
 /// Relative difference of magnitudes below which two eigenvalues are a pair that a restart must not separate.
 const TOGETHER: f64 = 1e-9;
-
-/// Scalar type of a basis: real or complex.
-pub(super) trait Number: ComplexField<Real = f64> + Copy + std::ops::Mul<Output = Self> {
-    /// Converts to a complex number.
-    fn complex(self) -> c64;
-    /// Converts from a complex number; a real type takes the real part.
-    fn from_complex(value: c64) -> Self;
-    /// `Aᴴ B`.
-    fn inner(a: MatRef<'_, Self>, b: MatRef<'_, Self>) -> Mat<Self>;
-    /// `A B`.
-    fn product(a: MatRef<'_, Self>, b: MatRef<'_, Self>) -> Mat<Self>;
-    /// Whether the type is real, so that subspaces must be closed under conjugation.
-    const REAL: bool;
-    /// Basis of this type for the span of `q`, which has orthonormal columns; the result has them too.
-    fn basis_of(q: MatRef<'_, c64>) -> Result<Mat<Self>, ReductionError>;
-}
-
-impl Number for f64 {
-    const REAL: bool = true;
-    fn complex(self) -> c64 {
-        c64::new(self, 0.0)
-    }
-    fn from_complex(value: c64) -> Self {
-        value.re
-    }
-    fn inner(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
-        a.transpose() * b
-    }
-    fn product(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
-        a * b
-    }
-    fn basis_of(q: MatRef<'_, c64>) -> Result<Mat<f64>, ReductionError> {
-        let projector = q * q.adjoint();
-        let m = q.nrows();
-        let real = Mat::from_fn(m, m, |i, j| 0.5 * (projector[(i, j)].re + projector[(j, i)].re));
-        let (_, vectors) = super::dense::symmetric_eigen("projector", real.as_ref())?;
-        // The projector has the eigenvalues 0 and 1, in ascending order.
-        Ok(vectors.subcols(m - q.ncols(), q.ncols()).to_owned())
-    }
-}
-
-impl Number for c64 {
-    const REAL: bool = false;
-    fn complex(self) -> c64 {
-        self
-    }
-    fn from_complex(value: c64) -> Self {
-        value
-    }
-    fn inner(a: MatRef<'_, c64>, b: MatRef<'_, c64>) -> Mat<c64> {
-        a.adjoint() * b
-    }
-    fn product(a: MatRef<'_, c64>, b: MatRef<'_, c64>) -> Mat<c64> {
-        a * b
-    }
-    fn basis_of(q: MatRef<'_, c64>) -> Result<Mat<c64>, ReductionError> {
-        Ok(q.to_owned())
-    }
-}
-
-/// Pseudo-random numbers in [-1, 1), real or complex, reproducible.
-pub(super) fn random<T: Number>(n: usize, columns: usize, seed: u64) -> Mat<T> {
-    let (re, im) = (random_block(n, columns, seed), random_block(if T::REAL { 0 } else { n }, columns, seed ^ 0x5a5a));
-    Mat::from_fn(n, columns, |i, j| T::from_complex(c64::new(re[(i, j)], if T::REAL { 0.0 } else { im[(i, j)] })))
-}
 
 /// Converged eigenpairs in descending magnitude.
 pub(super) struct Largest {
@@ -145,16 +77,16 @@ impl Iteration<'_> {
         let mut next_check = (3 * self.count / 2).min(capacity);
         let (mut restarts, mut built) = (0, BLOCK);
         loop {
-            let mut w = apply(space.last_block());
+            let mut w = apply(space.basis.last_block(BLOCK));
             let before = w.norm_l2();
             space.project_out(&mut w);
-            let whole = space.size + BLOCK > self.dimension || w.norm_l2() < 1e-14 * before;
-            let full = space.size + BLOCK > capacity || whole;
-            if full || space.size >= next_check {
+            let whole = space.basis.size() + BLOCK > self.dimension || w.norm_l2() < 1e-14 * before;
+            let full = space.basis.size() + BLOCK > capacity || whole;
+            if full || space.basis.size() >= next_check {
                 let remainder = T::inner(w.as_ref(), w.as_ref());
                 let ritz = space.ritz(self.what, remainder.as_ref())?;
                 let good = |k: &usize| ritz.residuals[*k] <= self.residual_limit || whole;
-                let converged = (0..space.size).take_while(good).count();
+                let converged = (0..space.basis.size()).take_while(good).count();
                 progress(built, converged);
                 let theta: Vec<c64> = (0..converged).map(|k| ritz.schur.value(k)).collect();
                 if converged >= self.count || whole || (converged > 0 && enough(&theta)) {
@@ -173,12 +105,12 @@ impl Iteration<'_> {
                 if full {
                     let coupling = space.restart(&ritz, (self.count + capacity) / 2)?;
                     restarts += 1;
-                    next_check = space.size + self.count / 2;
+                    next_check = space.basis.size() + self.count / 2;
                     space.append(w, Some(coupling), self.seed);
                     built += BLOCK;
                     continue;
                 }
-                next_check = space.size + (self.count / 2).max(BLOCK);
+                next_check = space.basis.size() + (self.count / 2).max(BLOCK);
             }
             space.append(w, None, self.seed);
             built += BLOCK;
@@ -194,68 +126,58 @@ struct Ritz {
 
 /// Orthonormal basis `V` and the projected operator `H = Vᴴ C V`.
 struct Space<T: Number> {
-    basis: Mat<T>,
+    basis: Basis<T>,
     projected: Mat<c64>,
-    size: usize,
 }
 
 impl<T: Number> Space<T> {
     fn new(n: usize, capacity: usize) -> Self {
-        Self { basis: Mat::zeros(n, capacity), projected: Mat::zeros(capacity, capacity), size: 0 }
-    }
-
-    fn last_block(&self) -> Mat<T> {
-        self.basis.subcols(self.size - BLOCK, BLOCK).to_owned()
+        Self { basis: Basis::new(n, capacity), projected: Mat::zeros(capacity, capacity) }
     }
 
     /// Orthogonalises `w = C V_last` against the basis, twice, and adds the coefficients to `H`.
     fn project_out(&mut self, w: &mut Mat<T>) {
-        let first = self.size - BLOCK;
-        for _ in 0..2 {
-            let held = self.basis.subcols(0, self.size);
-            let coefficients = T::inner(held, w.as_ref());
-            *w -= T::product(held, coefficients.as_ref());
+        let (size, projected) = (self.basis.size(), &mut self.projected);
+        self.basis.project_out(w, |coefficients| {
             for j in 0..BLOCK {
-                for i in 0..self.size {
-                    self.projected[(i, first + j)] += coefficients[(i, j)].complex();
+                for i in 0..size {
+                    projected[(i, size - BLOCK + j)] += coefficients[(i, j)].complex();
                 }
             }
-        }
+        });
     }
 
     /// Orthonormalises a block, `W = Q R`, and appends `Q`. `R` couples it to the previous block; after a restart,
     /// `coupling` couples `W` to the whole basis. A vector that vanishes is replaced by a random one without coupling.
     fn append(&mut self, block: Mat<T>, coupling: Option<Mat<c64>>, seed: u64) {
-        let (n, start) = (block.nrows(), self.size);
+        let (n, start) = (block.nrows(), self.basis.size());
         let mut r = Mat::<c64>::zeros(BLOCK, BLOCK);
         let whole = block.norm_l2();
         for column in 0..BLOCK {
             let mut vector = block.subcols(column, 1).to_owned();
-            let within = self.make_orthogonal(&mut vector, start);
+            let within = self.basis.make_orthogonal(&mut vector, start);
             (0..column).for_each(|i| r[(i, column)] = within[(i, 0)].complex());
             let mut norm = vector.norm_l2();
             if norm > 1e-13 * whole {
                 // A small remainder may no longer be orthogonal to the basis.
-                self.make_orthogonal(&mut vector, 0);
+                self.basis.make_orthogonal(&mut vector, 0);
                 norm = vector.norm_l2();
                 r[(column, column)] = c64::new(norm, 0.0);
             }
             let mut attempt = 0;
             while norm <= 1e-13 * whole {
-                vector = random::<T>(n, 1, seed ^ (0x9e37 + 8 * self.size as u64 + attempt));
-                self.make_orthogonal(&mut vector, 0);
-                self.make_orthogonal(&mut vector, 0);
+                vector = random::<T>(n, 1, seed ^ (0x9e37 + 8 * self.basis.size() as u64 + attempt));
+                self.basis.make_orthogonal(&mut vector, 0);
+                self.basis.make_orthogonal(&mut vector, 0);
                 norm = vector.norm_l2();
                 attempt += 1;
                 if norm > 1e-6 {
                     break;
                 }
             }
-            let scale = T::from_complex(c64::new(1.0 / norm, 0.0));
-            vector.col_mut(0).iter_mut().for_each(|value| *value *= scale);
-            self.make_orthogonal(&mut vector, 0);
-            self.basis.subcols_mut(self.size, 1).copy_from(&vector);
-            self.size += 1;
+            Basis::normalise(&mut vector);
+            self.basis.make_orthogonal(&mut vector, 0);
+            self.basis.push(&vector);
         }
         let joined = match coupling {
             // `W = Q R`: multiply by `R` to convert the coupling of `W` to that of `Q`.
@@ -268,17 +190,9 @@ impl<T: Number> Space<T> {
         }
     }
 
-    /// Orthogonalises a vector against the basis from column `from` on; returns the coefficients.
-    fn make_orthogonal(&self, vector: &mut Mat<T>, from: usize) -> Mat<T> {
-        let held = self.basis.subcols(from, self.size - from);
-        let coefficients = T::inner(held, vector.as_ref());
-        *vector -= T::product(held, coefficients.as_ref());
-        coefficients
-    }
-
     /// Ordered Schur form of `H` and residuals; `remainder` is the Gram matrix of the next block.
     fn ritz(&self, what: &str, remainder: MatRef<'_, T>) -> Result<Ritz, ReductionError> {
-        let m = self.size;
+        let m = self.basis.size();
         let failed = || ReductionError::Factorisation {
             what: what.to_owned(),
             reason: format!("the eigenvalues of a projection on {m} vectors did not converge"),
@@ -300,25 +214,17 @@ impl<T: Number> Space<T> {
 
     /// The Ritz vectors of the `count` largest Ritz values.
     fn vectors(&self, ritz: &Ritz, count: usize) -> Mat<c64> {
-        let n = self.basis.nrows();
-        let mut mixed = Mat::<c64>::zeros(self.size, count);
+        let mut mixed = Mat::<c64>::zeros(self.basis.size(), count);
         for k in 0..count {
             mixed.subcols_mut(k, 1).copy_from(ritz.schur.vector(k));
         }
-        let mut vectors = Mat::zeros(n, count);
-        for first in (0..n).step_by(ROWS_TOGETHER) {
-            let rows = ROWS_TOGETHER.min(n - first);
-            let part = self.basis.submatrix(first, 0, rows, self.size);
-            let part = Mat::from_fn(rows, self.size, |i, j| part[(i, j)].complex());
-            vectors.subrows_mut(first, rows).copy_from(part * &mixed);
-        }
-        vectors
+        self.basis.combined(mixed.as_ref())
     }
 
     /// Truncates the basis to about `keep` vectors, which span the Schur vectors of the largest Ritz values. Returns
     /// the coupling of the next block `W` to them.
     fn restart(&mut self, ritz: &Ritz, keep: usize) -> Result<Mat<c64>, ReductionError> {
-        let m = self.size;
+        let m = self.basis.size();
         let size = |k: usize| ritz.schur.value(k).norm();
         // Do not separate a conjugate pair.
         let mut keep = keep.min(m - BLOCK);
@@ -327,15 +233,10 @@ impl<T: Number> Space<T> {
         }
         let kept = T::basis_of(ritz.schur.u.subcols(0, keep))?;
         let z = Mat::from_fn(m, keep, |i, j| kept[(i, j)].complex());
-        for first in (0..self.basis.nrows()).step_by(ROWS_TOGETHER) {
-            let rows = ROWS_TOGETHER.min(self.basis.nrows() - first);
-            let recombined = T::product(self.basis.submatrix(first, 0, rows, m), kept.as_ref());
-            self.basis.submatrix_mut(first, 0, rows, keep).copy_from(&recombined);
-        }
+        self.basis.recombine(kept.as_ref());
         let projected = z.adjoint() * (self.projected.submatrix(0, 0, m, m) * &z);
         self.projected.fill(c64::new(0.0, 0.0));
         self.projected.submatrix_mut(0, 0, keep, keep).copy_from(&projected);
-        self.size = keep;
         Ok(z.subrows(m - BLOCK, BLOCK).to_owned())
     }
 }

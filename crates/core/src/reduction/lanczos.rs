@@ -16,13 +16,12 @@ use faer::{Mat, MatRef};
 
 use super::ReductionError;
 use super::dense::symmetric_eigen;
+use super::krylov::{Basis, random_block};
 
 /// Block size: number of vectors added per step.
 pub(super) const BLOCK: usize = 6;
 /// Largest number of restarts.
 const MOST_RESTARTS: usize = 60;
-/// Number of rows of the basis recombined at a time.
-const ROWS_TOGETHER: usize = 4096;
 
 /// Converged eigenpairs, largest `θ` first.
 pub(super) struct Largest {
@@ -69,19 +68,18 @@ impl Iteration<'_> {
         let mut next_check = self.count + self.count / 2 + 4 * BLOCK;
         let (mut restarts, mut built) = (0, BLOCK);
         loop {
-            let mut w = apply(space.last_block());
+            let mut w = apply(space.basis.last_block(BLOCK));
             let remainder = space.project_out(&mut w);
-            let full = space.size + BLOCK > self.capacity;
-            if full || space.size >= next_check {
+            let full = space.basis.size() + BLOCK > self.capacity;
+            if full || space.basis.size() >= next_check {
                 let ritz = space.ritz(self.what, remainder.as_ref())?;
                 let good = |k: &usize| ritz.residuals[*k] < self.residual_limit;
                 let converged = (0..ritz.theta.len()).take_while(good).count();
                 progress(built, converged);
                 if enough(&ritz.theta[..converged]) {
                     // Reuse the memory of the basis, which is the peak.
-                    space.recombine(ritz.vectors.subcols(0, converged));
-                    let mut vectors = space.basis;
-                    vectors.truncate(self.dimension, converged);
+                    space.basis.recombine(ritz.vectors.subcols(0, converged));
+                    let vectors = space.basis.into_vectors();
                     return Ok(Largest { theta: ritz.theta[..converged].to_vec(), vectors });
                 }
                 if full && (restarts == MOST_RESTARTS || self.capacity + BLOCK > self.dimension) {
@@ -97,7 +95,7 @@ impl Iteration<'_> {
                     space.restart(&ritz, (self.count + self.capacity) / 2);
                     restarts += 1;
                 }
-                next_check = space.size + (self.count / 8).max(2 * BLOCK);
+                next_check = space.basis.size() + (self.count / 8).max(2 * BLOCK);
             }
             space.append(w, self.seed);
             built += BLOCK;
@@ -115,41 +113,28 @@ struct Ritz {
 
 /// Orthonormal basis `V` and the projected operator `T = Vᵀ C V`.
 struct Space {
-    basis: Mat<f64>,
+    basis: Basis<f64>,
     projected: Mat<f64>,
-    size: usize,
 }
 
 impl Space {
     fn new(n: usize, capacity: usize) -> Self {
-        Self { basis: Mat::zeros(n, capacity), projected: Mat::zeros(capacity, capacity), size: 0 }
-    }
-
-    fn held(&self) -> MatRef<'_, f64> {
-        self.basis.subcols(0, self.size)
-    }
-
-    fn last_block(&self) -> Mat<f64> {
-        self.basis.subcols(self.size - BLOCK, BLOCK).to_owned()
+        Self { basis: Basis::new(n, capacity), projected: Mat::zeros(capacity, capacity) }
     }
 
     /// Orthogonalises `w = C V_last` against the basis, twice, and adds the coefficients to `T`. Returns the Gram
     /// matrix `wᵀ w` of the remainder.
     fn project_out(&mut self, w: &mut Mat<f64>) -> Mat<f64> {
-        let first = self.size - BLOCK;
-        for _ in 0..2 {
-            let coefficients = self.held().transpose() * &*w;
-            *w -= self.held() * &coefficients;
-            let mut column = self.projected.submatrix_mut(0, first, self.size, BLOCK);
-            column += coefficients;
-        }
+        let size = self.basis.size();
+        let mut column = self.projected.submatrix_mut(0, size - BLOCK, size, BLOCK);
+        self.basis.project_out(w, |coefficients| column += coefficients);
         w.transpose() * &*w
     }
 
     /// Orthonormalises a block and appends it. A vector that vanishes is replaced by a random one.
     fn append(&mut self, block: Mat<f64>, seed: u64) {
         let n = block.nrows();
-        let block_start = self.size;
+        let block_start = self.basis.size();
         for column in 0..BLOCK {
             let mut vector = block.subcols(column, 1).to_owned();
             // The block is already orthogonal to the basis, unless cancellation within the block leaves little of a
@@ -157,34 +142,26 @@ impl Space {
             let mut from = block_start;
             for attempt in 0..4_u64 {
                 let before = vector.norm_l2();
-                self.make_orthogonal(&mut vector, from);
+                self.basis.make_orthogonal(&mut vector, from);
                 if from == block_start && vector.norm_l2() > 1e-2 * before {
                     break;
                 }
                 from = 0;
-                self.make_orthogonal(&mut vector, from);
+                self.basis.make_orthogonal(&mut vector, from);
                 if vector.norm_l2() > 1e-10 * before {
                     break;
                 }
-                vector = random_block(n, 1, seed ^ (0x9e37 + 4 * self.size as u64 + attempt));
+                vector = random_block(n, 1, seed ^ (0x9e37 + 4 * self.basis.size() as u64 + attempt));
             }
-            self.make_orthogonal(&mut vector, from);
-            vector = faer::Scale(1.0 / vector.norm_l2()) * vector;
-            self.basis.subcols_mut(self.size, 1).copy_from(&vector);
-            self.size += 1;
+            self.basis.make_orthogonal(&mut vector, from);
+            Basis::normalise(&mut vector);
+            self.basis.push(&vector);
         }
-    }
-
-    /// Orthogonalises a vector against the basis from column `from` on.
-    fn make_orthogonal(&self, vector: &mut Mat<f64>, from: usize) {
-        let held = self.basis.subcols(from, self.size - from);
-        let coefficients = held.transpose() * &*vector;
-        *vector -= held * coefficients;
     }
 
     /// Ritz pairs and their residuals; `remainder` is the Gram matrix of the next block.
     fn ritz(&self, what: &str, remainder: MatRef<'_, f64>) -> Result<Ritz, ReductionError> {
-        let m = self.size;
+        let m = self.basis.size();
         // Each column of T is computed in its own step, so that the upper triangle holds every coefficient once.
         let t = Mat::from_fn(m, m, |i, j| self.projected[(i.min(j), i.max(j))]);
         let (theta, vectors) = symmetric_eigen(what, t.as_ref())?;
@@ -199,37 +176,14 @@ impl Space {
         })
     }
 
-    /// Overwrites the first columns of the basis with `V S`.
-    fn recombine(&mut self, s: MatRef<'_, f64>) {
-        for first in (0..self.basis.nrows()).step_by(ROWS_TOGETHER) {
-            let rows = ROWS_TOGETHER.min(self.basis.nrows() - first);
-            let recombined = self.basis.submatrix(first, 0, rows, self.size) * s;
-            self.basis.submatrix_mut(first, 0, rows, s.ncols()).copy_from(&recombined);
-        }
-    }
-
     /// Restarts from the `keep` best Ritz vectors; the recurrence continues with the remainder of the last block.
     fn restart(&mut self, ritz: &Ritz, keep: usize) {
-        self.recombine(ritz.vectors.subcols(0, keep));
+        self.basis.recombine(ritz.vectors.subcols(0, keep));
         self.projected.fill(0.0);
         for (k, theta) in ritz.theta[..keep].iter().enumerate() {
             self.projected[(k, k)] = *theta;
         }
-        self.size = keep;
     }
-}
-
-/// Pseudo-random numbers in [-1, 1), reproducible (SplitMix64, Steele et al. 2014).
-pub(super) fn random_block(n: usize, columns: usize, seed: u64) -> Mat<f64> {
-    let mut state = seed.wrapping_mul(0x2545_f491_4f6c_dd1d).wrapping_add(0x1234_5678);
-    let mut next = || {
-        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = state;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
-    };
-    Mat::from_fn(n, columns, |_, _| next())
 }
 
 #[cfg(test)]

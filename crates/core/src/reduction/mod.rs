@@ -30,6 +30,8 @@ mod error;
 mod full_model;
 mod full_order;
 mod full_problem;
+mod full_root;
+mod krylov;
 mod krylov_schur;
 mod lanczos;
 mod matching;
@@ -47,19 +49,21 @@ mod substructures;
 #[cfg(test)]
 mod test_models;
 
-pub use balance::balanced_displacement;
+pub(crate) use balance::balanced_displacement;
 pub use compare::{
     CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
 };
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::{GIB, ReductionError};
 pub use full_model::{FullContact, FullModel, FullPart, PartMatrices, PartTurning, Projected, SparseRow, SparseTerm};
-pub use full_order::{CoveredDisc, FullProgress, FullRoot, FullSolver, FullSpectrum, FullVectors};
+pub use full_order::FullSolver;
+pub use full_root::{CoveredDisc, FullProgress, FullRoot, FullSpectrum, FullVectors};
 pub use matching::{Counted, RootMatch, match_roots};
 pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use operating_box::OperatingBox;
 pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
-pub use project::{project_dense, project_sparse};
+use project::project_dense;
+pub use project::project_sparse;
 pub use residual::{InertiaBy, Residual};
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 

@@ -448,7 +448,7 @@ fn merge(
 fn smallest_scaled(matrix: &SparseMatrix, diagonal: &[f64]) -> Option<f64> {
     let n = diagonal.len();
     let scale: Vec<f64> = diagonal.iter().map(|value| value.sqrt().recip()).collect();
-    let mut vector = super::lanczos::random_block(n, 1, 1);
+    let mut vector = super::krylov::random_block(n, 1, 1);
     let norm = vector.norm_l2();
     vector *= faer::Scale(1.0 / norm);
     let (mut previous, mut beta) = (Mat::<f64>::zeros(n, 1), 0.0);

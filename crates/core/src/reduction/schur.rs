@@ -189,7 +189,7 @@ impl Schur {
 
 #[cfg(test)]
 mod tests {
-    use super::super::lanczos::random_block;
+    use super::super::krylov::random_block;
     use super::*;
 
     /// Backward stability: `|U T Uᴴ - A|`, `|Uᴴ U - I|` and `|A x - θ x|` are a modest multiple of `ε √m` (of 60).
