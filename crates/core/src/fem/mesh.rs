@@ -13,13 +13,16 @@ use super::Material;
 /// A named component of one material.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Component {
+    /// Name, as decks list it.
     pub name: String,
+    /// Material of all its bricks.
     pub material: Material,
 }
 
 /// An 8-node brick, nodes ordered as `C3D8I` of Abaqus and CalculiX.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Brick {
+    /// Indices of the corners in [`Mesh::nodes_m`].
     pub nodes: [usize; 8],
     /// Index in [`Mesh::components`].
     pub component: usize,
@@ -30,7 +33,9 @@ pub struct Brick {
 pub struct Mesh {
     /// Positions of the nodes, m.
     pub nodes_m: Vec<[f64; 3]>,
+    /// The bricks, each of one component.
     pub bricks: Vec<Brick>,
+    /// The components, which bricks refer to by index.
     pub components: Vec<Component>,
     /// For each hanging node: the independent nodes it depends on and their weights, which sum to 1.
     pub hanging: BTreeMap<usize, Vec<(usize, f64)>>,
@@ -39,7 +44,9 @@ pub struct Mesh {
 /// Shape of a lattice: which cells are filled, and whether the third coordinate is periodic.
 #[derive(Clone, Copy)]
 pub struct Extent<'a> {
+    /// Whether the cell with these lattice indices has a brick.
     pub filled: &'a dyn Fn([usize; 3]) -> bool,
+    /// Whether the last grid line of the third coordinate is the first one: a ring.
     pub closed: bool,
 }
 

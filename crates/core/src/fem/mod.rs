@@ -26,24 +26,61 @@ pub use turning::{Axis, Turning, TurningError};
 /// An isotropic, linearly elastic material.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Material {
+    /// Density `ρ`, kg/m³, above 0.
     pub density_kg_per_m3: f64,
+    /// Young's modulus `E`, Pa, above 0.
     pub young_pa: f64,
+    /// Poisson's ratio `ν`, between -1 and 0.5.
     pub poisson: f64,
 }
 
 /// Error of a finite-element model, with the offending value. Nodes and bricks are counted from 0.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum FemError {
+    /// A material constant is outside its range.
     #[error("{component}: {field} is {value}, expected {limit}")]
-    Material { component: String, field: &'static str, value: f64, limit: &'static str },
+    Material {
+        /// Name of the component.
+        component: String,
+        /// Field of [`Material`].
+        field: &'static str,
+        /// The value found.
+        value: f64,
+        /// The range expected.
+        limit: &'static str,
+    },
+    /// A brick is turned inside out or has no volume.
     #[error("brick {brick} of {component}: the Jacobian is {value:.3e} m^3, expected more than 0")]
-    Inverted { brick: usize, component: String, value: f64 },
+    Inverted {
+        /// Index of the brick.
+        brick: usize,
+        /// Name of its component.
+        component: String,
+        /// Smallest determinant of its Jacobian, m³.
+        value: f64,
+    },
+    /// A node belongs to no brick and would move freely.
     #[error("node {node} is in no brick")]
-    Loose { node: usize },
+    Loose {
+        /// Index of the node.
+        node: usize,
+    },
+    /// A spring has no positive stiffness.
     #[error("spring {spring}: the stiffness is {value} N/m, expected a finite number above 0")]
-    Spring { spring: usize, value: f64 },
+    Spring {
+        /// Index of the spring.
+        spring: usize,
+        /// Its stiffness, N/m.
+        value: f64,
+    },
+    /// Fewer degrees of freedom than the coarsest mesh has.
     #[error("{value} degrees of freedom requested, expected at least {limit}")]
-    Size { value: usize, limit: usize },
+    Size {
+        /// Number asked for.
+        value: usize,
+        /// Size of the coarsest mesh.
+        limit: usize,
+    },
 }
 
 impl Material {

@@ -10,18 +10,24 @@ use crate::reduction::SparseMatrix;
 /// A spring along one direction (0 to 2 for x, y, z) between two nodes, or between a node and the ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spring {
+    /// Index of the node.
     pub node: usize,
+    /// Index of the other node; `None` for the ground.
     pub other: Option<usize>,
+    /// 0, 1 or 2 for x, y or z.
     pub direction: usize,
+    /// Stiffness, N/m, above 0.
     pub stiffness_n_per_m: f64,
 }
 
 /// A mesh with its supports and springs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Structure {
+    /// Nodes and bricks.
     pub mesh: Mesh,
     /// Node and direction, 0 to 2, of each displacement fixed at 0. Hanging nodes depend on others and cannot be fixed.
     pub fixed: BTreeSet<(usize, usize)>,
+    /// Springs between nodes, or to the ground.
     pub springs: Vec<Spring>,
 }
 

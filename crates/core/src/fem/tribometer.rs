@@ -70,31 +70,50 @@ const fn material(density_kg_per_m3: f64, young_pa: f64, poisson: f64) -> Materi
 /// Dimensions of the rig, m. In the upper part, `x` is measured from [`MEAN_RADIUS_M`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Dimensions {
+    /// Where the pad begins and ends along x.
     pub pad_x: [f64; 2],
+    /// Half width of the pad along z.
     pub pad_half_z: f64,
+    /// Height of the pad.
     pub pad_height: f64,
     /// Half widths along x and z.
     pub pad_holder_half: [f64; 2],
+    /// Height of the pad holder.
     pub pad_holder_height: f64,
     /// Half widths along x and z of force sensor and sensor holder; both are grid lines of the pad.
     pub column_half: [f64; 2],
+    /// Height of the force sensor.
     pub sensor_height: f64,
     /// Heights of three sections of the sensor holder: `shank_height` below the bearing, `bearing_height` beside it and
     /// `collar_height` above it.
     pub shank_height: f64,
+    /// Height of the sensor holder beside the bearing.
     pub bearing_height: f64,
+    /// Height of the sensor holder above the bearing.
     pub collar_height: f64,
+    /// Half width of the linear bearing along x.
     pub bearing_half_x: f64,
+    /// Depth of the linear bearing along z.
     pub bearing_depth: f64,
+    /// Depth of the bracket plate along z.
     pub plate_depth: f64,
+    /// Half widths of the cylinder along x and z.
     pub cylinder_half: [f64; 2],
+    /// Height of the cylinder.
     pub cylinder_height: f64,
+    /// Half widths of the spring holder along x and z.
     pub spring_holder_half: [f64; 2],
+    /// Height of the spring holder.
     pub spring_holder_height: f64,
+    /// Outer radius of the disc.
     pub disc_radius: f64,
+    /// Thickness of the disc.
     pub disc_thickness: f64,
+    /// Radius of the bore of disc and holders.
     pub bore_radius: f64,
+    /// Outer radius of the disc holders.
     pub disc_holder_radius: f64,
+    /// Height of each disc holder.
     pub disc_holder_height: f64,
     /// Distance from the contact patch to the edge of the finely meshed part of the disc, along the radius and along
     /// the circumference.
@@ -134,6 +153,7 @@ impl Default for Dimensions {
 /// One of the two substructures, with free contact interface.
 #[derive(Clone, Debug)]
 pub struct Part {
+    /// Mesh, supports and springs.
     pub structure: Structure,
     /// Nodes of the contact patch; the position along x varies fastest.
     pub interface: Vec<usize>,
@@ -143,7 +163,9 @@ pub struct Part {
 /// coincide.
 #[derive(Clone, Debug)]
 pub struct Tribometer {
+    /// The upper part: pad, holders, sensor, bearing, cylinder.
     pub pad: Part,
+    /// The lower part: disc and holders.
     pub disc: Part,
 }
 

@@ -27,6 +27,7 @@ use crate::reduction::{ReductionError, SparseMatrix, balanced_displacement};
 /// An axis in space.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Axis {
+    /// A point of the axis, m.
     pub point_m: [f64; 3],
     /// Of length 1; the turn is right-handed about it.
     pub direction: [f64; 3],
@@ -47,8 +48,10 @@ pub struct Turning {
 /// Error of [`Structure::turning`].
 #[derive(Clone, Debug, thiserror::Error)]
 pub enum TurningError {
+    /// The structure has no matrices.
     #[error(transparent)]
     Fem(#[from] FemError),
+    /// The centrifugal stress could not be solved for.
     #[error("centrifugal load: {0}")]
     Load(#[from] ReductionError),
 }

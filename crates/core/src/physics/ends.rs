@@ -94,7 +94,9 @@ pub struct NearestEnd {
 /// A value with a bound of its error; the bound is NaN if unknown.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounded {
+    /// The value.
     pub value: f64,
+    /// Bound of its error, in the same unit; NaN if unknown.
     pub error: f64,
 }
 

@@ -47,6 +47,7 @@ pub struct Trial {
 /// The best stiffness and how well it is determined.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Identified {
+    /// The trial with the smallest root mean square error.
     pub best: Trial,
     /// Factors between which the error stays below twice its minimum; `None` where it does not reach that in the
     /// search range.
@@ -60,12 +61,29 @@ pub struct Identified {
 /// Why the stiffness could not be identified.
 #[derive(Debug, PartialEq, thiserror::Error)]
 pub enum IdentificationError<E> {
+    /// The model has fewer natural frequencies than there are targets.
     #[error("{found} natural frequencies, expected at least the {expected} of the targets")]
-    TooFew { found: usize, expected: usize },
+    TooFew {
+        /// The number found.
+        found: usize,
+        /// The number expected.
+        expected: usize,
+    },
+    /// A target is no frequency, or they do not ascend.
     #[error("target {index} is {value} Hz, expected a finite frequency above 0, ascending")]
-    Target { index: usize, value: f64 },
+    Target {
+        /// Index of the target.
+        index: usize,
+        /// The target, Hz.
+        value: f64,
+    },
+    /// The error is smallest at the end of the search range, so there is no minimum in it.
     #[error("the error still falls at {factor:e} times the present stiffness, the end of the search")]
-    AtTheEnd { factor: f64 },
+    AtTheEnd {
+        /// Factor on the present stiffness at that end.
+        factor: f64,
+    },
+    /// The natural frequencies could not be computed.
     #[error(transparent)]
     Model(#[from] E),
 }

@@ -3,27 +3,27 @@
 //! Pure: no clock, file, bus, log or serialisation. Everything is SI, angular frequencies in rad/s.
 
 pub mod chart;
-pub mod critical;
+pub(crate) mod critical;
 mod decoupled;
 mod dense_eigen;
-pub mod ends;
+pub(crate) mod ends;
 mod flexible_contact;
 pub mod identification;
-pub mod model;
-pub mod numbering;
-pub mod operating_point;
+pub(crate) mod model;
+pub(crate) mod numbering;
+pub(crate) mod operating_point;
 pub mod sensitivity;
 pub(crate) mod solver;
-pub mod spectrum;
+pub(crate) mod spectrum;
 pub mod stability_map;
 mod steady_contact;
 #[cfg(test)]
 mod steady_tests;
-pub mod summary;
+pub(crate) mod summary;
 #[cfg(test)]
 pub(crate) mod test_models;
 mod traces;
-pub mod tracking;
+pub(crate) mod tracking;
 #[cfg(test)]
 mod turning;
 
@@ -31,9 +31,9 @@ pub use chart::{Chart, NotCharted};
 pub use critical::{Window, WindowKind};
 pub use ends::{Bounded, End, Ends, NearestEnd};
 pub use flexible_contact::ResidualFlexibility;
-pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Parameter, Term};
+pub use model::{ContactLaw, ContactPairs, CustomLaw, Law, Model, ModelError, Parameter, Structure, Term};
 pub use numbering::Census;
-pub use operating_point::{ContactState, OperatingPoint};
+pub use operating_point::{ContactState, OperatingPoint, SLIDING_SPEED_RAD_S};
 pub use solver::Solver;
 pub use spectrum::{Root, RootError, SolveError, Spectrum, Vectors};
 pub use stability_map::{MapError, MapOptions, NextWindow, StabilityMap};

@@ -44,14 +44,32 @@ pub enum Law {
     LateralFriction,
     /// `x T_k(x / r)` with `x = s μ`, while the contact slides. A sum of such terms expands `f(x) - f(0)` of a smooth
     /// function `f`. Undefined for `|μ| > r`.
-    FrictionChebyshev { degree: usize, range: f64 },
+    FrictionChebyshev {
+        /// Degree `k` of the polynomial.
+        degree: usize,
+        /// Largest `|μ|` of the expansion, `r`.
+        range: f64,
+    },
     /// `Ω^p` of the disc speed `Ω` with its sign, rad/s, in any contact state: gyroscopic terms (`p = 1`) and spin
     /// terms (`p = 2`) of a disc that turns in the frame of the pad.
-    DiscSpeed { power: u8 },
+    DiscSpeed {
+        /// Exponent `p`.
+        power: u8,
+    },
     /// `Ω^p` while the contact is closed.
-    DiscSpeedInContact { power: u8 },
+    DiscSpeedInContact {
+        /// Exponent `p`.
+        power: u8,
+    },
     /// `Ω^p x T_k(x / r)`, the product of [`Law::DiscSpeed`] and [`Law::FrictionChebyshev`].
-    DiscSpeedChebyshev { power: u8, degree: usize, range: f64 },
+    DiscSpeedChebyshev {
+        /// Exponent `p`.
+        power: u8,
+        /// Degree `k` of the polynomial.
+        degree: usize,
+        /// Largest `|μ|` of the expansion, `r`.
+        range: f64,
+    },
     /// Any other function, given as an expression in the rig file.
     Custom(CustomLaw),
 }
@@ -192,33 +210,102 @@ impl Parameter {
 /// Why a model could not be built or evaluated.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ModelError {
+    /// A matrix has the wrong shape.
     #[error("{what} is {rows}x{columns}, expected {expected}x{expected}")]
-    Shape { what: String, rows: usize, columns: usize, expected: usize },
+    Shape {
+        /// Which matrix.
+        what: String,
+        /// Number of rows found.
+        rows: usize,
+        /// Number of columns found.
+        columns: usize,
+        /// Number of rows and columns expected.
+        expected: usize,
+    },
+    /// A matrix has an entry that is no finite number.
     #[error("{what}: entry ({row}, {column}) is {value}, expected a finite number")]
-    NotFinite { what: String, row: usize, column: usize, value: f64 },
+    NotFinite {
+        /// Which matrix.
+        what: String,
+        /// Row of the entry, from 0.
+        row: usize,
+        /// Column of the entry, from 0.
+        column: usize,
+        /// The entry.
+        value: f64,
+    },
+    /// A law has no finite value at an operating point.
     #[error(
         "{what} is {value} at {normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}; expected a finite number"
     )]
-    LawNotFinite { what: String, value: f64, normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64 },
+    LawNotFinite {
+        /// Which law.
+        what: String,
+        /// The value found.
+        value: f64,
+        /// Normal load, N.
+        normal_load_n: f64,
+        /// Disc speed, rad/s.
+        disc_speed_rad_s: f64,
+        /// Friction coefficient.
+        friction_coefficient: f64,
+    },
+    /// A list does not have one value for each contact pair.
     #[error("{what} has {found} values, expected one for each of {expected} contact pairs")]
-    PairCount { what: &'static str, found: usize, expected: usize },
+    PairCount {
+        /// Which list.
+        what: &'static str,
+        /// The number found.
+        found: usize,
+        /// Number of contact pairs.
+        expected: usize,
+    },
+    /// Residual flexibility beside a contact stiffness that depends on the load.
     #[error(
         "residual flexibility with [load] exponent {exponent}, expected 0: it requires a contact stiffness that \
          does not depend on the load"
     )]
-    FlexibleLoadExponent { exponent: f64 },
+    FlexibleLoadExponent {
+        /// [`ContactLaw::exponent`].
+        exponent: f64,
+    },
+    /// The contact flexibility is nearly singular.
     #[error(
         "contact flexibility at friction coefficient {friction_coefficient} has condition number {condition:.1e}, \
          limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient exclude it"
     )]
-    IllConditioned { friction_coefficient: f64, condition: f64, limit: f64 },
+    IllConditioned {
+        /// Friction coefficient.
+        friction_coefficient: f64,
+        /// Its condition number.
+        condition: f64,
+        /// Largest condition number accepted.
+        limit: f64,
+    },
+    /// The contact flexibility is not resolved by Chebyshev polynomials in the friction coefficient.
     #[error(
         "contact flexibility over friction coefficients up to {range} leaves {value:.1e} to the highest of {degrees} \
          Chebyshev polynomials, limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient help"
     )]
-    FlexibilityFit { range: f64, degrees: usize, value: f64, limit: f64 },
+    FlexibilityFit {
+        /// Largest friction coefficient of the expansion.
+        range: f64,
+        /// Number of polynomials.
+        degrees: usize,
+        /// Size of the highest coefficient, relative.
+        value: f64,
+        /// Largest such size accepted.
+        limit: f64,
+    },
+    /// A contact pair has no lever arm, which lateral damping needs.
     #[error("contact pair {pair}: radius_m is {radius_m}, expected more than 0 for lateral damping")]
-    Radius { pair: usize, radius_m: f64 },
+    Radius {
+        /// Index of the pair.
+        pair: usize,
+        /// Its distance from the axis, m.
+        radius_m: f64,
+    },
+    /// An operating point with a value that is no finite number.
     #[error(
         "contact pair {pair}: damping {damping} N·s/m with stiffness {stiffness} N/m; with a contact state the damping \
          of a pair is proportional to its stiffness"
@@ -235,7 +322,14 @@ pub enum ModelError {
     #[error(
         "operating point ({normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}) is not finite"
     )]
-    PointNotFinite { normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64 },
+    PointNotFinite {
+        /// Normal load, N.
+        normal_load_n: f64,
+        /// Disc speed, rad/s.
+        disc_speed_rad_s: f64,
+        /// Friction coefficient.
+        friction_coefficient: f64,
+    },
 }
 
 /// A term, with the known symmetry of its matrix.

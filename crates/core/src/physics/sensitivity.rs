@@ -79,12 +79,23 @@ pub struct RootSensitivity {
 /// Why sensitivities could not be computed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SensitivityError {
+    /// The derivative of a term could not be evaluated.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// The spectrum does not hold all roots.
     #[error("{found} roots with their conjugates, expected {expected}: no basis of left vectors")]
-    Roots { found: usize, expected: usize },
+    Roots {
+        /// Number of roots found, conjugates counted.
+        found: usize,
+        /// Number of roots of the model.
+        expected: usize,
+    },
+    /// The right vectors are linearly dependent: a root is defective.
     #[error("root {root}: the basis of right vectors is singular")]
-    Singular { root: usize },
+    Singular {
+        /// Index of the root.
+        root: usize,
+    },
 }
 
 /// Roots treated together: one, or a pair.

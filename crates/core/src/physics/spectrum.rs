@@ -139,16 +139,41 @@ pub struct Spectrum {
 /// Why a solve failed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SolveError {
+    /// The matrices could not be assembled.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// The eigenvalue iteration did not converge.
     #[error("the eigenvalue iteration did not converge on a {dimension}x{dimension} matrix")]
-    NoConvergence { dimension: usize },
+    NoConvergence {
+        /// Size of the matrix.
+        dimension: usize,
+    },
+    /// The roots contradict the trace of the matrix or of its square.
     #[error(
         "powers {power} of the roots sum to {found:e}, the trace is {expected:e}: they differ by more than {limit:e}"
     )]
-    Trace { power: u32, found: f64, expected: f64, limit: f64 },
+    Trace {
+        /// Power of the matrix: 1 or 2.
+        power: u32,
+        /// Sum of the powers of the roots.
+        found: f64,
+        /// The trace.
+        expected: f64,
+        /// Largest difference accepted.
+        limit: f64,
+    },
+    /// A root and its vector do not fulfil the equation.
     #[error("root {root} at {frequency_hz} Hz: residual {residual:e} exceeds {limit:e}")]
-    Residual { root: usize, frequency_hz: f64, residual: f64, limit: f64 },
+    Residual {
+        /// Index of the root.
+        root: usize,
+        /// Its frequency, Hz.
+        frequency_hz: f64,
+        /// Its scaled residual.
+        residual: f64,
+        /// Largest residual accepted.
+        limit: f64,
+    },
 }
 
 impl Spectrum {

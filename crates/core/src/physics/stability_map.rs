@@ -39,10 +39,22 @@ pub struct MapOptions {
 /// Why a map could not be built.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum MapError {
+    /// A solve failed.
     #[error("at friction coefficient {mu}: {source}")]
-    Solve { mu: f64, source: SolveError },
+    Solve {
+        /// The friction coefficient.
+        mu: f64,
+        /// Why.
+        source: SolveError,
+    },
+    /// The range is not finite or does not contain 0.
     #[error("friction coefficients {mu_min}..{mu_max}: expected a finite range that contains 0")]
-    Range { mu_min: f64, mu_max: f64 },
+    Range {
+        /// Lowest friction coefficient.
+        mu_min: f64,
+        /// Highest friction coefficient.
+        mu_max: f64,
+    },
 }
 
 /// A solved point of the map.

@@ -38,6 +38,7 @@ pub struct FullPart {
 pub struct SparseTerm {
     /// `n×n` over the rows of all parts.
     pub matrix: SparseMatrix,
+    /// Scalar factor of the matrix, as a function of the operating point.
     pub law: Law,
 }
 

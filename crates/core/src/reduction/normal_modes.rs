@@ -37,7 +37,12 @@ pub enum Wanted {
     /// All modes with `ω` below this, rad/s.
     Below(f64),
     /// All modes below `below_rad_s`, whose number [`Analysed::count_below`] has already determined.
-    Counted { modes: usize, below_rad_s: f64 },
+    Counted {
+        /// Number of modes.
+        modes: usize,
+        /// All of them are below this angular frequency, rad/s.
+        below_rad_s: f64,
+    },
 }
 
 /// Progress of a computation of modes.
@@ -47,15 +52,40 @@ pub enum Progress {
     Analysing,
     /// The system is ordered and symbolically analysed. `factor_entries` is the number of entries of a factor; `bytes`
     /// is the memory needed in addition to what is already held.
-    Analysed { factor_entries: usize, bytes: usize },
+    Analysed {
+        /// Number of entries of a factor.
+        factor_entries: usize,
+        /// Estimated memory, bytes.
+        bytes: usize,
+    },
     /// `K + s M` is factorised with the shift `s`, rad²/s².
-    Factored { shift: f64 },
+    Factored {
+        /// The shift `σ` of `K - σ M`, rad²/s².
+        shift: f64,
+    },
     /// Lanczos vectors built so far, and how many of the wanted modes have converged.
-    Iterated { vectors: usize, converged: usize, wanted: usize },
+    Iterated {
+        /// Number of vectors built.
+        vectors: usize,
+        /// Number of converged modes.
+        converged: usize,
+        /// Number of modes wanted; 0 if not known yet.
+        wanted: usize,
+    },
     /// The inertia of `K - σ M` gave the number of modes below `ω² = σ`, rad²/s².
-    Counted { modes: usize, below: f64 },
+    Counted {
+        /// Number of modes.
+        modes: usize,
+        /// Below this `ω²`, rad²/s².
+        below: f64,
+    },
     /// Number of unit loads at the contact whose static response has been computed, of `loads`.
-    Loaded { solved: usize, loads: usize },
+    Loaded {
+        /// Number of loads solved.
+        solved: usize,
+        /// Number of loads in all.
+        loads: usize,
+    },
 }
 
 /// Lowest modes of a symmetric system, which may be statically unstable.

@@ -10,9 +10,11 @@ const GEOMETRIC_ABOVE: f64 = 3.0;
 /// Closed ranges of the operating conditions. A range may be a single value.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OperatingBox {
+    /// Lowest and highest friction coefficient.
     pub friction_coefficient: [f64; 2],
+    /// Lowest and highest normal load, N, above 0.
     pub normal_load_n: [f64; 2],
-    /// Must not contain 0, where there is no sliding.
+    /// Lowest and highest disc speed, rad/s, both of one sign: at 0 the contact does not slide.
     pub disc_speed_rad_s: [f64; 2],
 }
 

@@ -91,29 +91,70 @@ pub struct ParametricRequest {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum ParametricStep {
     /// Estimated bytes needed in addition to the memory in use before the solver was made.
-    Planned { bytes: usize },
+    Planned {
+        /// The bytes.
+        bytes: usize,
+    },
     /// Progress of a solve of the full model.
     Solving(FullProgress),
     /// The error has been estimated at `done` of `of` training points.
-    Estimating { done: usize, of: usize },
+    Estimating {
+        /// Number of points done.
+        done: usize,
+        /// Number of points in all.
+        of: usize,
+    },
     /// A solve of the full model at a sampled point starts.
-    Sampling { point: OperatingPoint, sample: usize },
+    Sampling {
+        /// The sampled point.
+        point: OperatingPoint,
+        /// Its number, from 1.
+        sample: usize,
+    },
     /// The sampled point has `roots` roots within band and growth floor, margins included, and the span now has
     /// `vectors` vectors. `true_over_estimate` is the largest ratio of true error to estimate at this point; NaN
     /// without estimates.
-    Sampled { roots: usize, vectors: usize, true_over_estimate: f64 },
+    Sampled {
+        /// Number of roots.
+        roots: usize,
+        /// Number of vectors of the span.
+        vectors: usize,
+        /// Largest ratio of true error to estimate.
+        true_over_estimate: f64,
+    },
     /// The error has been estimated at all training points. `worst` is the largest scaled estimate of `|Δλ|/|λ|`.
-    Estimated { worst: f64, vectors: usize },
+    Estimated {
+        /// Largest estimate, relative.
+        worst: f64,
+        /// Number of vectors of the span.
+        vectors: usize,
+    },
     /// A basis of `vectors` leading vectors has the error `worst` at the training points.
-    Cut { vectors: usize, worst: f64 },
+    Cut {
+        /// Number of vectors kept.
+        vectors: usize,
+        /// Largest estimate with them, relative.
+        worst: f64,
+    },
     /// A held-out point, the `done`th of `of`, was solved and compared.
-    HeldOut { point: OperatingPoint, worst: f64, done: usize, of: usize },
+    HeldOut {
+        /// The held-out point.
+        point: OperatingPoint,
+        /// Largest error there, relative.
+        worst: f64,
+        /// Number of points done.
+        done: usize,
+        /// Number of points in all.
+        of: usize,
+    },
 }
 
 /// A held-out point and its comparison of full and reduced roots.
 #[derive(Clone, Debug)]
 pub struct HeldOut {
+    /// The operating point.
     pub point: OperatingPoint,
+    /// Full and reduced roots, paired.
     pub comparison: RootMatch,
 }
 

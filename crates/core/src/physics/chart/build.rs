@@ -45,14 +45,27 @@ pub struct ChartOptions {
 /// Why a chart could not be built.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ChartError {
+    /// A range of conditions cannot be charted.
     #[error("{what} from {low} to {high}: expected a finite range{limit}")]
-    Range { what: &'static str, low: f64, high: f64, limit: &'static str },
+    Range {
+        /// The condition.
+        what: &'static str,
+        /// Lower end.
+        low: f64,
+        /// Upper end.
+        high: f64,
+        /// What the range must fulfil besides.
+        limit: &'static str,
+    },
+    /// A dense solve failed.
     #[error(transparent)]
     Solve(#[from] SolveError),
+    /// The contact law is not analytic, so roots have no expansions across the load at which a pair opens.
     #[error(
         "the contact law is not analytic: roots jump or bend wherever a pair opens or closes, so every condition is solved"
     )]
     NotAnalytic,
+    /// The caller stopped the build.
     #[error("stopped")]
     Stopped,
 }

@@ -36,7 +36,7 @@ pub use words::{BUILDER, FORMAT};
 
 /// A condition that a chart depends on, and its coordinate inside a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Axis {
+pub(crate) enum Axis {
     /// Friction coefficient; the coordinate is `μ`.
     Friction,
     /// Normal load; the coordinate is its logarithm.
@@ -95,12 +95,20 @@ const MAX_AXES: usize = 3;
 /// Why a chart gives no roots at a point.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum NotCharted {
+    /// The point is outside the box of the chart.
     #[error("outside the charted conditions")]
     Outside,
+    /// No leaf holds the point: the expansions did not converge there, or have not been built yet.
     #[error("in a part of the box that did not converge")]
     NotConverged,
+    /// The charted roots contradict the traces of the matrix, so one is missing or counted twice.
     #[error("the charted roots and the trace differ by {difference:e}, more than {limit:e}")]
-    Incomplete { difference: f64, limit: f64 },
+    Incomplete {
+        /// Difference from the exact trace.
+        difference: f64,
+        /// Largest difference that the error bounds allow.
+        limit: f64,
+    },
 }
 
 /// A node of the tree of boxes.
