@@ -9,7 +9,7 @@ use super::memory::{room, solver};
 use super::steps::ProgressOptions;
 use super::{Conditions, Outcome, positive, print};
 use crate::full_model::FullModelFile;
-use crate::full_model::certificate::DEFAULT_BAND_HZ;
+use crate::full_model::verification::DEFAULT_BAND_HZ;
 use crate::physics::OperatingPoint;
 use crate::reduction::{FullSpectrum, FullVectors};
 

@@ -6,7 +6,7 @@ use anyhow::bail;
 
 use super::steps::Steps;
 use crate::full_model::FullModelFile;
-use crate::full_model::certificate::DECAY_PER_S;
+use crate::full_model::verification::DECAY_PER_S;
 use crate::reduction::{
     Counted, FullSolver, GIB, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
 };

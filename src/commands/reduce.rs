@@ -13,10 +13,10 @@ use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, s
 use crate::files::input_file;
 use crate::files::whole_file::{remove_begun, write_together};
 use crate::full_model::FullModelFile;
-use crate::full_model::certificate::{Against, Certificate, Verified, verify_against};
+use crate::full_model::verification::{Against, Verified, verify_against};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullSolver, GIB, Kept, Progress, Residual, Wanted};
-use crate::rig::{Rig, RigFile, SideResidual, between_patches};
+use crate::rig::{Certificate, Rig, RigFile, SideResidual, between_patches};
 
 /// Default cut-off of the modes kept, relative to the band, if `--cutoff-hz` has no value.
 const CUTOFF: f64 = 2.5;

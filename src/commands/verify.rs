@@ -7,7 +7,7 @@ use super::memory::{room, solver};
 use super::steps::ProgressOptions;
 use super::{Outcome, RigName, positive, print};
 use crate::full_model::FullModelFile;
-use crate::full_model::certificate::{Against, Verified, WindowEnds, verify_against};
+use crate::full_model::verification::{Against, Verified, WindowEnds, verify_against};
 use crate::rig::Rig;
 
 /// Default tolerance: relative error of an eigenvalue up to which rig and full model agree.

@@ -8,10 +8,9 @@ use sha2::{Digest, Sha256};
 use super::matrix_market::write_array;
 use super::rig::{HASH_DIGITS, ModalSide, modal_rig, rig_name, source_remarks};
 use crate::full_model::FullModelFile;
-use crate::full_model::certificate::Certificate;
 use crate::physics::{Law, Term};
 use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
-use crate::rig::RigFile;
+use crate::rig::{Certificate, RigFile};
 use crate::text::hex::hex;
 
 /// The files of a rig on `basis`: the rig file, called `file`, followed by the files it refers to. `known` is the

@@ -11,11 +11,10 @@ use npyz::zip::DateTime;
 use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
-use crate::full_model::certificate::Certificate;
 use crate::full_model::{FullModelFile, PartGeometry};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullPart, Kept, PartMatrices, Residual};
-use crate::rig::RigFile;
+use crate::rig::{Certificate, RigFile};
 use crate::text::hex::hex;
 
 /// Name of the rig in a rig file called `file`: the file name without its extension.

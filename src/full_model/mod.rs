@@ -4,13 +4,13 @@
 //! `[[contact_patch]]` (`part`), or `[system]` as in rig files of kind 3. Matrices are read line by line into 16 bytes
 //! per listed entry (`entries`). The contents of the files are not kept, only their hashes (`files`).
 
-pub mod certificate;
 mod coordinates;
 mod entries;
 mod files;
 mod part;
 mod raw;
 mod tables;
+pub mod verification;
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};

@@ -32,11 +32,10 @@ pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, W
 
 use crate::bus::received::{Bus, Received};
 use crate::files::chart_file::ChartFile;
-use crate::full_model::certificate::Certificate;
 use crate::msgs::{self, Header, RigInfo, SessionEvent, Time, event_kind};
 use crate::physics::{Chart, Ends, OperatingPoint, StabilityMap};
 use crate::recording::message::Payload;
-use crate::rig::Rig;
+use crate::rig::{Certificate, Rig};
 use crate::session::{Event, Session, Want, map_serves};
 use crate::session::{conditions, settings::Settings};
 use crate::system::clock;

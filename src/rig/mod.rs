@@ -10,6 +10,7 @@
 //! of a recording.
 
 mod basis;
+mod certificate;
 mod embedded;
 mod error;
 mod inline;
@@ -31,9 +32,9 @@ pub mod uff;
 use faer::Mat;
 
 use crate::files::input_file;
-use crate::full_model::certificate::Certificate;
 use crate::physics::{ContactPairs, ContactState, Model, OperatingPoint, ResidualFlexibility};
 
+pub use certificate::Certificate;
 pub use embedded::{EMBEDDED, Embedded};
 pub use error::RigError;
 pub use modal_data::{ModalData, Residual};

@@ -3,8 +3,8 @@
 use serde::Deserialize;
 
 use super::RigError;
+use super::certificate::Certificate;
 use crate::files::input_file;
-use crate::full_model::certificate::Certificate;
 
 /// A whole rig file.
 #[derive(Debug, Deserialize)]

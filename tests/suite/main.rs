@@ -18,6 +18,7 @@ mod full_model;
 mod full_scipy;
 mod identify;
 mod identities;
+mod layers;
 mod modal_rigs;
 mod neighbours;
 mod non_matching;

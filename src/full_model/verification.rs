@@ -1,84 +1,53 @@
 //! Compares a rig with the full model it was reduced from: the command `verify` and the table `[reduction]` of a rig
 //! file.
 
-use anyhow::{Context, ensure};
 use faer::c64;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::full_model::FullModelFile;
-use crate::physics::{MapOptions, OperatingPoint, Solver, StabilityMap, Window};
+use crate::physics::{MapError, MapOptions, OperatingPoint, SolveError, Solver, StabilityMap, Window};
 use crate::reduction::{
-    FullProgress, FullSolver, FullVectors, Judged, compare_roots, compare_windows, full_windows, reduced_roots,
+    CompareError, FullProgress, FullSolver, FullVectors, Judged, ReductionError, compare_roots, compare_windows,
+    full_windows, reduced_roots,
 };
-use crate::rig::Rig;
+use crate::rig::{Certificate, Rig, RigError};
 
 /// Default upper end of the band, if neither rig nor full model gives one, Hz.
 pub const DEFAULT_BAND_HZ: f64 = 5000.0;
 /// Roots that decay faster than this are neither compared nor held to the tolerance of a basis, 1/s.
 pub const DECAY_PER_S: f64 = 20.0;
 
-/// Certificate of a rig: its errors against the full model at held-out points. The table `[reduction]` of a rig file.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Certificate {
-    /// `content_hash` of the full model.
-    pub full_model_hash: String,
-    /// How the rig was reduced, as text.
-    #[serde(default)]
-    pub method: String,
-    /// Upper end of the compared band, Hz.
-    pub band_hz: f64,
-    /// Number of held-out operating points.
-    pub points: usize,
-    /// Largest `|Δf| / f`.
-    pub max_frequency_error: f64,
-    /// Largest `|Δσ|`, 1/s.
-    pub max_growth_error_per_s: f64,
-    /// Largest `|Δλ| / |λ|`.
-    pub max_relative_error: f64,
-    /// Number of pairs of load and speed at which windows of instability were compared.
-    #[serde(default)]
-    pub windows_compared_at: usize,
-    /// Largest difference between the ends of corresponding windows; `None` if no windows correspond.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub critical_friction_error: Option<f64>,
-    /// Missed: unstable modes, summed over all points, and windows that only the full model has.
-    pub missed: usize,
-    /// Invented: unstable modes, summed over all points, and windows that only the rig has.
-    pub invented: usize,
-    /// Modes of the full model, stable or not, without a partner in the rig, summed over all points.
-    #[serde(default)]
-    pub unpaired: usize,
-}
-
-impl Certificate {
-    /// Whether rig and full model have the same modes, unstable modes and windows in the band.
-    pub fn is_complete(&self) -> bool {
-        self.missed == 0 && self.invented == 0 && self.unpaired == 0 && !self.max_relative_error.is_nan()
-    }
-
-    /// The certificate in one line of text.
-    pub fn summary(&self) -> String {
-        let (critical, what) = match (self.windows_compared_at, self.critical_friction_error) {
-            (0, _) => (", windows of instability not compared".to_owned(), "unstable modes"),
-            (_, Some(error)) => (format!(", critical friction {error:.1e}"), "unstable modes or windows"),
-            (_, None) => (String::new(), "unstable modes or windows"),
-        };
-        let unpaired = match self.unpaired {
-            0 => String::new(),
-            count => format!(", {count} modes without a partner"),
-        };
-        format!(
-            "reduction  errors at {} held-out points up to {} Hz: frequency {:.1e} relative, growth rate {:.1e} 1/s{critical}; \
-             {} {what} missed, {} invented{unpaired}",
-            self.points,
-            self.band_hz,
-            self.max_frequency_error,
-            self.max_growth_error_per_s,
-            self.missed,
-            self.invented
-        )
-    }
+/// Why a rig could not be compared with its full model.
+#[derive(Debug, thiserror::Error)]
+pub enum VerificationError {
+    /// No operating points were asked for.
+    #[error("--points is 0, expected at least 1")]
+    NoPoints,
+    /// The full model has settings that its comparison does not support.
+    #[error(transparent)]
+    Settings(#[from] RigError),
+    /// The full model could not be solved at an operating point.
+    #[error("full model at {point:?}")]
+    Full {
+        /// The operating point.
+        point: OperatingPoint,
+        /// Why.
+        source: ReductionError,
+    },
+    /// The rig could not be solved at an operating point.
+    #[error("rig at {point:?}")]
+    Rig {
+        /// The operating point.
+        point: OperatingPoint,
+        /// Why.
+        source: SolveError,
+    },
+    /// The windows of instability of the full model were not found.
+    #[error(transparent)]
+    Windows(#[from] CompareError),
+    /// The windows of instability of the rig were not found.
+    #[error(transparent)]
+    Map(#[from] MapError),
 }
 
 /// Options of a comparison.
@@ -140,15 +109,17 @@ pub struct Verified {
 /// receives a description of the step and its progress.
 ///
 /// # Errors
-/// A full model or rig that cannot be solved, modal damping in the full model, or no points.
+/// [`VerificationError`].
 pub fn verify_against(
     rig: &Rig,
     full: &FullModelFile,
     full_solver: &mut FullSolver<'_>,
     against: &Against,
     progress: &mut dyn FnMut(&str, FullProgress),
-) -> anyhow::Result<Verified> {
-    ensure!(against.points > 0, "--points is 0, expected at least 1");
+) -> Result<Verified, VerificationError> {
+    if against.points == 0 {
+        return Err(VerificationError::NoPoints);
+    }
     full.refuse_modal_damping()?;
     let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
     let band_rad_s = std::f64::consts::TAU * band_hz;
@@ -159,9 +130,10 @@ pub fn verify_against(
         let label = format!("point {} of {}", index + 1, against.points);
         let found = full_solver
             .roots(&p, band_rad_s, FullVectors::None, &mut |step| progress(&label, step))
-            .with_context(|| format!("full model at {p:?}"))?;
+            .map_err(|source| VerificationError::Full { point: p, source })?;
         let lambdas: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
-        let reduced = reduced_roots(&rig.model, &mut solver, &p).with_context(|| format!("rig at {p:?}"))?;
+        let reduced =
+            reduced_roots(&rig.model, &mut solver, &p).map_err(|source| VerificationError::Rig { point: p, source })?;
         let comparison = compare_roots(&lambdas, &reduced, &judged);
         let listed = |roots: &[c64]| roots.iter().map(|l| [l.re, l.im / std::f64::consts::TAU]).collect();
         points.push(PointReport {
