@@ -1,14 +1,35 @@
 //! LAPACK for comparison: a child process with scipy that solves the same matrices as the program.
 
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 
-use anyhow::{Context, ensure};
 use faer::{MatRef, c64};
 
 /// Source of the Python program that the child runs.
 const SCRIPT: &str = include_str!("../../../tests/peers/lapack.py");
+
+/// Why LAPACK gave no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum LapackError {
+    /// Python did not start.
+    #[error("{python}: cannot start")]
+    Start {
+        /// The program.
+        python: String,
+        /// Why.
+        source: io::Error,
+    },
+    /// Python has no scipy.
+    #[error("{python}: has no scipy")]
+    NoScipy {
+        /// The program.
+        python: String,
+    },
+    /// The child ended before it answered.
+    #[error("scipy has ended")]
+    Ended(#[source] io::Error),
+}
 
 /// A Python process with scipy that solves eigenvalue problems.
 pub struct Lapack {
@@ -23,20 +44,22 @@ impl Lapack {
     /// Starts `python`.
     ///
     /// # Errors
-    /// Python does not start or has no scipy.
-    pub fn start(python: &Path) -> anyhow::Result<Self> {
+    /// [`LapackError`]: `Start`, `NoScipy`, `Ended`.
+    pub fn start(python: &Path) -> Result<Self, LapackError> {
         let mut child = Command::new(python)
             .args(["-c", SCRIPT])
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
-            .with_context(|| format!("{}: cannot start", python.display()))?;
+            .map_err(|source| LapackError::Start { python: python.display().to_string(), source })?;
         let stdin = child.stdin.take();
-        let mut stdout = BufReader::new(child.stdout.take().context("no pipe")?);
+        let mut stdout = BufReader::new(child.stdout.take().expect("standard output is piped"));
         let mut versions = String::new();
-        stdout.read_line(&mut versions)?;
+        stdout.read_line(&mut versions).map_err(LapackError::Ended)?;
         let peer = Self { child, stdin, stdout, versions: versions.trim().to_owned() };
-        ensure!(!peer.versions.is_empty(), "{}: has no scipy", python.display());
+        if peer.versions.is_empty() {
+            return Err(LapackError::NoScipy { python: python.display().to_string() });
+        }
         Ok(peer)
     }
 
@@ -44,19 +67,19 @@ impl Lapack {
     /// then the eigenvalues.
     ///
     /// # Errors
-    /// The child has ended.
-    pub fn solve(&mut self, matrix: MatRef<'_, f64>, vectors: bool) -> anyhow::Result<(f64, Vec<c64>)> {
+    /// [`LapackError::Ended`].
+    pub fn solve(&mut self, matrix: MatRef<'_, f64>, vectors: bool) -> Result<(f64, Vec<c64>), LapackError> {
         let n = matrix.nrows();
-        let stdin = self.stdin.as_mut().context("no pipe")?;
+        let stdin = self.stdin.as_mut().expect("standard input is piped until the child is dropped");
         let mut message = Vec::with_capacity(16 + 8 * n * n);
         message.extend((n as u64).to_le_bytes());
         message.extend(u64::from(vectors).to_le_bytes());
         for j in 0..n {
             (0..n).for_each(|i| message.extend(matrix[(i, j)].to_le_bytes()));
         }
-        stdin.write_all(&message).and_then(|()| stdin.flush()).context("scipy has ended")?;
+        stdin.write_all(&message).and_then(|()| stdin.flush()).map_err(LapackError::Ended)?;
         let mut answer = vec![0; 8 * (1 + 2 * n)];
-        self.stdout.read_exact(&mut answer).context("scipy has ended")?;
+        self.stdout.read_exact(&mut answer).map_err(LapackError::Ended)?;
         let number = |k: usize| {
             let mut bytes = [0; 8];
             bytes.copy_from_slice(&answer[8 * k..8 * (k + 1)]);

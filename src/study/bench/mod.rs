@@ -9,20 +9,19 @@ pub mod lapack;
 
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, ensure};
 use faer::{Mat, c64};
 use serde::Serialize;
 
 use crate::physics::chart::Scratch;
 use crate::physics::chart::build::{ChartError, ChartOptions, Progress, resume};
 use crate::physics::{
-    Chart, ContactLaw, MapOptions, Model, OperatingPoint, Root, Solver, Spectrum, StabilityMap, Summary, Traces,
-    Vectors,
+    Chart, ContactLaw, MapError, MapOptions, Model, ModelError, NotCharted, OperatingPoint, Root, SolveError, Solver,
+    Spectrum, StabilityMap, Summary, Traces, Vectors,
 };
 use crate::proof::held_out::hold_out;
 use crate::proof::reference::{self, Refined};
 use crate::proof::synthetic::{Synthetic, Uniform, rig};
-use lapack::Lapack;
+use lapack::{Lapack, LapackError};
 
 /// Which synthetic rigs are measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -125,14 +124,76 @@ pub struct HeldOut {
     pub largest_pair_mean_error: f64,
 }
 
-const ROUTES: [&str; 6] = [
-    "dense values",
-    "dense both vectors",
-    "chart values",
-    "chart + certificate",
-    "LAPACK values",
-    "LAPACK both vectors",
-];
+/// Why the routes could not be measured.
+#[derive(Debug, thiserror::Error)]
+pub enum BenchError {
+    /// The rig could not be made or assembled.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The merging points of the rig were not found.
+    #[error(transparent)]
+    Map(#[from] MapError),
+    /// A dense solve failed.
+    #[error("{point:?}")]
+    Solve {
+        /// The operating point.
+        point: OperatingPoint,
+        /// Why.
+        source: SolveError,
+    },
+    /// The chart could not be built.
+    #[error(transparent)]
+    Chart(#[from] ChartError),
+    /// A dense solve at a held-out point failed.
+    #[error("held-out conditions")]
+    HeldOut(#[source] SolveError),
+    /// The chart gave roots at a point once, but not again.
+    #[error(transparent)]
+    NotCharted(#[from] NotCharted),
+    /// LAPACK gave no answer.
+    #[error(transparent)]
+    Lapack(#[from] LapackError),
+    /// The band holds no mode to compare.
+    #[error("no mode below {band_max_hz} Hz")]
+    NoModes {
+        /// Upper end of the band, Hz.
+        band_max_hz: f64,
+    },
+}
+
+/// A way to the roots at an operating point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Way {
+    DenseValues,
+    DenseVectors,
+    ChartValues,
+    ChartBounds,
+    LapackValues,
+    LapackVectors,
+}
+
+impl Way {
+    /// All ways, in the order in which they are listed.
+    const ALL: [Self; 6] = [
+        Self::DenseValues,
+        Self::DenseVectors,
+        Self::ChartValues,
+        Self::ChartBounds,
+        Self::LapackValues,
+        Self::LapackVectors,
+    ];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::DenseValues => "dense values",
+            Self::DenseVectors => "dense both vectors",
+            Self::ChartValues => "chart values",
+            Self::ChartBounds => "chart + certificate",
+            Self::LapackValues => "LAPACK values",
+            Self::LapackVectors => "LAPACK both vectors",
+        }
+    }
+}
 
 /// Times and errors collected for one route.
 #[derive(Clone, Debug, Default)]
@@ -240,7 +301,7 @@ const MOST_SEEDS: u64 = 40;
 
 /// Draws rigs, starting from the seed of the plan, until one has merging points in the band at the load and speed of
 /// `reference`. Returns its seed, its model and its merging points; the last rig drawn if none has any.
-fn squealing(modes: usize, plan: &Plan, reference: &OperatingPoint) -> anyhow::Result<(u64, Model, Vec<f64>)> {
+fn squealing(modes: usize, plan: &Plan, reference: &OperatingPoint) -> Result<(u64, Model, Vec<f64>), BenchError> {
     let options = MapOptions {
         mu_min: 0.0,
         mu_max: 1.0,
@@ -260,7 +321,7 @@ fn squealing(modes: usize, plan: &Plan, reference: &OperatingPoint) -> anyhow::R
     }
 }
 
-fn model(modes: usize, plan: &Plan, seed: u64) -> anyhow::Result<Model> {
+fn model(modes: usize, plan: &Plan, seed: u64) -> Result<Model, ModelError> {
     let contact_law = match plan.kind {
         Kind::Undamped => ContactLaw::default(),
         Kind::Hertzian => ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() },
@@ -270,136 +331,229 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> anyhow::Result<Model> {
         }
     };
     let damping_ratio = if matches!(plan.kind, Kind::Damped | Kind::Lateral) { 5e-3 } else { 0.0 };
-    Ok(rig(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })?)
+    rig(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })
+}
+
+/// The answers of the dense solver and of LAPACK at one operating point. Those of the chart are in [`Routes`].
+struct Answers {
+    values: Spectrum,
+    spectrum: Spectrum,
+    on_chart: bool,
+    /// Eigenvalues of LAPACK, without and with vectors.
+    lapack: Option<[Vec<c64>; 2]>,
+}
+
+/// All routes on one rig, and what has been measured.
+struct Routes<'a> {
+    plan: &'a Plan,
+    model: &'a Model,
+    chart: &'a Chart,
+    lapack: Option<&'a mut Lapack>,
+    traces: Traces,
+    solver: Solver,
+    scratch: Scratch,
+    summary: Summary,
+    /// Roots of the chart at the present operating point: values only, and with bounds.
+    bare: Vec<c64>,
+    charted: Vec<Root>,
+    samples: [Samples; 6],
+    pairs_compared: usize,
+    not_refined: usize,
+}
+
+impl Routes<'_> {
+    fn sample(&mut self, way: Way) -> &mut Samples {
+        &mut self.samples[way as usize]
+    }
+
+    fn solve(&mut self, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, BenchError> {
+        self.solver.solve(self.model, p, vectors).map_err(|source| BenchError::Solve { point: *p, source })
+    }
+
+    /// The answers of all routes at `p`, checked but not timed.
+    fn answer(&mut self, p: &OperatingPoint) -> Result<Answers, BenchError> {
+        let values = self.solve(p, Vectors::None)?;
+        let spectrum = self.solve(p, Vectors::Both)?;
+        self.charted.clear();
+        let known = self.traces.at(self.model, p);
+        let on_chart = self.chart.evaluate(p, known, &mut self.scratch, &mut self.charted).is_ok();
+        self.bare.clear();
+        if on_chart {
+            self.chart.values(p, &mut self.scratch, &mut self.bare)?;
+        }
+        let lapack = match self.lapack.as_deref_mut() {
+            None => None,
+            Some(peer) => {
+                let matrix = self.solver.matrix(&spectrum);
+                Some([peer.solve(matrix, false)?.1, peer.solve(matrix, true)?.1])
+            }
+        };
+        Ok(Answers { values, spectrum, on_chart, lapack })
+    }
+
+    /// Compares every route with a cluster of roots to thirty digits.
+    fn compare(&mut self, answers: &Answers, refined: &Refined) {
+        let Answers { values, spectrum, on_chart, lapack } = answers;
+        let of_root = |root: &Root, bounded: bool| {
+            let (z, bound) =
+                if spectrum.undamped { (root.square, root.error.square) } else { (root.lambda, root.error.omega) };
+            (z, bounded.then_some(bound))
+        };
+        let all = |roots: &[Root], bounded| roots.iter().map(|r| of_root(r, bounded)).collect::<Vec<_>>();
+        self.pairs_compared += usize::from(refined.members.len() > 1);
+        self.sample(Way::DenseValues).compare(spectrum, refined, &all(&values.roots, false));
+        self.sample(Way::DenseVectors).compare(spectrum, refined, &all(&spectrum.roots, true));
+        if *on_chart {
+            let bare: Vec<_> = self.bare.iter().map(|&z| (z, None)).collect();
+            let charted = all(&self.charted, true);
+            self.sample(Way::ChartValues).compare(spectrum, refined, &bare);
+            self.sample(Way::ChartBounds).compare(spectrum, refined, &charted);
+        }
+        let sign = if spectrum.undamped { -1.0 } else { 1.0 };
+        for (way, theirs) in [Way::LapackValues, Way::LapackVectors].into_iter().zip(lapack.iter().flatten()) {
+            let theirs: Vec<_> = theirs.iter().map(|z| (z * sign, None)).collect();
+            self.sample(way).compare(spectrum, refined, &theirs);
+        }
+    }
+
+    /// Times the routes at `p`, one after another.
+    fn time(&mut self, p: &OperatingPoint, answers: &Answers) -> Result<(), BenchError> {
+        for (way, theirs, vectors) in [
+            (Way::DenseValues, Way::LapackValues, Vectors::None),
+            (Way::DenseVectors, Way::LapackVectors, Vectors::Both),
+        ] {
+            let begun = Instant::now();
+            std::hint::black_box(self.solve(p, vectors)?);
+            self.took(way, begun.elapsed().as_secs_f64());
+            if let Some(peer) = self.lapack.as_deref_mut() {
+                let (seconds, _) = peer.solve(self.solver.matrix(&answers.spectrum), vectors == Vectors::Both)?;
+                self.took(theirs, seconds);
+            }
+        }
+        if answers.on_chart {
+            self.time_chart(p)?;
+        }
+        if self.lapack.is_some() {
+            // Charted routes are compared with LAPACK's time without vectors.
+            for (way, theirs) in [
+                (Way::DenseValues, Way::LapackValues),
+                (Way::DenseVectors, Way::LapackVectors),
+                (Way::ChartValues, Way::LapackValues),
+                (Way::ChartBounds, Way::LapackValues),
+            ] {
+                if answers.on_chart || matches!(way, Way::DenseValues | Way::DenseVectors) {
+                    let last = |way: Way| self.samples[way as usize].time_us.last().copied().unwrap_or(f64::NAN);
+                    let ratio = last(way) / last(theirs);
+                    self.sample(way).ratio.push(ratio);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn time_chart(&mut self, p: &OperatingPoint) -> Result<(), BenchError> {
+        // One untimed evaluation first: the dense solves evicted the chart from the caches, as they would not in a run
+        // of charted predictions.
+        self.bare.clear();
+        self.chart.values(p, &mut self.scratch, &mut self.bare)?;
+        self.bare.clear();
+        let begun = Instant::now();
+        self.chart.values(p, &mut self.scratch, &mut self.bare)?;
+        self.took(Way::ChartValues, begun.elapsed().as_secs_f64());
+        self.charted.clear();
+        let begun = Instant::now();
+        let known = self.traces.at(self.model, p);
+        let all = self.chart.evaluate(p, known, &mut self.scratch, &mut self.charted)?;
+        let band = Some(self.plan.band_max_hz);
+        self.summary.take_chart(&self.charted, p.friction_coefficient, all, None, band, 1e-6);
+        std::hint::black_box(&self.summary);
+        self.took(Way::ChartBounds, begun.elapsed().as_secs_f64());
+        Ok(())
+    }
+
+    fn took(&mut self, way: Way, seconds: f64) {
+        self.sample(way).time_us.push(1e6 * seconds);
+    }
+}
+
+/// Compares the chart with dense solves at held-out points; `None` if the plan asks for none.
+fn checked(
+    model: &Model,
+    plan: &Plan,
+    options: &ChartOptions,
+    chart: &Chart,
+    say: &dyn Fn(&str),
+) -> Result<Option<HeldOut>, BenchError> {
+    if plan.held_out == 0 {
+        return Ok(None);
+    }
+    say("held-out conditions");
+    let seed = plan.seed.wrapping_add(3000);
+    let found = hold_out(model, options, chart, plan.held_out, seed).map_err(BenchError::HeldOut)?;
+    Ok(Some(HeldOut {
+        charted: found.charted,
+        not_converged: found.not_converged,
+        incomplete: found.incomplete,
+        bounds_broken: found.violations,
+        largest_share: found.largest_share,
+        largest_error: found.largest_error,
+        largest_pair_mean_error: found.largest_mean_error,
+    }))
 }
 
 /// Measures all routes on a rig of `modes` modes; `say` receives progress messages.
 ///
 /// # Errors
-/// A rig that cannot be solved, an answer that fails its check, or a band without modes.
+/// [`BenchError`].
 pub fn measure(
     modes: usize,
     plan: &Plan,
-    mut lapack: Option<&mut Lapack>,
+    lapack: Option<&mut Lapack>,
     say: &dyn Fn(&str),
-) -> anyhow::Result<(Vec<Route>, Offline)> {
+) -> Result<(Vec<Route>, Offline), BenchError> {
     let reference = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.0 };
-
     say("merging points");
     let begun = Instant::now();
     let (seed, model, merging) = squealing(modes, plan, &reference)?;
     let map_s = begun.elapsed().as_secs_f64();
-    let traces = Traces::new(&model);
-    let mut solver = Solver::new(modes);
     let points = conditions(plan, &merging, &reference);
 
     let begun = Instant::now();
     let options = chart_options(plan);
     let chart = chart(&model, plan, &options, say)?;
     let chart_s = begun.elapsed().as_secs_f64();
-    let held_out = if plan.held_out == 0 {
-        None
-    } else {
-        say("held-out conditions");
-        let found = hold_out(&model, &options, &chart, plan.held_out, plan.seed.wrapping_add(3000))?;
-        Some(HeldOut {
-            charted: found.charted,
-            not_converged: found.not_converged,
-            incomplete: found.incomplete,
-            bounds_broken: found.violations,
-            largest_share: found.largest_share,
-            largest_error: found.largest_error,
-            largest_pair_mean_error: found.largest_mean_error,
-        })
-    };
+    let held_out = checked(&model, plan, &options, &chart, say)?;
 
-    let mut samples: [Samples; 6] = Default::default();
-    let (mut scratch, mut charted, mut bare, mut summary) = (Scratch::default(), vec![], vec![], Summary::default());
-    let (mut pairs_compared, mut not_refined) = (0, 0);
+    let mut routes = Routes {
+        plan,
+        model: &model,
+        chart: &chart,
+        lapack,
+        traces: Traces::new(&model),
+        solver: Solver::new(modes),
+        scratch: Scratch::default(),
+        summary: Summary::default(),
+        bare: vec![],
+        charted: vec![],
+        samples: Default::default(),
+        pairs_compared: 0,
+        not_refined: 0,
+    };
     let mut choice = Uniform::new(plan.seed.wrapping_add(2000));
     for (done, p) in points.iter().enumerate() {
         if done % 20 == 0 {
             say(&format!("condition {done} of {}", points.len()));
         }
-        // First the answers are computed and checked.
-        let values = solver.solve(&model, p, Vectors::None)?;
-        let spectrum = solver.solve(&model, p, Vectors::Both).with_context(|| format!("{p:?}"))?;
-        charted.clear();
-        let on_chart = chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted).is_ok();
-        bare.clear();
-        if on_chart {
-            chart.values(p, &mut scratch, &mut bare)?;
-        }
-        let theirs = lapack.as_deref_mut().map(|peer| peer.solve(solver.matrix(&spectrum), false)).transpose()?;
-        let theirs_both = lapack.as_deref_mut().map(|peer| peer.solve(solver.matrix(&spectrum), true)).transpose()?;
-        let refined = refined(&model, p, &spectrum, plan, &mut choice)?;
-        for refined in &refined {
-            let Some(refined) = refined else {
-                not_refined += 1;
-                continue;
-            };
-            pairs_compared += usize::from(refined.members.len() > 1);
-            let of_root = |root: &Root, bounded: bool| {
-                let (z, bound) =
-                    if spectrum.undamped { (root.square, root.error.square) } else { (root.lambda, root.error.omega) };
-                (z, bounded.then_some(bound))
-            };
-            let all = |roots: &[Root], bounded| roots.iter().map(|r| of_root(r, bounded)).collect::<Vec<_>>();
-            samples[0].compare(&spectrum, refined, &all(&values.roots, false));
-            samples[1].compare(&spectrum, refined, &all(&spectrum.roots, true));
-            if on_chart {
-                samples[2].compare(&spectrum, refined, &bare.iter().map(|&z| (z, None)).collect::<Vec<_>>());
-                samples[3].compare(&spectrum, refined, &all(&charted, true));
-            }
-            let sign = if spectrum.undamped { -1.0 } else { 1.0 };
-            for (route, theirs) in [(4, &theirs), (5, &theirs_both)] {
-                let Some((_, theirs)) = theirs else { continue };
-                let theirs: Vec<_> = theirs.iter().map(|z| (z * sign, None)).collect();
-                samples[route].compare(&spectrum, refined, &theirs);
+        // First the answers are computed and checked, then the routes are timed.
+        let answers = routes.answer(p)?;
+        for refined in refined(&model, p, &answers.spectrum, plan, &mut choice)? {
+            match refined {
+                Some(refined) => routes.compare(&answers, &refined),
+                None => routes.not_refined += 1,
             }
         }
-        // Then the routes are timed, one after another.
-        let mut time = |route: usize, seconds: f64| samples[route].time_us.push(1e6 * seconds);
-        let mut ours = [0.0; 2];
-        for (route, vectors) in [(0, Vectors::None), (1, Vectors::Both)] {
-            let begun = Instant::now();
-            std::hint::black_box(solver.solve(&model, p, vectors)?);
-            ours[route] = begun.elapsed().as_secs_f64();
-            time(route, ours[route]);
-            if let Some(peer) = lapack.as_deref_mut() {
-                time(4 + route, peer.solve(solver.matrix(&spectrum), route == 1)?.0);
-            }
-        }
-        if on_chart {
-            // One untimed evaluation first: the dense solves evicted the chart from the caches, as they would not in a
-            // run of charted predictions.
-            bare.clear();
-            chart.values(p, &mut scratch, &mut bare)?;
-            bare.clear();
-            let begun = Instant::now();
-            chart.values(p, &mut scratch, &mut bare)?;
-            time(2, begun.elapsed().as_secs_f64());
-            charted.clear();
-            let begun = Instant::now();
-            let all = chart.evaluate(p, traces.at(&model, p), &mut scratch, &mut charted)?;
-            summary.take_chart(&charted, p.friction_coefficient, all, None, Some(plan.band_max_hz), 1e-6);
-            std::hint::black_box(&summary);
-            time(3, begun.elapsed().as_secs_f64());
-        }
-        if lapack.is_some() {
-            // Charted routes are compared with LAPACK's time without vectors.
-            for (route, theirs) in [(0, 4), (1, 5), (2, 4), (3, 4)] {
-                if route < 2 || on_chart {
-                    let last = |k: usize| samples[k].time_us.last().copied().unwrap_or(f64::NAN);
-                    let ratio = last(route) / last(theirs);
-                    samples[route].ratio.push(ratio);
-                }
-            }
-        }
+        routes.time(p, &answers)?;
     }
-    let routes: Vec<Route> =
-        samples.into_iter().zip(ROUTES).filter_map(|(samples, route)| samples.summary(modes, route)).collect();
-    let skipped = routes.iter().find(|route| route.route == ROUTES[2]).map_or(0, |route| route.conditions);
     let offline = Offline {
         modes,
         seed,
@@ -413,13 +567,14 @@ pub fn measure(
         chart_leaves: chart.leaf_count(),
         chart_bytes: chart.size_bytes(),
         chart_dense_share: chart.dense_share(),
-        dense_solves_skipped: skipped,
+        dense_solves_skipped: routes.samples[Way::ChartValues as usize].time_us.len(),
         conditions: points.len(),
-        pairs_compared,
-        not_refined,
+        pairs_compared: routes.pairs_compared,
+        not_refined: routes.not_refined,
         held_out,
     };
-    Ok((routes, offline))
+    let listed = Way::ALL.into_iter().zip(routes.samples);
+    Ok((listed.filter_map(|(way, samples)| samples.summary(modes, way.name())).collect(), offline))
 }
 
 /// A chart over the whole box of conditions.
@@ -441,7 +596,7 @@ fn chart_options(plan: &Plan) -> ChartOptions {
 }
 
 /// Builds the chart, as far as the time limit allows.
-fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str)) -> anyhow::Result<Chart> {
+fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str)) -> Result<Chart, ChartError> {
     let begun = Instant::now();
     let mut so_far = None;
     let mut go_on = |progress: &Progress<'_>| {
@@ -454,7 +609,7 @@ fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str))
     };
     match (resume(model, options, None, &mut go_on), so_far) {
         (Ok(chart), _) | (Err(ChartError::Stopped), Some(chart)) => Ok(chart),
-        (Err(error), _) => Err(error.into()),
+        (Err(error), _) => Err(error),
     }
 }
 
@@ -469,14 +624,16 @@ fn refined(
     spectrum: &Spectrum,
     plan: &Plan,
     choice: &mut Uniform,
-) -> anyhow::Result<Vec<Option<Refined>>> {
+) -> Result<Vec<Option<Refined>>, BenchError> {
     let n = model.dimension();
     let (mut stiffness, mut damping) = (Mat::zeros(n, n), Mat::zeros(n, n));
     model.assemble(p, &mut stiffness, &mut damping)?;
     let mut clusters = reference::clusters(spectrum);
     let in_band = |cluster: &Vec<usize>| cluster.iter().any(|&k| spectrum.roots[k].frequency_hz() <= plan.band_max_hz);
     clusters.retain(in_band);
-    ensure!(!clusters.is_empty(), "no mode below {} Hz", plan.band_max_hz);
+    if clusters.is_empty() {
+        return Err(BenchError::NoModes { band_max_hz: plan.band_max_hz });
+    }
     let (mut chosen, mut single): (Vec<_>, Vec<_>) = clusters.into_iter().partition(|cluster| cluster.len() > 1);
     let gap = |i: usize, j: usize| {
         let (a, b) = (reference::solved_for(spectrum, single[i][0]), reference::solved_for(spectrum, single[j][0]));
