@@ -9,7 +9,7 @@ use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
 use super::steps::{ProgressOptions, Steps};
 use super::{Outcome, positive, print};
-use crate::export::{HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
+use crate::export::{ExportError, HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
 use crate::files::input_file;
 use crate::files::whole_file::{remove_begun, write_together};
 use crate::full_model::FullModelFile;
@@ -165,7 +165,7 @@ impl Options {
         full: &FullModelFile,
         solver: Option<FullSolver<'_>>,
         method: String,
-        files_of: &dyn Fn(Option<&Certificate>) -> anyhow::Result<Vec<RigFile>>,
+        files_of: &dyn Fn(Option<&Certificate>) -> Result<Vec<RigFile>, ExportError>,
     ) -> anyhow::Result<Outcome> {
         let make = |known: Option<&Certificate>| -> anyhow::Result<(Vec<RigFile>, Rig)> {
             let files = files_of(known)?;
@@ -187,7 +187,7 @@ impl Options {
                             report("analysis", step)
                         })?,
                     };
-                    verify_against(&rig, full, &mut solver, &against, &mut report)
+                    verify_against(&rig, full, &mut solver, &against, &mut report).map_err(anyhow::Error::from)
                 };
                 let found = compare();
                 match found {

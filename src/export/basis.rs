@@ -1,10 +1,10 @@
 //! Writes a full model on a parametric basis as a rig: pad and disc on shared coordinates, or a system of small
 //! matrices.
 
-use anyhow::{Context, bail};
 use faer::Mat;
 use sha2::{Digest, Sha256};
 
+use super::error::ExportError;
 use super::matrix_market::write_array;
 use super::rig::{HASH_DIGITS, ModalSide, modal_rig, rig_name, source_remarks};
 use crate::full_model::FullModelFile;
@@ -17,21 +17,22 @@ use crate::text::hex::hex;
 /// certificate, if the rig has been compared.
 ///
 /// # Errors
-/// A table that cannot be serialised as TOML, a matrix or archive that cannot be written.
+/// [`ExportError`]: `Toml`, `Bytes`, `Law`.
 pub fn basis_rig(
     file: &str,
     full: &FullModelFile,
     request: &ParametricRequest,
     basis: &ParametricBasis,
     known: Option<&Certificate>,
-) -> anyhow::Result<Vec<RigFile>> {
+) -> Result<Vec<RigFile>, ExportError> {
     let remarks = remarks(full, request, basis);
     let mut common = within(&full.common_tables, request);
     let mut record = record(full, request, basis);
     if full.geometry.is_empty() {
         common.insert("basis".to_owned(), record.into());
         if let Some(known) = known {
-            let known = toml::Value::try_from(known).context("the comparison cannot be put into words of TOML")?;
+            let known =
+                toml::Value::try_from(known).map_err(|source| ExportError::Toml { what: "the certificate", source })?;
             common.insert("reduction".to_owned(), known);
         }
         return system_rig(file, basis, &remarks, &common);
@@ -95,12 +96,13 @@ fn system_rig(
     basis: &ParametricBasis,
     remarks: &[String],
     common: &toml::Table,
-) -> anyhow::Result<Vec<RigFile>> {
+) -> Result<Vec<RigFile>, ExportError> {
     let stem = rig_name(file);
     let mut files = vec![];
-    let mut write = |what: &str, matrix: &Mat<f64>| -> anyhow::Result<toml::Value> {
+    let mut write = |what: &str, matrix: &Mat<f64>| -> Result<toml::Value, ExportError> {
         let mut bytes = vec![];
-        write_array(matrix, &format!("{what} of {stem} on its basis"), &mut bytes).context(what.to_owned())?;
+        write_array(matrix, &format!("{what} of {stem} on its basis"), &mut bytes)
+            .map_err(|source| ExportError::Bytes { what: what.to_owned(), source })?;
         let hash = hex(&Sha256::digest(&bytes));
         let name = format!("{stem}-{what}-{}.mtx", &hash[..HASH_DIGITS]);
         files.push(RigFile { name: name.clone(), bytes });
@@ -135,7 +137,7 @@ fn system_rig(
                 | Law::FrictionChebyshev { .. }
                 | Law::DiscSpeedInContact { .. }
                 | Law::DiscSpeedChebyshev { .. }) => {
-                    bail!("{key} term {index} follows {law:?}; expected a constant or an expression in a [system]");
+                    return Err(ExportError::Law { key, index, law: format!("{law:?}") });
                 }
             }
             list.push(toml::Value::from(keys));
@@ -149,7 +151,7 @@ fn system_rig(
     table.extend(common.clone());
     table.insert("system".to_owned(), system.into());
     let mut text: String = remarks.iter().map(|line| format!("# {line}\n")).collect();
-    text += &toml::to_string(&table).context("the rig cannot be written as TOML")?;
+    text += &toml::to_string(&table).map_err(|source| ExportError::Toml { what: "the rig", source })?;
     files.insert(0, RigFile { name: file.to_owned(), bytes: text.into_bytes() });
     Ok(files)
 }

@@ -3,8 +3,7 @@
 use std::io::Write;
 use std::path::Path;
 
-use anyhow::Context;
-
+use super::error::ExportError;
 use super::{write_deck, write_mesh, write_skew, write_symmetric};
 use crate::fem::Turning;
 use crate::fem::tribometer::{AXIS, CONTACT_STIFFNESS_N_PER_M, Part, Tribometer};
@@ -22,14 +21,15 @@ const DECK_MODES: usize = 20;
 /// does. `say` receives the name of each file once it is written.
 ///
 /// # Errors
-/// A part that cannot be assembled, a file that cannot be written.
+/// [`ExportError`]: `Folder`, `Assembly`, `Turning`, `File`.
 pub fn write_full_model(
     tribometer: &Tribometer,
     rotation: bool,
     folder: &Path,
     mut say: impl FnMut(&str),
-) -> anyhow::Result<()> {
-    std::fs::create_dir_all(folder).with_context(|| format!("{}: the folder cannot be created", folder.display()))?;
+) -> Result<(), ExportError> {
+    std::fs::create_dir_all(folder)
+        .map_err(|source| ExportError::Folder { folder: folder.display().to_string(), source })?;
     let mut toml = format!(
         "# A pad-on-disc tribometer of the paper's kind, with dimensions of this project: {} degrees of freedom.\n\
          name = \"tribometer\"\n\n[band]\nmax_hz = {BAND_HZ:?}\n\n[search]\nmu_max = {MU_MAX:?}\n",
@@ -56,13 +56,13 @@ pub fn write_full_model(
 }
 
 /// Writes the files of one part and returns its TOML table.
-fn write_part(name: &str, part: &Part, folder: &Path, say: &mut impl FnMut(&str)) -> anyhow::Result<String> {
+fn write_part(name: &str, part: &Part, folder: &Path, say: &mut impl FnMut(&str)) -> Result<String, ExportError> {
     let structure = &part.structure;
     let file = |what: &str| format!("{name}-{what}");
     let deck = format!("{name}.inp");
     write_whole(&folder.join(&deck), |out| write_deck(structure, &format!("{name} of a tribometer"), DECK_MODES, out))?;
     say(&deck);
-    let assembled = structure.assemble().with_context(|| name.to_owned())?;
+    let assembled = structure.assemble().map_err(|source| ExportError::Assembly { part: name.to_owned(), source })?;
     for (what, matrix, unit) in [("stiffness", &assembled.stiffness, "N/m"), ("mass", &assembled.mass, "kg")] {
         let file = file(&format!("{what}.mtx"));
         let comment = format!("{what} of the {name}, {unit}, interface free; rows as in {name}-rows.csv");
@@ -92,8 +92,9 @@ fn write_part(name: &str, part: &Part, folder: &Path, say: &mut impl FnMut(&str)
 }
 
 /// Writes the matrices of the turning disc and returns their keys.
-fn write_turning(disc: &Part, folder: &Path, say: &mut impl FnMut(&str)) -> anyhow::Result<String> {
-    let Turning { gyroscopic, spin, stiffening } = disc.structure.turning(&AXIS).context("disc")?;
+fn write_turning(disc: &Part, folder: &Path, say: &mut impl FnMut(&str)) -> Result<String, ExportError> {
+    let Turning { gyroscopic, spin, stiffening } =
+        disc.structure.turning(&AXIS).map_err(|source| ExportError::Turning { part: "disc".to_owned(), source })?;
     let mut keys = String::new();
     let matrices = [("gyroscopic", &gyroscopic), ("spin", &spin), ("stress_stiffening", &stiffening)];
     for (key, matrix) in matrices {

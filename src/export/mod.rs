@@ -3,6 +3,7 @@
 
 mod basis;
 mod calculix;
+mod error;
 mod full_model;
 mod matrix_market;
 mod rig;
@@ -10,6 +11,7 @@ mod vtk;
 
 pub use basis::basis_rig;
 pub use calculix::write_deck;
+pub use error::ExportError;
 pub use full_model::write_full_model;
 pub use matrix_market::{write_skew, write_symmetric};
 pub use rig::{HASH_DIGITS, ModalSide, modal_rig, modal_sides, source_remarks};

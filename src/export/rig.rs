@@ -4,13 +4,13 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use anyhow::{Context, bail};
 use faer::Mat;
 use npyz::WriterBuilder;
 use npyz::zip::DateTime;
 use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
+use super::error::ExportError;
 use crate::full_model::{FullModelFile, PartGeometry};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullPart, Kept, PartMatrices, Residual};
@@ -52,15 +52,15 @@ pub struct ModalSide<'a> {
 /// The sides of a rig, from the modes kept of pad and disc of a full model.
 ///
 /// # Errors
-/// A part whose stiffness matrix is indefinite beyond rounding.
-pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> anyhow::Result<Vec<ModalSide<'a>>> {
+/// [`ExportError::Indefinite`].
+pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> Result<Vec<ModalSide<'a>>, ExportError> {
     for (part, kept) in full.model.parts.iter().zip(kept) {
         let squares = &kept.modes.omega_squared;
         let limit = -ROUNDING * squares.iter().fold(0.0_f64, |largest, square| largest.max(square.abs()));
         if let Some(square) = squares.iter().find(|square| **square < limit) {
             let field = format!("{}.stiffness", part.name);
-            let file = full.file_of(&field);
-            bail!("{file}: `{field}` has a mode of {square:.3e} rad^2/s^2; expected at least {limit:.1e}");
+            let file = full.file_of(&field).to_string();
+            return Err(ExportError::Indefinite { file, field, value: *square, limit });
         }
     }
     let side = |(index, ((part, geometry), kept)): (usize, ((&'a FullPart, &PartGeometry), &'a Kept))| {
@@ -162,7 +162,7 @@ fn packed(arrays: &[(&str, Vec<usize>, Vec<f64>)]) -> std::io::Result<Vec<u8>> {
 /// have it themselves.
 ///
 /// # Errors
-/// A table that cannot be serialised as TOML, an archive that cannot be written.
+/// [`ExportError`]: `Toml`, `Bytes`.
 pub fn modal_rig(
     file: &str,
     remarks: &[String],
@@ -171,7 +171,7 @@ pub fn modal_rig(
     reduction: Option<&Certificate>,
     sides: &[ModalSide<'_>],
     residual: Option<&ResidualFlexibility>,
-) -> anyhow::Result<Vec<RigFile>> {
+) -> Result<Vec<RigFile>, ExportError> {
     let stem = rig_name(file);
     let mut table = toml::Table::new();
     table.insert("name".to_owned(), stem.as_str().into());
@@ -184,7 +184,9 @@ pub fn modal_rig(
         name.into()
     };
     for side in sides {
-        let bytes = side.archive().with_context(|| format!("{}: its modes cannot be packed", side.name))?;
+        let bytes = side
+            .archive()
+            .map_err(|source| ExportError::Bytes { what: format!("archive of the modes of {}", side.name), source })?;
         let mut keys = toml::Table::new();
         keys.insert("modal".to_owned(), add(side.name, bytes));
         if let Some(ratio) = side.damping_ratio {
@@ -193,18 +195,20 @@ pub fn modal_rig(
         table.insert(side.name.to_owned(), keys.into());
     }
     if let Some(residual) = residual {
-        let bytes = residual_archive(residual).context("the residual cannot be packed")?;
+        let bytes = residual_archive(residual)
+            .map_err(|source| ExportError::Bytes { what: "archive of the residual flexibility".to_owned(), source })?;
         let mut keys = toml::Table::new();
         keys.insert("pairs".to_owned(), add("residual", bytes));
         table.insert("residual".to_owned(), keys.into());
     }
     table.extend(patches.map(|patches| ("contact_patch".to_owned(), patches.clone())));
     if let Some(reduction) = reduction {
-        let known = toml::Value::try_from(reduction).context("the comparison cannot be put into words of TOML")?;
+        let known =
+            toml::Value::try_from(reduction).map_err(|source| ExportError::Toml { what: "the certificate", source })?;
         table.insert("reduction".to_owned(), known);
     }
     let mut text: String = remarks.iter().map(|line| format!("# {line}\n")).collect();
-    text += &toml::to_string(&table).context("the rig cannot be put into words of TOML")?;
+    text += &toml::to_string(&table).map_err(|source| ExportError::Toml { what: "the rig", source })?;
     let mut files = vec![RigFile { name: file.to_owned(), bytes: text.into_bytes() }];
     files.extend(archives);
     Ok(files)
