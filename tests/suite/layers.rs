@@ -53,6 +53,8 @@ const CIRCLES: &[(&[&str], &str)] = &[
         &["physics::critical", "physics::ends", "physics::numbering", "physics::stability_map", "physics::summary"],
         "a map holds its windows and its numbering of modes, both made from its nodes",
     ),
+    (&["contact::law", "contact::spline"], "a law may be a table, and a table gives the values of a law"),
+    (&["contact::path", "contact::statics"], "statics are solved along a path, whose steps are states of the statics"),
     (
         &["physics::chart::build", "physics::chart::leaf"],
         "a build makes leaves, and a leaf reads the options of its build",

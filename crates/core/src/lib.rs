@@ -118,6 +118,7 @@
 //! # Where to go
 //!
 //! - [`physics`]: operating point, model, solver, stability map, window ends, sensitivities, chart
+//! - [`contact`]: states of steady sliding of a contact that can open
 //! - [`reduction`]: full models, their modes and roots, bases that hold over a range of conditions, comparison
 //! - [`fem`]: brick elements and the reference tribometer
 //! - `examples/predict_from_matrices.rs`: a model of modes and contact pairs, from matrices in memory

@@ -67,8 +67,17 @@ pub enum Smoothness {
 /// Why a contact law is invalid.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum LawError {
+    /// A parameter is outside its range.
     #[error("{field} is {value}, expected {limit}")]
-    Value { field: &'static str, value: f64, limit: &'static str },
+    Value {
+        /// The parameter.
+        field: &'static str,
+        /// Its value.
+        value: f64,
+        /// The range expected.
+        limit: &'static str,
+    },
+    /// The table is invalid.
     #[error(transparent)]
     Table(#[from] TableError),
 }

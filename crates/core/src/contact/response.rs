@@ -14,6 +14,7 @@ pub struct StaticResponse {
     pub sliding_flexibility: Mat<f64>,
     /// `a = B_n K_0⁻¹ p`, `c`, m/N: change of the gaps by a load of 1 N, negative where it closes them.
     pub gap_per_load: Vec<f64>,
+    /// Motions of parts that nothing but the contact supports.
     pub rigid: RigidMotions,
 }
 
@@ -56,10 +57,30 @@ pub struct TruncatedResponse<'a> {
 /// Why modes have no static response.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ResponseError {
+    /// A matrix or list has the wrong shape.
     #[error("{what} is {rows}x{columns}, expected {expected_rows}x{expected_columns}")]
-    Shape { what: &'static str, rows: usize, columns: usize, expected_rows: usize, expected_columns: usize },
+    Shape {
+        /// Which matrix or list.
+        what: &'static str,
+        /// Number of rows found.
+        rows: usize,
+        /// Number of columns found.
+        columns: usize,
+        /// Number of rows expected.
+        expected_rows: usize,
+        /// Number of columns expected.
+        expected_columns: usize,
+    },
+    /// A mode has a negative squared frequency beyond rounding.
     #[error("mode {mode}: squared frequency is {value:e}, expected a finite number of at least -{limit:e}")]
-    Frequency { mode: usize, value: f64, limit: f64 },
+    Frequency {
+        /// Index of the mode.
+        mode: usize,
+        /// Its `ω²`, rad²/s².
+        value: f64,
+        /// Magnitude accepted as rounding, rad²/s².
+        limit: f64,
+    },
 }
 
 impl StaticResponse {

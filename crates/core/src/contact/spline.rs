@@ -38,19 +38,53 @@ pub struct PressureTable {
 /// Why a table is not a contact law.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TableError {
+    /// The two lists differ in length.
     #[error("{closures} closures and {pressures} pressures, expected as many of each")]
-    Lengths { closures: usize, pressures: usize },
+    Lengths {
+        /// Number of closures.
+        closures: usize,
+        /// Number of pressures.
+        pressures: usize,
+    },
+    /// Too few points.
     #[error("{found} points, expected at least {limit}")]
-    Points { found: usize, limit: usize },
+    Points {
+        /// Number of points.
+        found: usize,
+        /// Smallest number accepted.
+        limit: usize,
+    },
+    /// A value of a point is outside its range.
     #[error("point {point}: {field} is {value}, expected {limit}")]
-    Value { point: usize, field: &'static str, value: f64, limit: String },
+    Value {
+        /// Index of the point.
+        point: usize,
+        /// Closure or pressure.
+        field: &'static str,
+        /// The value.
+        value: f64,
+        /// The range expected.
+        limit: String,
+    },
+    /// The stiffness of a pair would jump as it closes.
     #[error(
         "the curve leaves 0 like the power {exponent} of the closure, expected more than 1: a pair would close with a jump of \
          its stiffness; a first pressure above 0 or further points near 0 change it"
     )]
-    Toe { exponent: f64 },
+    Toe {
+        /// Exponent of the closure at 0.
+        exponent: f64,
+    },
+    /// The slopes of the interpolation did not converge.
     #[error("slopes of the interpolation changed by {change:.1e} in the last of {steps} steps, limit {limit:.1e}")]
-    Slopes { change: f64, steps: usize, limit: f64 },
+    Slopes {
+        /// Their change in the last step, relative.
+        change: f64,
+        /// Number of steps.
+        steps: usize,
+        /// Largest change accepted.
+        limit: f64,
+    },
 }
 
 impl PressureTable {

@@ -18,12 +18,15 @@ pub enum MeasuredLoad {
 /// What the statics of `c` contact pairs are made of.
 #[derive(Clone, Debug)]
 pub struct StaticsParts {
+    /// Contact law of all pairs.
     pub law: PressureLaw,
     /// `A`, `c`: area of each pair in m², or a factor; force = area × pressure. Positive.
     pub area: Vec<f64>,
     /// `h`, `c`, m: initial gaps, pad minus disc along the normal; negative for interference.
     pub gap_m: Vec<f64>,
+    /// Static response of the parts.
     pub response: StaticResponse,
+    /// Which force the load is.
     pub measured: MeasuredLoad,
 }
 
@@ -60,25 +63,84 @@ impl std::fmt::Display for PathEnd {
 /// Why there is no state.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum StaticsError {
+    /// The contact law is invalid.
     #[error("contact law: {0}")]
     Law(#[from] LawError),
+    /// A matrix or list has the wrong shape.
     #[error("{what} is {rows}x{columns}, expected {expected_rows}x{expected_columns}")]
-    Shape { what: &'static str, rows: usize, columns: usize, expected_rows: usize, expected_columns: usize },
+    Shape {
+        /// Which matrix or list.
+        what: &'static str,
+        /// Number of rows found.
+        rows: usize,
+        /// Number of columns found.
+        columns: usize,
+        /// Number of rows expected.
+        expected_rows: usize,
+        /// Number of columns expected.
+        expected_columns: usize,
+    },
+    /// An entry is outside its range.
     #[error("{what}, entry ({row}, {column}), is {value}, expected {limit}")]
-    Value { what: &'static str, row: usize, column: usize, value: f64, limit: &'static str },
+    Value {
+        /// Which matrix or list.
+        what: &'static str,
+        /// Row of the entry, from 0.
+        row: usize,
+        /// Column of the entry, from 0.
+        column: usize,
+        /// The entry.
+        value: f64,
+        /// The range expected.
+        limit: &'static str,
+    },
+    /// A condition is outside its range.
     #[error("{what} is {value}, expected {limit}")]
-    Condition { what: &'static str, value: f64, limit: &'static str },
+    Condition {
+        /// The condition.
+        what: &'static str,
+        /// Its value.
+        value: f64,
+        /// The range expected.
+        limit: &'static str,
+    },
+    /// No state without friction was found, from which states with friction are followed.
     #[error(
         "no steady sliding without friction at a load of {load_n} N: Newton steps leave {residual:.1e} of the forces, limit \
          {limit:.1e}; the load does not press free-floating parts together, or nothing supports them"
     )]
-    NoStateAtRest { load_n: f64, residual: f64, limit: f64 },
+    NoStateAtRest {
+        /// The load, N.
+        load_n: f64,
+        /// What Newton steps leave of the forces, relative.
+        residual: f64,
+        /// Largest residual accepted.
+        limit: f64,
+    },
+    /// There is no steady sliding at a friction coefficient.
     #[error(
         "no steady sliding at a load of {load_n} N and friction coefficient {asked}: {end} at {friction_coefficient:.6}"
     )]
-    NoEquilibrium { load_n: f64, asked: f64, friction_coefficient: f64, end: PathEnd },
+    NoEquilibrium {
+        /// The load, N.
+        load_n: f64,
+        /// The friction coefficient requested.
+        asked: f64,
+        /// The friction coefficient at which the states end.
+        friction_coefficient: f64,
+        /// How they end.
+        end: PathEnd,
+    },
+    /// A pair is closed further than the table of the law reaches.
     #[error("contact pair {pair} is closed by {closure_m:e} m, beyond the last closure of the table, {limit_m:e} m")]
-    BeyondTable { pair: usize, closure_m: f64, limit_m: f64 },
+    BeyondTable {
+        /// Index of the pair.
+        pair: usize,
+        /// Its closure, m.
+        closure_m: f64,
+        /// Last closure of the table, m.
+        limit_m: f64,
+    },
 }
 
 /// Derivatives of a state with respect to one parameter.
