@@ -305,20 +305,34 @@ pub enum ModelError {
         /// Its distance from the axis, m.
         radius_m: f64,
     },
-    /// An operating point with a value that is no finite number.
+    /// Damping of a pair that is not proportional to its stiffness.
     #[error(
         "contact pair {pair}: damping {damping} N·s/m with stiffness {stiffness} N/m; with a contact state the damping \
          of a pair is proportional to its stiffness"
     )]
-    StateDamping { pair: usize, stiffness: f64, damping: f64 },
+    StateDamping {
+        /// Index of the pair.
+        pair: usize,
+        /// Its stiffness, N/m.
+        stiffness: f64,
+        /// Its damping, N·s/m.
+        damping: f64,
+    },
+    /// Residual inertia together with a contact state.
     #[error("residual inertia with a contact state, expected residual flexibility only")]
     StateInertia,
+    /// A load exponent together with a contact state.
     #[error(
         "[load] exponent {exponent} with a contact state, expected 0: the law of the contact state gives the stiffness"
     )]
-    StateLoadExponent { exponent: f64 },
+    StateLoadExponent {
+        /// [`ContactLaw::exponent`].
+        exponent: f64,
+    },
+    /// There is no contact state at the operating point.
     #[error("contact state: {0}")]
     State(#[source] StaticsError),
+    /// An operating point with a value that is no finite number.
     #[error(
         "operating point ({normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}) is not finite"
     )]
