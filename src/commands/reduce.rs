@@ -18,6 +18,9 @@ use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullSolver, GIB, Kept, Progress, Residual, Wanted};
 use crate::rig::{Certificate, Rig, RigFile, SideResidual, between_patches};
 
+/// Makes the files of the rig, with the certificate if the rig has been compared.
+type FilesOf<'a> = dyn Fn(Option<&Certificate>) -> Result<Vec<RigFile>, ExportError> + 'a;
+
 /// Default cut-off of the modes kept, relative to the band, if `--cutoff-hz` has no value.
 const CUTOFF: f64 = 2.5;
 
@@ -165,7 +168,7 @@ impl Options {
         full: &FullModelFile,
         solver: Option<FullSolver<'_>>,
         method: String,
-        files_of: &dyn Fn(Option<&Certificate>) -> Result<Vec<RigFile>, ExportError>,
+        files_of: &FilesOf<'_>,
     ) -> anyhow::Result<Outcome> {
         let make = |known: Option<&Certificate>| -> anyhow::Result<(Vec<RigFile>, Rig)> {
             let files = files_of(known)?;

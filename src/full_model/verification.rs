@@ -25,7 +25,7 @@ pub enum VerificationError {
     NoPoints,
     /// The full model has settings that its comparison does not support.
     #[error(transparent)]
-    Settings(#[from] RigError),
+    Settings(#[from] Box<RigError>),
     /// The full model could not be solved at an operating point.
     #[error("full model at {point:?}")]
     Full {
@@ -120,7 +120,7 @@ pub fn verify_against(
     if against.points == 0 {
         return Err(VerificationError::NoPoints);
     }
-    full.refuse_modal_damping()?;
+    full.refuse_modal_damping().map_err(Box::new)?;
     let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
     let band_rad_s = std::f64::consts::TAU * band_hz;
     let judged = Judged { band_rad_s, instability_threshold: rig.instability_threshold, decay_per_s: DECAY_PER_S };
