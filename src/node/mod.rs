@@ -600,6 +600,24 @@ mod tests {
         assert_eq!((seen.counters.solved, seen.passed_over), (1, COUNT - 1));
     }
 
+    /// Window ends are computed for a map that may no longer be in force when they are ready.
+    #[test]
+    fn window_ends_of_a_replaced_map_are_discarded() {
+        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
+        let (sender, _receiver) = channel();
+        let settings = Settings::for_rig(&rig);
+        let mut node = Node::new(rig.clone(), settings, Outputs::default(), sender, Watch::default());
+        let mut solver = crate::physics::Solver::new(rig.model.dimension());
+        let mut map = || Arc::new(session_map(&rig, &mut solver, &rig.reference).expect("mapped"));
+        let (former, present) = (map(), map());
+        node.map(rig.reference, Ok(former.clone()));
+        node.map(rig.reference, Ok(present.clone()));
+        for (of, taken) in [(&former, 0), (&present, 1)] {
+            node.ends(of, Ok(Ok(Arc::new(of.ends.clone()))));
+            assert_eq!(node.statistics.ends, taken);
+        }
+    }
+
     /// With a chart, inputs are predicted on the thread that received them. Inputs that need a dense solve are queued,
     /// and later inputs do not overtake them.
     #[test]

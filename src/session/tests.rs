@@ -51,6 +51,17 @@ fn margin_is_pending_until_the_map_is_there() {
     assert!((ready.critical_friction - 0.35592805826058).abs() < 1e-10);
 }
 
+/// Friction acts along the direction of rotation, so that the windows differ with it.
+#[test]
+fn a_map_holds_for_one_direction_of_rotation() {
+    let mut session = with_map(session());
+    assert!(predict(&mut session, conditions(0, 500.0, 13.0, 0.3)).friction_margin > 0.05);
+    let back = predict(&mut session, conditions(1, 500.0, -13.0, 0.3));
+    assert!(back.friction_margin.is_nan() && back.reason.ends_with("margin pending"), "{back:?}");
+    let effects = session.step(conditions(2, 500.0, -13.0, 0.31)).unwrap();
+    assert!(matches!(effects.want, Some(Want::Map(point)) if point.disc_speed_rad_s == -13.0), "{:?}", effects.want);
+}
+
 #[test]
 fn levels_follow_margin_and_damping_ratio_with_hysteresis() {
     let mut session = with_map(session());
@@ -311,6 +322,26 @@ fn static_divergence_squeals() {
         assert_eq!(diverges.level, level::SQUEAL);
         assert!(diverges.reason.contains("static divergence") && diverges.unstable_modes == 1, "{}", diverges.reason);
     }
+}
+
+/// Squeal by divergence ends with the same hysteresis as squeal by a growing mode: not before every damping ratio is above
+/// the limit by it.
+#[test]
+fn squeal_by_divergence_ends_with_the_hysteresis() {
+    // A coordinate that diverges above a friction coefficient of 1, and a mode with a damping ratio of -0.0008: between
+    // -0.001, where squeal begins, and -0.0005, where it ends.
+    let entry = |place: usize, value: f64, law| Term {
+        matrix: faer::Mat::from_fn(2, 2, |i, j| if i == place && j == place { value } else { 0.0 }),
+        law,
+    };
+    let stiffness =
+        vec![entry(0, 1.0, Law::Constant), entry(0, -1.0, Law::FrictionStiffness), entry(1, 100.0, Law::Constant)];
+    let damping = vec![entry(1, -0.016, Law::Constant)];
+    let mut session = of(Model::new(2, stiffness, damping, ContactLaw::default(), None).unwrap());
+    assert_eq!(predict(&mut session, friction(0, 0.9)).level, level::OK);
+    assert_eq!(predict(&mut session, friction(1, 1.1)).level, level::SQUEAL);
+    let held = predict(&mut session, friction(2, 0.9));
+    assert!(held.level == level::SQUEAL && held.reason.contains(", squeal ends at -0.0005"), "{}", held.reason);
 }
 
 #[test]

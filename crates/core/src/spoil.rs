@@ -8,7 +8,7 @@ use std::cell::Cell;
 pub enum Spoil {
     /// Moves an eigenvalue of the unsymmetric dense problem by 1e-6 of the matrix norm.
     Value,
-    /// Perturbs a right vector of the unsymmetric dense problem.
+    /// Perturbs a right vector of the unsymmetric dense problem, or a mode of a sparse system.
     Vector,
     /// Drops a converged mode of the Lanczos iteration.
     Mode,

@@ -925,6 +925,31 @@ mod tests {
     use super::super::spectrum::Vectors;
     use super::*;
 
+    /// One contact pair between a coordinate along the normal and one along the sliding direction: stiffness and damping
+    /// are `[1 0; s μ 0]` times `k` and `c` while it slides, `[1 0; 0 0]` at rest, and zero if the contact is open.
+    #[test]
+    fn contact_terms_follow_the_state_of_the_contact() {
+        let pairs = ContactPairs {
+            normal: faer::mat![[1.0, 0.0]],
+            sliding: faer::mat![[0.0, 1.0]],
+            lateral: Mat::zeros(1, 2),
+            stiffness_n_per_m: vec![3e4],
+            damping_n_s_per_m: vec![5.0],
+            radius_m: vec![0.1],
+        };
+        let free = Model::new(2, vec![], vec![], ContactLaw::default(), None).unwrap();
+        let model = free.with_contact(&pairs).unwrap();
+        let cases = [(500.0, 13.0, 1.0, 0.4), (500.0, -13.0, 1.0, -0.4), (500.0, 0.0, 1.0, 0.0), (0.0, 13.0, 0.0, 0.0)];
+        for (normal_load_n, disc_speed_rad_s, closed, friction) in cases {
+            let p = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient: 0.4 };
+            let (mut k, mut c) = (Mat::zeros(2, 2), Mat::zeros(2, 2));
+            let structure = model.assemble(&p, &mut k, &mut c).unwrap();
+            let unit = faer::mat![[closed, 0.0], [friction, 0.0]];
+            assert_eq!((k, c), (&unit * faer::Scale(3e4), &unit * faer::Scale(5.0)), "{p:?}");
+            assert_eq!(structure, Structure { damped: closed != 0.0, symmetric_stiffness: friction == 0.0 });
+        }
+    }
+
     /// Two contact pairs in two coordinates. One coordinate moves along the sliding direction, the other across it;
     /// each obeys `λ² + c λ + k = 0`. Along, the friction slope gives `c = N dμ/dv`; across, lateral friction gives
     /// `c = μ N / (|ω| r)`, for both directions of rotation. Calculated by hand: -10 and 153.846 1/s.

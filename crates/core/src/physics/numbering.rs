@@ -261,3 +261,70 @@ pub(crate) fn gaps(spectrum: &Spectrum) -> Vec<f64> {
     };
     (0..count).map(gap).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use faer::Mat;
+
+    use super::super::model::{ContactLaw, CustomLaw, Law, Model, Term};
+    use super::super::operating_point::OperatingPoint;
+    use super::super::solver::Solver;
+    use super::super::spectrum::Vectors;
+    use super::super::stability_map::MapOptions;
+    use super::*;
+
+    /// Two coordinates that nothing couples: `k = k_0(μ)` with damping `c`, and `k = 110` with damping `-c/10`. Their
+    /// shapes tell them apart wherever they cross. The band excludes both, so that the map has no nodes close to a
+    /// crossing.
+    fn crossing(k_0: fn(f64) -> f64, c: f64, [from, to]: [f64; 2]) {
+        let entry =
+            |place: usize, value: f64| Mat::from_fn(2, 2, |i, j| if i == place && j == place { value } else { 0.0 });
+        let law = CustomLaw {
+            text: "k_0".to_owned(),
+            evaluate: Arc::new(move |p: &OperatingPoint| k_0(p.friction_coefficient)),
+            depends_on_load: false,
+            depends_on_speed: false,
+            depends_on_friction: true,
+        };
+        let constant = |matrix| Term { matrix, law: Law::Constant };
+        let stiffness = vec![Term { matrix: entry(0, 1.0), law: Law::Custom(law) }, constant(entry(1, 110.0))];
+        let damping = vec![constant(entry(0, c)), constant(entry(1, -0.1 * c))];
+        let model = Model::new(2, stiffness, damping, ContactLaw::default(), None).unwrap();
+        let options = MapOptions {
+            mu_min: 0.0,
+            mu_max: 1.0,
+            band_max_hz: Some(0.1),
+            instability_threshold: 1e-6,
+            windows: false,
+        };
+        let at = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 13.0, friction_coefficient: 0.0 };
+        let mut solver = Solver::new(2);
+        let map = StabilityMap::build(&model, &mut solver, &at, &options).unwrap();
+        assert!(map.nodes.len() < 40, "{}", map.nodes.len());
+        let mut orders = [0; 2];
+        for k in 0..=40 {
+            let mu = from + (to - from) * f64::from(k) / 40.0;
+            let spectrum = solver.solve(&model, &at.with_friction(mu), Vectors::Both).unwrap();
+            assert_eq!(map.ids(&spectrum), map.identify(&spectrum), "friction coefficient {mu}");
+            orders[usize::from(spectrum.shapes[(0, 0)].norm() > 0.5)] += 1;
+        }
+        assert!(orders.iter().all(|&count| count > 5), "{orders:?}");
+    }
+
+    /// Undamped roots cross where a parabola does, between two nodes; a straight line between these crosses 1e-4 away.
+    #[test]
+    fn undamped_roots_cross_where_the_curves_through_the_nodes_do() {
+        crossing(|mu| 100.0 + 25.0 * mu * mu, 0.0, [0.632_43, 0.632_48]);
+    }
+
+    /// Where two damped roots have the same frequency, their growth rates differ: which frequency the interpolation
+    /// finds higher does not decide. The sine crosses 110 near 0.14, and a cubic 1e-5 away.
+    #[test]
+    fn damped_roots_keep_their_identities_where_frequencies_cross() {
+        // `ω² = k - c²/4` of each.
+        let crosses = (std::f64::consts::PI - ((10.0 - 0.000_625 + 0.0625) / 30.0_f64).asin()) / 20.0;
+        crossing(|mu| 100.0 + 30.0 * (20.0 * mu).sin(), 0.5, [crosses - 2e-5, crosses + 2e-5]);
+    }
+}

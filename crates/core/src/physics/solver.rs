@@ -476,6 +476,7 @@ mod tests {
         let under = solve(&one(25.0, 6.0), 0.0);
         assert!((under.roots[0].lambda - c64::new(-3.0, 4.0)).norm() < 1e-14);
         assert!((under.roots[0].damping_ratio() - 0.6).abs() < 1e-15);
+        assert_eq!(under.roots.len(), 1, "one root stands for a conjugate pair");
         let over = solve(&one(4.0, 5.0), 0.0);
         assert_eq!(over.mode_count, 0);
         let growth = over.nonoscillatory_growth_per_s();
@@ -551,6 +552,20 @@ mod tests {
     fn the_threshold_of_instability() {
         let root = |growth: f64| Root { lambda: c64::new(growth, 1.0), ..solve(&one(25.0, 6.0), 0.0).roots[0] };
         assert!(!root(0.99e-6).is_unstable(1e-6) && root(1.01e-6).is_unstable(1e-6));
+    }
+
+    /// A pair of roots `λ² = -100 ± 1e-10`, closer than the matrix is resolved. The bound is of the order of the square
+    /// root of the rounding error; the condition number alone, which is infinite in the limit, gives more than 1.
+    #[test]
+    fn the_bound_of_a_nearly_double_root_is_a_square_root() {
+        let matrix = mat![[100.0, 1.0], [1e-20, 100.0]];
+        let term = Term { matrix, law: Law::Constant };
+        let model = Model::new(2, vec![term], vec![], ContactLaw::default(), None).unwrap();
+        let spectrum = Solver::new(2).solve(&model, &REFERENCE, Vectors::Both).unwrap();
+        for root in &spectrum.roots {
+            let bound = root.error.square;
+            assert!(((root.square.re + 100.0).abs() - 1e-10).abs() <= bound && bound < 1e-3, "{root:?}");
+        }
     }
 
     /// `d(λ²)/dμ` from left and right vectors, compared with a central difference of the roots.

@@ -408,6 +408,10 @@ fn gap_after(squares: &[f64], count: usize) -> Option<usize> {
 fn finish(pencil: &Pencil<'_>, found: Found) -> Result<SparseModes, ReductionError> {
     let Found { omega_squared, mut phi } = found;
     fix_signs(&mut phi);
+    #[cfg(test)]
+    if crate::spoil::spoilt(crate::spoil::Spoil::Vector) {
+        phi[(0, 0)] += 1e-3 * phi.norm_max();
+    }
     let (stiffness, mass) = (one_norm(pencil.stiffness), one_norm(pencil.mass));
     let mut residual = times(pencil.stiffness, phi.as_ref());
     let inertia = times(pencil.mass, phi.as_ref());
@@ -533,6 +537,19 @@ mod tests {
             let found = with(Spoil::Mode, || normal_modes("pad", &mass, &stiffness, wanted, None, &mut |_| {}));
             let missed = matches!(&found, Err(ReductionError::MissedModes { what, .. }) if what == "pad");
             assert!(missed, "{:?}", found.map(|modes| modes.omega_squared));
+        }
+    }
+
+    /// A falsified mode is rejected by its residual, from the iteration and from the dense solve.
+    #[test]
+    fn a_wrong_mode_is_refused_by_its_residual() {
+        use crate::spoil::{Spoil, with};
+        for (side, count) in [(30, 20), (5, 10)] {
+            let (mass, stiffness, _) = membrane(side, 0.5);
+            let found = with(Spoil::Vector, || lowest_modes("disc", &mass, &stiffness, count));
+            let Err(ReductionError::Residual { what, mode: 0, value, limit }) = found else { panic!("{side}") };
+            assert!(what == "disc" && value > limit && limit == BACKWARD_LIMIT);
+            assert!(lowest_modes("disc", &mass, &stiffness, count).is_ok());
         }
     }
 

@@ -195,4 +195,27 @@ mod tests {
             }
         }
     }
+
+    /// Symmetric functions off by their bounds, in every combination of signs: the bound of some computed root contains
+    /// each true one, also where roots merge and move by the square or cube root of the error.
+    #[test]
+    fn bounds_hold_for_functions_off_by_theirs() {
+        const ERROR: f64 = 1e-9;
+        for offsets in [&[0.0, 0.0][..], &[-1e-4, 1e-4], &[-0.1, 0.1], &[0.0, 0.0, 0.0], &[-1e-3, 0.0, 1e-3]] {
+            let exact: Vec<c64> = offsets.iter().map(|w| c64::new(-4.0 + w, 0.0)).collect();
+            let functions = symmetric_functions(&exact);
+            let errors = vec![ERROR; functions.len()];
+            for signs in 0..1 << functions.len() {
+                let off = |m: usize| if signs >> m & 1 == 1 { 0.99 * ERROR } else { -0.99 * ERROR };
+                let moved: Vec<c64> = functions.iter().enumerate().map(|(m, f)| f + off(m)).collect();
+                let mut out = [(c64::ZERO, 0.0); MAX_SIZE];
+                roots(&moved, &errors, &mut out);
+                let found = &out[..exact.len()];
+                for root in &exact {
+                    let held = found.iter().any(|(z, bound)| (z - root).norm() <= *bound);
+                    assert!(held, "{root} of {offsets:?}, signs {signs:b}: {found:?}");
+                }
+            }
+        }
+    }
 }
