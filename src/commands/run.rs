@@ -37,7 +37,7 @@ pub struct Options {
     shown: NodeOptions,
 }
 
-/// What `run` and `demo` share.
+/// Options shared by `run` and `demo`.
 #[derive(Clone, Debug, Args)]
 pub struct NodeOptions {
     /// Record the session into a new directory in this one
@@ -222,7 +222,7 @@ fn start_recorder(rig: &Rig, directory: &std::path::Path) -> anyhow::Result<Reco
     let recorder = Recorder::start_when_possible(config)?;
     let status = recorder.status();
     match &status.state {
-        State::Failed(why) => note!("not recording yet, tried again until it can be: {why}"),
+        State::Failed(why) => note!("not recording yet, trying again: {why}"),
         State::Recording | State::Finished => note!("recording into {}", status.directory.display()),
     }
     Ok(recorder)

@@ -58,7 +58,7 @@ impl std::str::FromStr for Range {
 }
 
 impl Range {
-    /// Each value is computed on its own, so that rounding errors do not accumulate.
+    /// Each value is computed independently, so that rounding errors do not accumulate.
     fn values(self) -> impl Iterator<Item = f64> {
         let count = ((self.to - self.from) / self.step + 1e-9).floor() as usize;
         (0..=count).map(move |k| self.from + k as f64 * self.step)
@@ -100,7 +100,7 @@ impl Options {
 type Swept = (f64, Mode);
 
 /// Distance from a window at which the stable side of its end is drawn.
-const BESIDE: f64 = 1e-6;
+const OFFSET: f64 = 1e-6;
 
 /// Result of a sweep.
 struct Sweep {
@@ -154,7 +154,7 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
     windows.iter_mut().for_each(|window| window.mu_to = window.mu_to.filter(|&mu| mu <= range.to));
     let mut beside_ends = vec![];
     for window in &windows {
-        let outside = [Some(window.mu_from - BESIDE), window.mu_to.map(|mu| mu + BESIDE)];
+        let outside = [Some(window.mu_from - OFFSET), window.mu_to.map(|mu| mu + OFFSET)];
         for mu in outside.into_iter().flatten().filter(|mu| (range.from..=range.to).contains(mu)) {
             beside_ends.extend(modes_at(&mut solver, mu)?);
         }
@@ -199,7 +199,7 @@ mod tests {
             let grows = |swept: &Swept| swept.1.root.growth_rate_per_s() / swept.1.root.lambda.norm();
             let before: Vec<&Swept> = beside_ends.iter().filter(last).collect();
             let nearest = before.iter().map(|swept| swept.0).fold(0.0, f64::max);
-            assert!(window.mu_from - nearest < 2.0 * BESIDE, "{nearest}, the window begins at {}", window.mu_from);
+            assert!(window.mu_from - nearest < 2.0 * OFFSET, "{nearest}, the window begins at {}", window.mu_from);
             let ids: Vec<u32> = before.iter().filter(|swept| swept.0 == nearest).map(|swept| swept.1.id).collect();
             assert!(window.mode_ids.iter().all(|id| ids.contains(id)), "the pair has ids there: {ids:?}");
             let pair = before.iter().filter(|swept| swept.0 == nearest && window.mode_ids.contains(&swept.1.id));

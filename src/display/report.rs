@@ -316,7 +316,7 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
             event_kind::STABILITY_MAP => {
                 ("stability map ready", format!("{:.1} N, {:.3} rad/s", event.normal_load_n, event.disc_speed_rad_s))
             }
-            event_kind::CHART => ("chart ready", "predictions are read off it from here on".to_owned()),
+            event_kind::CHART => ("chart ready", "later predictions are evaluated from it".to_owned()),
             event_kind::SILENCE => ("silence", "no input came for too long".to_owned()),
             // The initial settings are in the table at the top.
             event_kind::PARAMETER if after_s > STARTING_S => ("setting", format!("{} = {}", event.name, event.value)),
@@ -393,7 +393,7 @@ fn skipped(recorded: &Recorded) -> String {
         html += &facts(counted);
     }
     if recorded.damage.is_empty() {
-        html += "<p>The recording is whole.</p>\n";
+        html += "<p>The recording is complete.</p>\n";
     }
     for damage in &recorded.damage {
         let _ = writeln!(html, "<p>{}</p>", escaped(&damage.to_string()));

@@ -204,14 +204,14 @@ async fn send_states(app: App) {
     }
 }
 
-/// Refuses requests for host names that are not the server's own, so that no other site can reach it through a name of
-/// its own. Tells the browser to load nothing from other origins.
+/// Refuses requests for host names other than the server's, so that no other site can reach it through a name of that
+/// site. Tells the browser to load nothing from other origins.
 async fn guard(Shared(app): Shared<App>, request: Request, next: Next) -> Response {
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or("");
     let mut response = if is_own_name(host, app.address.ip()) {
         next.run(request).await
     } else {
-        (StatusCode::FORBIDDEN, "this display is reached by the address it serves on").into_response()
+        (StatusCode::FORBIDDEN, "this display is only available at the address it serves on").into_response()
     };
     let headers = response.headers_mut();
     for (name, value) in [

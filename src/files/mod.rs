@@ -1,4 +1,4 @@
-//! Files as such: read under a size limit, written whole or not at all; charts on disk.
+//! Files: read under a size limit, written complete or not at all; charts on disk.
 
 pub mod chart_file;
 pub mod input_file;

@@ -154,7 +154,7 @@ pub fn read(
     let unknown = without_row.into_iter().filter(|(label, _)| !held.contains(label)).min_by_key(|&(_, line)| line);
     if let Some(((node, direction), line)) = unknown {
         let value = format!("is at node {node}, direction {}", direction + 1);
-        let limit = format!("a row of {rows_file}, or one that the stiffness holds; are the files whole?");
+        let limit = format!("a row of {rows_file}, or one that the stiffness constrains; the files may be truncated");
         return Err(refuse(file, line, "entry", value, &limit));
     }
     Ok((entries, if below && above { None } else { Some(1) }))

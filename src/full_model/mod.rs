@@ -154,7 +154,7 @@ impl FullModelFile {
             Some((part, ratio)) => Err(RigError::Kind {
                 file: self.path.display().to_string(),
                 field: format!("{part}.damping_ratio"),
-                value: format!("is {ratio}: damping of modes is no matrix of the full model"),
+                value: format!("is {ratio}: the matrices of a full model contain no modal damping"),
                 limit: "0, or none, to solve the full model".to_owned(),
             }),
         }

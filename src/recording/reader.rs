@@ -40,11 +40,11 @@ pub enum RecordingError {
     Io { path: PathBuf, source: io::Error },
     #[error("{}: not an MCAP file: it does not begin with its magic bytes", .path.display())]
     NotMcap { path: PathBuf },
-    #[error("{}: a recording in the sqlite3 format, expected MCAP; `ros2 bag convert` makes one of it", .path.display())]
+    #[error("{}: a recording in the sqlite3 format, expected MCAP; `ros2 bag convert` converts it", .path.display())]
     Sqlite { path: PathBuf },
     #[error(
         "{}: an MCAP file that was compressed as a whole, expected one as it is or with compressed chunks; `ros2 bag convert` \
-         makes one of it",
+         converts it",
         .path.display()
     )]
     Compressed { path: PathBuf },
@@ -358,7 +358,7 @@ impl Iterator for Messages<'_> {
 /// Why a message cannot be decoded.
 fn undecodable(data: &[u8], error: &CdrError) -> String {
     if data.starts_with(&ZSTD_MAGIC) {
-        return "compressed message by message; `ros2 bag convert` makes a recording without".to_owned();
+        return "compressed message by message; `ros2 bag convert` decompresses it".to_owned();
     }
     error.to_string()
 }

@@ -585,7 +585,7 @@ fn attachment(body: Bytes) -> Result<Attachment, String> {
         let end = body.len() - fields.0.len();
         Some((attachment, end - data..end, fields.u32()?))
     };
-    let (mut attachment, data, written) = read().ok_or("attachment shorter than it says")?;
+    let (mut attachment, data, written) = read().ok_or("attachment shorter than its length field")?;
     let crc = crc32fast::hash(body.get(..data.end).unwrap_or_default());
     if written != 0 && written != crc {
         return Err(format!("attachment {:?} with CRC {crc:08x} where {written:08x} was written", attachment.name));

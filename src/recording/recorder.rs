@@ -153,7 +153,7 @@ impl Status {
         let (full, failed) = (self.dropped_queue_full, self.dropped_failed);
         let full = (full > 0).then(|| {
             format!(
-                "{full} found the queue of {} messages full; the disk kept it waiting for {:.1} s at most",
+                "{full} dropped because the queue of {} messages was full; the disk blocked the recorder for at most {:.1} s",
                 self.queue_capacity,
                 self.longest_stall.as_secs_f64()
             )

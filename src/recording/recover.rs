@@ -29,7 +29,7 @@ pub enum RecoverError {
     Read(#[from] RecordingError),
     #[error(transparent)]
     Write(#[from] WriteError),
-    #[error("{}: cannot take the place of {}, which exists", .interrupted.display(), .finished.display())]
+    #[error("{}: cannot replace {}, which exists", .interrupted.display(), .finished.display())]
     TargetExists { interrupted: PathBuf, finished: PathBuf },
 }
 

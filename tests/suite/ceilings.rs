@@ -288,7 +288,7 @@ fn an_interrupted_file_does_not_take_the_place_of_a_finished_one() {
     let finished = write(folder.path(), "x.mcap", "finished");
     let interrupted = format!("{finished}.active");
     std::fs::write(&interrupted, recording(&[channel()])).expect("the recording");
-    run(["recover", &interrupted]).exits(1).complains("cannot take the place of");
+    run(["recover", &interrupted]).exits(1).complains("cannot replace");
     assert_eq!(std::fs::read(&finished).expect("it stays"), b"finished");
     assert_eq!(std::fs::read(&interrupted).expect("it stays"), recording(&[channel()]));
 }

@@ -260,7 +260,7 @@ fn labelled_matrices_cut_short_are_refused() {
     let lines = |text: &str, count: usize| text.lines().take(count).map(|line| format!("{line}\n")).collect::<String>();
     // What held node 17 along z is gone, so nothing says why it has mass but no row.
     check(&lines(stiffness, 3), mass).exits(1).complains(
-        "m.txt, line 3: entry is at node 17, direction 3; expected a row of k.txt, or one that the stiffness holds",
+        "m.txt, line 3: entry is at node 17, direction 3; expected a row of k.txt, or one that the stiffness constrains",
     );
     // Along y an entry off the diagonal is left: a row without a diagonal.
     check(&lines(stiffness, 2), mass)

@@ -322,7 +322,7 @@ fn a_disk_that_hangs_does_not_delay_predictions() {
     let finished = recorder.finish(LIMIT).unwrap();
     assert_eq!((finished.status.messages_written, finished.status.dropped_queue_full), (taken, 1));
     let why = finished.status.why_dropped().unwrap();
-    assert!(why.starts_with(&format!("1 found the queue of {QUEUE_MESSAGES} messages full")), "{why}");
+    assert!(why.starts_with(&format!("1 dropped because the queue of {QUEUE_MESSAGES} messages was full")), "{why}");
     assert!(sequence_numbers(&read(&finished.directory)).into_iter().eq(0..seq), "not those that were taken");
 }
 

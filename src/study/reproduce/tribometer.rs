@@ -83,7 +83,7 @@ impl PartModes {
     }
 }
 
-/// What Section 4 is reproduced from: a full model of the tribometer, the [`MODES`] of its parts with residual
+/// Inputs for reproducing Section 4: a full model of the tribometer, the [`MODES`] of its parts with residual
 /// flexibility, and a parametric basis of the full model.
 pub struct Study<'a> {
     pub full: &'a FullModelFile,

@@ -224,8 +224,8 @@ fn of_root(spectrum: &Spectrum, root: usize, group: &Group, block: &Block, reach
     let bends = (0..5).any(|k| {
         let [[a, b], [c, e]] = block.dt[k];
         let curvature = 0.25 * (a - e) * (a - e) + b * c;
-        let lacks = curvature - pair.discriminant_slope[k] * pair.discriminant_slope[k] / (4.0 * pair.discriminant);
-        let bend = lacks.norm() * reach[k] * reach[k];
+        let deviation = curvature - pair.discriminant_slope[k] * pair.discriminant_slope[k] / (4.0 * pair.discriminant);
+        let bend = deviation.norm() * reach[k] * reach[k];
         bend.is_nan() || bend > half.norm_sqr()
     });
     let change = if bends { Change::SquareRoot { partner, pair } } else { Change::Linear(to_lambda(slope)) };
