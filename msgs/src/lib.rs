@@ -21,7 +21,7 @@
 //! # Ok::<(), squealcast_msgs::CdrError>(())
 //! ```
 //!
-//! `examples/shared_memory_client.rs` sends conditions over shared memory and prints what is predicted.
+//! `examples/shared_memory_client.rs` sends conditions over shared memory and prints the predictions.
 
 #![warn(missing_docs)]
 
@@ -276,7 +276,7 @@ pub struct RigInfo {
     pub mode_count: u32,
     /// Highest frequency that is listed and judged, Hz.
     pub band_max_hz: f64,
-    /// How the rig differs from the full model it was reduced from; empty if unknown.
+    /// Errors of the rig against the full model it was reduced from, as text; empty if unknown.
     pub reduction: String,
 }
 

@@ -733,7 +733,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused() {
+    fn messages_that_do_not_fit_are_refused() {
         assert_eq!(PredictionForm::from_message(&prediction(65, "")), Err(FormError::ModeCount { found: 65 }));
         let bad_level = Prediction { level: 4, ..prediction(0, "") };
         assert_eq!(PredictionForm::from_message(&bad_level), Err(FormError::Level(4)));

@@ -367,7 +367,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn csv_has_a_line_for_each_event_and_no_value_where_there_is_none() {
+    fn csv_has_a_line_for_each_event_and_empty_cells_for_unknown_values() {
         let mut events = Events::default();
         events.push(&sample(1_700_000_000_000_000_000, 0.5, Status::Squeal));
         events.push(&sample(1_700_000_001_250_000_000, f64::NAN, Status::Fault));

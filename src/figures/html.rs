@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_no_markup_stays_none() {
+    fn text_is_escaped_and_figures_are_not() {
         assert_eq!(escaped("<a href=\"x\">&"), "&lt;a href=&quot;x&quot;&gt;&amp;");
         assert!(page("a < b", "").contains("<title>a &lt; b</title>"));
         let figure = figure("<?xml?>\n<svg></svg>", "c");

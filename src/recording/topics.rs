@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn a_topic_of_the_nodes_that_cannot_be_read_says_why() {
+    fn an_unreadable_topic_of_the_node_is_reported_with_the_reason() {
         let read = |channel: Channel| {
             let decided = RecordedTopics::decide(std::slice::from_ref(&channel), &[]).expect("no choice");
             let unread: Vec<String> = decided.unread().iter().map(ToString::to_string).collect();

@@ -206,7 +206,7 @@ fn read_header(header: &str) -> Result<(bool, bool, Symmetry), HeaderError> {
     let integer = match field {
         "real" | "double" => false,
         "integer" => true,
-        "complex" => return Err(("field", found(field), "real or integer: complex matrices have no place in a rig")),
+        "complex" => return Err(("field", found(field), "real or integer: complex matrices are not supported")),
         "pattern" => return Err(("field", found(field), "real or integer: a pattern has no values")),
         _ => return Err(("field", found(field), "real or integer")),
     };
@@ -295,7 +295,7 @@ mod tests {
             ),
             (
                 format!("{head} coordinate complex general\n1 1 0"),
-                "a.mtx, line 1: field is `complex`; expected real or integer: complex matrices have no place in a rig",
+                "a.mtx, line 1: field is `complex`; expected real or integer: complex matrices are not supported",
             ),
             (
                 format!("{head} coordinate real hermitian\n1 1 0"),

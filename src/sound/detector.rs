@@ -62,7 +62,7 @@ pub struct Settings {
     pub min_duration_s: f64,
     /// Longest interruption within a squeal, s.
     pub bridge_s: f64,
-    /// Samples are missing if a stamp is this much later than the samples before it say, s.
+    /// Samples are missing if a stamp is this much later than the previous samples imply, s.
     pub gap_s: f64,
 }
 
@@ -166,7 +166,7 @@ pub struct Counts {
     pub missing: u64,
     /// Ignored samples, at overlaps.
     pub repeated: u64,
-    /// Samples that are no numbers; taken for 0.
+    /// Samples that are not finite; replaced by 0.
     pub not_finite: u64,
     pub interruptions: u64,
     /// The first [`MOST_NAMED`] interruptions.
@@ -809,7 +809,7 @@ mod tests {
     }
 
     #[test]
-    fn several_squeals_at_once_are_told_apart() {
+    fn simultaneous_squeals_are_distinguished() {
         let (samples, planted) = sound(60.0, &[], &[(1900.0, 60.0), (2000.0, 90.0), (5432.1, 150.0)]);
         let found = squeals(&samples, 1024);
         assert_eq!(found.len(), 3, "{found:?}");

@@ -105,7 +105,7 @@ fn a_shared_basis_of_both_sides_modes_is_the_same_rig() {
 }
 
 #[test]
-fn what_makes_no_shared_basis_is_refused() {
+fn an_invalid_shared_basis_is_refused() {
     let both = |more: &str, omega: f64| {
         let sides = [side("pad", vec![300.0], shape(12, 1, 0.2)), side("disc", vec![omega], shape(12, 1, 1.0))];
         Rig::from_files(&rig_of(more, &sides)).map(|_| ()).unwrap_err().to_string()

@@ -522,7 +522,7 @@ fn a_recording_of_faults_is_not_called_quiet() {
 }
 
 #[test]
-fn a_connection_that_says_nothing_is_closed() {
+fn a_silent_connection_is_closed() {
     let shown = Shown::demo(&[]);
     let mut silent = TcpStream::connect(shown.address).unwrap();
     silent.set_read_timeout(Some(PATIENCE)).unwrap();

@@ -158,7 +158,7 @@ fn stiffness_that_is_poorly_determined_is_called_so() {
 }
 
 #[test]
-fn what_cannot_be_fitted_is_refused() {
+fn targets_that_cannot_be_fitted_are_refused() {
     let temp = tempfile::tempdir().unwrap();
     let rig = launch("nine-dof.toml");
     let targets = |content: &str| write(temp.path(), "targets.csv", content);

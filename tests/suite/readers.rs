@@ -204,7 +204,7 @@ fn topics_decide_which_conditions_are_predicted() {
 }
 
 #[test]
-fn a_topic_that_cannot_be_read_says_why() {
+fn an_unreadable_topic_is_reported_with_the_reason() {
     let folder = folder();
     let prediction = squealcast::msgs::Prediction { input_seq: 0, ..Default::default() };
     let schema = Topic::Prediction.schema().replace("float64 friction_margin_error\n", "");

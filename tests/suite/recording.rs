@@ -62,7 +62,7 @@ fn only_file(directory: &Path) -> PathBuf {
 }
 
 #[test]
-fn what_was_recorded_is_read_back() {
+fn recorded_messages_are_read_back() {
     let temp = TempDir::new().unwrap();
     let (directory, messages) = record(config(temp.path()), 500);
     let entries = read(&directory);

@@ -217,7 +217,7 @@ fn a_compact_rig_is_the_same_rig() {
 }
 
 #[test]
-fn what_cannot_be_done_is_refused_and_leaves_nothing() {
+fn impossible_requests_are_refused_and_leave_no_files() {
     let folder = tempfile::tempdir().unwrap();
     let path = tribometer(folder.path(), 5000);
     let bandless = std::fs::read_to_string(&path).unwrap().replace(BAND, "");

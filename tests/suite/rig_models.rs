@@ -186,7 +186,7 @@ fn belt_modes_of_the_reduced_rigs_are_x5_and_the_translation() {
 }
 
 #[test]
-fn hoffmann_coalesces_where_the_closed_form_says() {
+fn hoffmann_coalesces_at_the_closed_form_value() {
     // In physical coordinates (k11 - k22 - kc)²/4 + k12 (k12 - μ kc) = 0; the discriminant of the characteristic
     // polynomial does not depend on the coordinates.
     let rig = Rig::load(&launch("hoffmann.toml")).unwrap();

@@ -384,7 +384,7 @@ pub mod tests {
     }
 
     #[test]
-    fn what_squeals_is_on_top_red_and_marked_wherever_the_rest_is_scrolled() {
+    fn unstable_modes_are_on_top_red_and_marked_at_any_scroll_position() {
         for (width, height) in SIZES {
             for first_row in [0, 3, usize::MAX] {
                 let (lines, buffer, first) = drawn(Status::Squeal, width, height, first_row);

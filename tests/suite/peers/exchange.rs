@@ -96,7 +96,7 @@ fn iceoryx2_in_python_is_answered() {
 
 /// Our peers on both buses at once: the result must not depend on the bus an input arrives over first.
 #[test]
-fn what_comes_over_both_buses_is_answered_once() {
+fn an_input_received_over_both_buses_is_answered_once() {
     const COUNT: u64 = 1000;
     let _alone = alone();
     say(&format!("both buses: squealcast {} against its own mirror", env!("CARGO_PKG_VERSION")));

@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mass_adds_up_to_density_times_volume_and_the_stiffness_knows_no_rigid_motion() {
+    fn the_mass_is_density_times_volume_and_rigid_motions_have_no_stiffness() {
         let nodes = distorted();
         let matrices = brick(&nodes, &STEEL).unwrap();
         // A distorted 2x2x2 box. 2x2x2 Gauss points integrate its volume exactly, so a 5x5x5 rule must agree.

@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_meaning_is_refused() {
+    fn unsupported_contacts_are_refused() {
         let with = |residual: &ResidualFlexibility, law: ContactLaw, range: f64| {
             let mut model = free(KEPT);
             model.contact_law = law;

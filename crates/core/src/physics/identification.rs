@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_found_is_said() {
+    fn unsuitable_targets_are_errors() {
         let stiff = [1.58, 2e4];
         assert_eq!(identify(&stiff, &mut pair), Err(IdentificationError::AtTheEnd { factor: 1e4 }));
         assert_eq!(identify(&[1.0; 3], &mut pair), Err(IdentificationError::TooFew { found: 2, expected: 3 }));

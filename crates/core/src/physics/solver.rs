@@ -457,7 +457,7 @@ mod tests {
 
     /// Two masses on two springs, with the stiffness scaled over 24 decades: `ω² = k (3 ± √5)/2`.
     #[test]
-    fn symmetric_route_knows_no_scale() {
+    fn symmetric_route_is_independent_of_scale() {
         for k in [1e-12, 1e-6, 1.0, 1e6, 1e12] {
             let matrix = mat![[2.0 * k, -k], [-k, k]];
             let term = Term { matrix, law: Law::Constant };
@@ -507,7 +507,7 @@ mod tests {
     /// A falsified eigenvector is rejected by its residual. A falsified eigenvalue is rejected by the traces if no
     /// vectors are requested.
     #[test]
-    fn an_answer_that_is_none_is_refused() {
+    fn a_falsified_solution_is_rejected() {
         use crate::spoil::{Spoil, with};
         let (model, mut solver) = (nine_dof(1.0, 1.0, 1.0), Solver::new(9));
         let mut solve =

@@ -1,4 +1,4 @@
-//! Makes a leaf from followed roots: finds clusters whose symmetric functions converge, expands and bounds them, and
+//! Builds a leaf from followed roots: finds clusters whose symmetric functions converge, expands and bounds them, and
 //! arranges the coefficients.
 
 use faer::{Mat, c64};
