@@ -23,7 +23,7 @@ const LONGEST_S: f64 = 4.0 * 3600.0;
 /// Whether a simulated session sounds
 #[derive(Clone, Debug, Args)]
 pub struct SoundOptions {
-    /// Also write the sound of the session, in Pa, and beside it as JSON the squeals in it: unstable modes grow at their
+    /// Also write the sound of the session, in Pa, and its squeals as JSON: unstable modes grow at their
     /// predicted rates up to 95 dB(A). `hear WAV --unit Pa --against DIR/...` compares them with the predictions
     #[arg(long, value_name = "WAV", requires = "record")]
     sound: Option<PathBuf>,
@@ -32,7 +32,7 @@ pub struct SoundOptions {
     snr_db: f64,
 }
 
-/// The JSON file beside the sound.
+/// The JSON file with the squeals of the sound.
 #[derive(Serialize)]
 struct Truth {
     /// Stamp of the first sample and of the first prediction, ns since the epoch.

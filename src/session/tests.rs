@@ -97,7 +97,7 @@ fn bad_and_stale_inputs_are_faults_without_modes() {
     for (event, reason) in cases {
         let fault = predict(&mut session, event);
         assert_eq!(fault.level, level::FAULT);
-        assert!(fault.reason.contains(reason), "`{}` lacks `{reason}`", fault.reason);
+        assert!(fault.reason.contains(reason), "`{}` does not contain `{reason}`", fault.reason);
         assert!(fault.modes.is_empty() && fault.friction_margin.is_nan() && !fault.reused);
     }
     assert_eq!(predict(&mut session, friction(15, 0.3)).level, level::OK, "the next good input is predicted");
@@ -154,7 +154,7 @@ fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
             assert!(off <= prediction.friction_margin_error + 1e-12, "{load} N: {off} {prediction:?}");
             if let Some(Want::Ends(point)) = effects.want {
                 largest = largest.max(off);
-                assert!(asked.replace(point).is_none(), "{load} N: asked for once");
+                assert!(asked.replace(point).is_none(), "{load} N: requested once");
                 let map = session.map().cloned().unwrap();
                 let ends = Ends::carried(&rig.model, &mut session.solver, &map, &point).unwrap().unwrap();
                 session.step(Event::EndsReady(Arc::new(ends))).unwrap();

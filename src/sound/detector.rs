@@ -815,7 +815,7 @@ mod tests {
         assert_eq!(found.len(), 3, "{found:?}");
         for planted in &planted {
             let near = |squeal: &&Squeal| (squeal.frequency_hz - planted.frequency_hz).abs() < 20.0;
-            check(found.iter().find(near).unwrap_or_else(|| panic!("{found:?} lacks {planted:?}")), planted);
+            check(found.iter().find(near).unwrap_or_else(|| panic!("{planted:?} is not among {found:?}")), planted);
         }
     }
 

@@ -95,7 +95,7 @@ export const SITUATIONS = {
   squeal: state(predicted(0.72, 5216)),
   worst: state(predicted(0.93, 5216)),
   fault: state({ ...blank(3, FAULT), status: "fault", message: FAULT, load: -5, speed: 13.04, mu: 0.42 }),
-  waiting: state({ age_s: null, rate_hz: 0, map: 0, events: 0, status: "waiting", message: "no operating point was heard yet", counters: { solved: 0, charted: 0, reused: 0, faults: 1, passed_over: 0, ros2_falls: 0 }, spread: null, trend_per_s: null, fastest: null, next: null }),
+  waiting: state({ age_s: null, rate_hz: 0, map: 0, events: 0, status: "waiting", message: "no input was received yet", counters: { solved: 0, charted: 0, reused: 0, faults: 1, passed_over: 0, ros2_falls: 0 }, spread: null, trend_per_s: null, fastest: null, next: null }),
   no_data: state({ ...blank(3, "no input for 1 s"), age_s: 5.4, rate_hz: 0, status: "no_data", message: "operating points came and stopped" }),
 };
 

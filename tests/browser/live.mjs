@@ -66,7 +66,7 @@ await wall.waitForTimeout(5000);
 const work = ((await worked()) - work0) * 1000 / (Date.now() - began);
 await wall.context().close();
 
-// A mode moves when chosen, and stands when paused.
+// A mode moves when chosen, and stops when paused.
 // A WebGL canvas cannot be read back; it publishes its displacements instead.
 const pixels = () => page.locator("#shape").evaluate((canvas) => (canvas.displacements ? JSON.stringify(canvas.displacements()) : canvas.toDataURL()));
 await page.locator("#modes .mode-button").nth(2).click();
@@ -76,7 +76,7 @@ const first = await pixels();
 await until("the mode moves", async () => (await pixels()) !== first);
 await page.locator("#shape-play").click();
 // The last picture may still be on its way, and a new shape may come with new conditions: then it is looked at again.
-await until("the mode stands while paused", async () => {
+await until("the mode is at rest while paused", async () => {
   const still = await pixels();
   await page.waitForTimeout(300);
   return (await pixels()) === still;

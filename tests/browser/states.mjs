@@ -11,14 +11,14 @@ const LAPTOP = { viewport: { width: 1280, height: 800 } };
 
 const text = (page, id) => page.locator(`#${id}`).innerText();
 const reaches = (page, status) => page.waitForSelector(`#status[data-level="${status}"]`);
-/** The shape of a mode stands or moves on the stage. */
+/** Displacements on the stage, to compare whether the shape moves. */
 const showsMode = (page, id) => page.waitForFunction((id) => document.getElementById("shape-note").textContent.startsWith(`mode ${id},`), id);
 const displacements = (page) => page.locator("#shape").evaluate((canvas) => JSON.stringify(canvas.displacements?.() ?? null));
 /** Reads the map at the friction coefficient that a key leads to. */
 const readAt = async (page, ...keys) => {
   await page.locator("#map-plots").focus();
   for (const key of keys) await page.keyboard.press(key);
-  return { mu: Number(await page.locator("#map-plots").getAttribute("aria-valuenow")), told: await page.locator("#map-plots").getAttribute("aria-valuetext") };
+  return { mu: Number(await page.locator("#map-plots").getAttribute("aria-valuenow")), text: await page.locator("#map-plots").getAttribute("aria-valuetext") };
 };
 
 const WORDS = { ok: "OK", warn: "WARN", squeal: "SQUEAL", fault: "FAULT", waiting: "WAITING", no_data: "NO DATA" };
@@ -74,12 +74,12 @@ let page = await open(browser, served.url, LAPTOP, faults);
 await showsMode(page, 1);
 const near = [await readAt(page, "Home"), await readAt(page, "End")];
 check(near[0].mu < 0.637 && near[1].mu > 0.67 && near[1].mu - near[0].mu < 0.2, `near: ${near[0].mu} to ${near[1].mu}`);
-check(/mode 1: 740\.0 Hz, \+2\d\.\d\d 1\/s/.test(near[1].told) && !/mode 14/.test(near[1].told), `near: ${near[1].told}`);
+check(/mode 1: 740\.0 Hz, \+2\d\.\d\d 1\/s/.test(near[1].text) && !/mode 14/.test(near[1].text), `near: ${near[1].text}`);
 const step = await readAt(page, "Home", "ArrowRight");
 check(Math.abs(step.mu - near[0].mu - 0.01 * (near[1].mu - near[0].mu)) < 1e-9, `a step leads to ${step.mu}`);
 await page.locator("input[name=map-range][value=all]").check({ force: true });
 const all = [await readAt(page, "Home"), await readAt(page, "End")];
-check(all[0].mu === 0 && all[1].mu === 1 && /mode 14: 3110\.0 Hz/.test(all[1].told), `all: ${all[0].mu} to ${all[1].mu}, ${all[1].told}`);
+check(all[0].mu === 0 && all[1].mu === 1 && /mode 14: 3110\.0 Hz/.test(all[1].text), `all: ${all[0].mu} to ${all[1].mu}, ${all[1].text}`);
 await page.keyboard.press("Escape");
 check((await page.locator("#map-plots").getAttribute("aria-valuetext")) === "nothing read off", "Escape still reads");
 const box = await page.locator("#map-frequency .u-over").boundingBox();
@@ -106,9 +106,9 @@ await reaches(page, "no_data");
 await page.waitForSelector("#stage.still");
 // A frame that was already scheduled comes first.
 await page.waitForTimeout(300);
-const stands = await displacements(page);
+const rest = await displacements(page);
 await page.waitForTimeout(500);
-check((await displacements(page)) === stands, "the shape moves without data");
+check((await displacements(page)) === rest, "the shape moves without data");
 // A lost connection is distinguished from a node without inputs.
 served.turn("ok");
 await reaches(page, "ok");

@@ -57,16 +57,16 @@ def main() -> int:
     rig = node.create_publisher(RigInfo, "/squealcast/rig", latched)
     diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", qos)
 
-    heard = {"count": 0, "at": None}
+    received = {"count": 0, "at": None}
     held: list[Prediction] = []
     modes = [Mode(id=i, frequency_hz=100.0 * (i + 1)) for i in range(args.modes)]
 
     def on_point(point: OperatingPoint) -> None:
-        heard["count"] += 1
-        heard["at"] = time.monotonic()
+        received["count"] += 1
+        received["at"] = time.monotonic()
         answer = Prediction(header=point.header, input_seq=point.seq, modes=modes, friction_margin=math.nan)
         answer.unstable_modes = int(point.friction_coefficient > args.critical)
-        if heard["count"] % EVERY == 0:
+        if received["count"] % EVERY == 0:
             if defect == "drop":
                 return
             if defect == "duplicate":
@@ -85,10 +85,10 @@ def main() -> int:
             predictions.publish(held.pop())
 
     def on_tick() -> None:
-        silent = heard["at"] is not None and time.monotonic() - heard["at"] > 1.0
+        silent = received["at"] is not None and time.monotonic() - received["at"] > 1.0
         if silent and defect != "no-silence":
             predictions.publish(Prediction(level=Prediction.FAULT, reason="silence: no input for 1 s"))
-            heard["at"] = time.monotonic() if defect == "chatty-silence" else None
+            received["at"] = time.monotonic() if defect == "chatty-silence" else None
 
     def on_second() -> None:
         if defect != "no-diagnostics":

@@ -133,7 +133,7 @@ class Exchange:
     def _account(self, got: Answer, now: float) -> None:
         if is_silence_fault(got):
             if not self.inputs:
-                return  # about whoever published before
+                return  # about an earlier publisher
             since = now - max(sent.at for sent in self.inputs.values())
             if since < 0.5 and not self.args.allow_silence:
                 self.fail("silence", f"reported {since:.3f} s after an input: {got.reason!r}")

@@ -26,10 +26,10 @@ def main() -> int:
 
     rclpy.init(args=[])
     node = rclpy.create_node("patient_listener")
-    heard: list[tuple[float, int]] = []
+    received: list[tuple[float, int]] = []
     qos = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=20_000)
-    hear = lambda message: heard.append((time.monotonic(), message.seq))  # noqa: E731
-    node.create_subscription(OperatingPoint, "/rig/operating_point", hear, qos)
+    receive = lambda message: received.append((time.monotonic(), message.seq))  # noqa: E731
+    node.create_subscription(OperatingPoint, "/rig/operating_point", receive, qos)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     ended = threading.Event()
@@ -41,10 +41,10 @@ def main() -> int:
     node.destroy_node()
     rclpy.try_shutdown()
 
-    waits = [later - earlier for (earlier, _), (later, _) in zip(heard, heard[1:], strict=False)]
+    waits = [later - earlier for (earlier, _), (later, _) in zip(received, received[1:], strict=False)]
     report = {
-        "heard": len(heard),
-        "different": len({seq for _, seq in heard}),
+        "heard": len(received),
+        "different": len({seq for _, seq in received}),
         "longest_wait_s": round(max(waits, default=0.0), 3),
         "silences": sum(wait > args.silence for wait in waits),
     }

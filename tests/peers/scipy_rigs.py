@@ -130,7 +130,7 @@ def linear_weights(disc, candidates, at, normal):
     across = scipy.linalg.null_space(normal[None, :])
     triangles = Delaunay(disc[candidates] @ across)
     triangle = int(triangles.find_simplex(at @ across))
-    assert triangle >= 0, "a pad node beside the disc's surface"
+    assert triangle >= 0, "a pad node outside the disc's surface"
     first = triangles.transform[triangle, :2] @ (at @ across - triangles.transform[triangle, 2])
     weights = [*first, 1 - first.sum()]
     return [(candidates[int(i)], float(w)) for i, w in zip(triangles.simplices[triangle], weights)]

@@ -150,7 +150,7 @@ def run(rig):
     sent, answered, latencies_us, faults, foreign = {}, set(), [], [], 0
     ahead = rig.first_seq
 
-    def hear(until):
+    def receive(until):
         nonlocal foreign
         while True:
             sample = subscriber.receive()
@@ -179,7 +179,7 @@ def run(rig):
     for index in range(rig.count):
         # After a stall it catches up at no more than twice the rate: a burst would test the queue, not the node.
         due = max(start + index * period, last + period / 2)
-        hear(due)
+        receive(due)
         last = time.monotonic()
         seq = ahead + index
         friction = 0.3 + 0.1 * (index % 100) / 100
@@ -188,7 +188,7 @@ def run(rig):
         point = OperatingPoint(stamp_ns, seq, rig.load, rig.speed, friction)
         publisher.send_copy(point)
         notifier.notify()
-    hear(time.monotonic() + rig.patience)
+    receive(time.monotonic() + rig.patience)
 
     report = {
         "sent": len(sent),

@@ -68,10 +68,10 @@ def with_mcap(path, **options):
 def main():
     directory = Path(sys.argv[1])
     with_rosbags(directory, "/lab/conditions", StoragePlugin.MCAP)
-    beside = lambda kind: directory.with_name(f"{directory.name}-{kind}")
-    with_rosbags(beside("message"), "/rig/operating_point", StoragePlugin.MCAP, CompressionMode.MESSAGE)
-    with_rosbags(beside("file"), "/rig/operating_point", StoragePlugin.MCAP, CompressionMode.FILE)
-    with_rosbags(beside("sqlite3"), "/rig/operating_point", StoragePlugin.SQLITE3)
+    sibling = lambda kind: directory.with_name(f"{directory.name}-{kind}")
+    with_rosbags(sibling("message"), "/rig/operating_point", StoragePlugin.MCAP, CompressionMode.MESSAGE)
+    with_rosbags(sibling("file"), "/rig/operating_point", StoragePlugin.MCAP, CompressionMode.FILE)
+    with_rosbags(sibling("sqlite3"), "/rig/operating_point", StoragePlugin.SQLITE3)
     with_mcap(directory.parent / "lz4.mcap", compression=CompressionType.LZ4)
     with_mcap(directory.parent / "plain.mcap", use_chunking=False)
 

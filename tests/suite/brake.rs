@@ -1,7 +1,7 @@
 //! Real input: the matrices of an industrial disc brake, 4669 degrees of freedom, projected on 150 modes.
 //!
 //! They are no part of the project. They are looked for in `$SQUEALCAST_SHARED/data/brake4669`, by default in `../shared`
-//! beside the project; without them the test says that it is skipped.
+//! next to the project; without them the test reports that it is skipped.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;

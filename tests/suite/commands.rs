@@ -306,10 +306,10 @@ fn nine_degrees_of_freedom_have_the_published_critical_friction() {
         }
         // At a merging point the frequency itself is good to √ε only; here the pair's mean is reported.
         let (from, hz) = (number(&windows[0], "mu_from"), number(&windows[0], "frequency_hz"));
-        let beside = modes(&json(["predict", rig, "--json", "--mu", &(from + 1e-7).to_string()]));
-        let pair = beside[expected[0].1[0] as usize];
+        let near = modes(&json(["predict", rig, "--json", "--mu", &(from + 1e-7).to_string()]));
+        let pair = near[expected[0].1[0] as usize];
         // dω/dμ of the mean is of the order of ω, so 1e-7 in μ leaves 1e-7 in ω.
-        assert!((TAU * hz / pair.im - 1.0).abs() < 1e-6, "{rig}: {hz} Hz at {from}, {pair} beside it");
+        assert!((TAU * hz / pair.im - 1.0).abs() < 1e-6, "{rig}: {hz} Hz at {from}, {pair} near it");
     }
     eprintln!("largest difference of a critical friction coefficient: {worst:.1e}");
     // The search ends at the given limit.
@@ -503,7 +503,7 @@ fn a_sweep_prints_csv_or_writes_the_requested_files() {
     assert_eq!(drawn.stdout, "", "a figure was asked for, no table");
     drawn.complains("only.svg: 1 window of instability");
     well_formed(&std::fs::read_to_string(&svg).expect("the SVG file"));
-    assert_eq!(files_below(folder.path()).len(), 1, "nothing left beside it");
+    assert_eq!(files_below(folder.path()).len(), 1, "no other file is left");
     run(["sweep", "nine-dof", "--csv", "/nowhere/at/all.csv"]).exits(1).complains("/nowhere/at/");
 }
 
@@ -574,8 +574,8 @@ fn damping_destabilises_hulten_modes_as_routh_and_hurwitz_say() {
             assert_eq!(window["kind"], "zero_growth");
             assert!((number(window, "frequency_hz") / expected_hz - 1.0).abs() < 1e-9, "{found}");
             // The growth rate changes its sign there; at a distance of 1e-4 |σ| is about 0.01 1/s, far above rounding.
-            for (beside, unstable) in [(-1e-4, 0), (1e-4, 1)] {
-                let mu = (expected + beside).to_string();
+            for (near, unstable) in [(-1e-4, 0), (1e-4, 1)] {
+                let mu = (expected + near).to_string();
                 assert_eq!(json(["predict", &rig, "--mu", &mu, "--json"])["unstable_modes"], unstable);
             }
         }

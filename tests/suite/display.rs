@@ -663,13 +663,13 @@ fn pages_do_not_slow_the_node() {
 
     // From hearing an input to publishing its prediction, as recorded.
     let session = std::fs::read_dir(directory.path()).unwrap().next().unwrap().unwrap().path();
-    let mut heard = HashMap::new();
+    let mut received = HashMap::new();
     let mut latencies: Vec<Vec<f64>> = vec![vec![]; phases.len()];
     for entry in Recording::open(&session).unwrap().messages() {
         match entry.message {
-            Recorded::Known(Payload::OperatingPoint(input)) => drop(heard.insert(input.seq, entry.log_time_ns)),
+            Recorded::Known(Payload::OperatingPoint(input)) => drop(received.insert(input.seq, entry.log_time_ns)),
             Recorded::Known(Payload::Prediction(prediction)) => {
-                let Some(&at) = heard.get(&prediction.input_seq) else { continue };
+                let Some(&at) = received.get(&prediction.input_seq) else { continue };
                 if let Some(phase) = phases.iter().position(|&(_, from, to)| (from..to).contains(&at)) {
                     latencies[phase].push(entry.log_time_ns.saturating_sub(at) as f64 * 1e-3);
                 }

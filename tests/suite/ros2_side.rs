@@ -41,7 +41,7 @@ struct Node {
 }
 
 impl Node {
-    /// `number` tells the tests of this file apart.
+    /// `number` distinguishes the tests of this file.
     fn start(number: u16) -> Self {
         let folder = TempDir::new().expect("a folder");
         let process_id = std::process::id();
@@ -192,8 +192,8 @@ impl Peer {
     }
 }
 
-/// Subscribes to the rig as a late reader does and lets `hears` take what comes.
-fn late_reader_of_the_rig(domain: u16, hears: impl FnOnce(&dyn Fn() -> Option<RigInfo>)) {
+/// Subscribes to the rig as a late reader does and passes the subscription to `check`.
+fn late_reader_of_the_rig(domain: u16, check: impl FnOnce(&dyn Fn() -> Option<RigInfo>)) {
     use ros2_client::{Context, MessageTypeName, Name, NodeName, NodeOptions, QosProfile, qos};
     let participant = rustdds::DomainParticipantBuilder::new(domain).with_only_networks([Ipv4Addr::LOCALHOST]).build();
     let context = Context::from_domain_participant(participant.expect("participant")).expect("context");
@@ -202,7 +202,7 @@ fn late_reader_of_the_rig(domain: u16, hears: impl FnOnce(&dyn Fn() -> Option<Ri
     let kind = MessageTypeName::new("squealcast_msgs", "RigInfo");
     let topic = node.create_topic(&Name::new("/squealcast", "rig").expect("name"), kind, &profile).expect("topic");
     let subscription = node.create_subscription::<RigInfo>(&topic, None).expect("subscription");
-    hears(&|| subscription.take().expect("taken").map(|(rig, _)| rig));
+    check(&|| subscription.take().expect("taken").map(|(rig, _)| rig));
 }
 
 /// The processes started by one.
@@ -427,7 +427,7 @@ fn a_ros2_side_that_hangs_is_replaced() {
     node.finish();
 }
 
-/// The ROS 2 side hears on while its node is stopped, and the node gets what came meanwhile.
+/// The ROS 2 side continues to receive while its node is stopped, and the node gets these messages afterwards.
 #[test]
 fn a_node_that_is_stopped_for_a_while_loses_no_input() {
     const COUNT: u64 = 2000;
@@ -516,7 +516,7 @@ fn a_reader_that_does_not_acknowledge_holds_up_no_other() {
     let _ = frozen.kill();
     let _ = frozen.wait();
     eprintln!(
-        "{received} of {COUNT} received beside a frozen reader in {:.1?}, longest pause {longest_pause:.1?}",
+        "{received} of {COUNT} received next to a frozen reader in {:.1?}, longest pause {longest_pause:.1?}",
         begun.elapsed()
     );
     // What this reader cannot keep up with at 2 kHz on a busy machine is lost in its own queue.
@@ -538,7 +538,7 @@ fn the_ros2_side_costs_little_time() {
         let (args, _) = RosArgs::split(arguments).expect("well formed");
         Ros2Options::new(Some(domain), true, args).expect("a domain")
     };
-    let (inside, beside) = (options("/inside"), options("/beside"));
+    let (inside, outside) = (options("/inside"), options("/outside"));
 
     let echo: Arc<OnceLock<Ros2>> = Arc::default();
     let echoing = echo.clone();
@@ -561,9 +561,9 @@ fn the_ros2_side_costs_little_time() {
         fell: Box::new(|why| panic!("{why}")),
     };
     let program = env!("CARGO_BIN_EXE_squealcast").into();
-    assert!(apart.set(Ros2Process::start_program(program, &beside, vec![], sinks).expect("started")).is_ok());
+    assert!(apart.set(Ros2Process::start_program(program, &outside, vec![], sinks).expect("started")).is_ok());
 
-    let mut askers = [inside, beside].map(|options| {
+    let mut askers = [inside, outside].map(|options| {
         let (sender, received) = unbounded();
         let source = Ros2Source::start(&options, into(sender)).expect("joined");
         wait_until("readers", || source.readers() > 0 && source.prediction_writers() > 0);
@@ -584,12 +584,12 @@ fn the_ros2_side_costs_little_time() {
             }
         }
     }
-    let [inside, beside] = times.map(|mut times| {
+    let [inside, outside] = times.map(|mut times| {
         times.sort_by(f64::total_cmp);
         [times[times.len() / 2], times[times.len() * 99 / 100]]
     });
-    let ratio = beside[0] / inside[0];
-    eprintln!("round trip, median and p99 in us: one process {inside:.0?}, two {beside:.0?}, ratio {ratio:.2}");
+    let ratio = outside[0] / inside[0];
+    eprintln!("round trip, median and p99 in us: one process {inside:.0?}, two {outside:.0?}, ratio {ratio:.2}");
     assert!(!program::measuring() || ratio < 2.0, "{ratio}");
 }
 
@@ -597,7 +597,7 @@ fn the_ros2_side_costs_little_time() {
 const FORGE: &str = "SQUEALCAST_FORGE_DOMAIN";
 const HOST: Ipv4Addr = Ipv4Addr::new(10, 213, 77, 1);
 
-/// From a network namespace, as from another machine: a node with `--loopback` does not hear what ends its ROS 2 side when it
+/// From a network namespace, as from another machine: a node with `--loopback` does not receive the datagrams that end its ROS 2 side when it
 /// comes from this machine.
 #[test]
 fn forged_datagrams_from_elsewhere_do_not_reach_a_node_on_loopback() {
@@ -611,7 +611,7 @@ fn forged_datagrams_from_elsewhere_do_not_reach_a_node_on_loopback() {
         return;
     }
     let Some(elsewhere) = Namespace::new() else {
-        return program::skipped("making a network namespace takes rights that this process lacks");
+        return program::skipped("making a network namespace takes rights that this process does not have");
     };
     let forge = |node: &Node| {
         let test = "ros2_side::forged_datagrams_from_elsewhere_do_not_reach_a_node_on_loopback";

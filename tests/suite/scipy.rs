@@ -106,7 +106,7 @@ impl Comparison {
     fn share(&mut self, expected: &Root, found: &Root) {
         match (expected.pad_share, found.pad_share) {
             (None, None) => {}
-            // Shapes lose what lies between a root and the next: 1e-3 of λ² in the worst case here, 1e-6 beside the
+            // Shapes lose what lies between a root and the next: 1e-3 of λ² in the worst case here, 1e-6 next to the
             // merging. That leaves 1e-12.
             (Some(share), Some(found)) if (found - share).abs() <= TOLERANCE => {
                 self.share_off = self.share_off.max((found - share).abs());

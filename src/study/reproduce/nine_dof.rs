@@ -112,7 +112,7 @@ fn table_1() -> anyhow::Result<Item> {
     let header = ["mode", "full", "paper", "3+2", "paper", "4+2", "paper"];
     let text =
         "<p>Angular frequencies at a friction coefficient of 1, rad/s. The paper prints mode 2 of the 3+2 model as \
-                1.0797, beside 1.0795 for the mode it has merged with: a slip of the pen.</p>\n"
+                1.0797, and 1.0795 for the mode it has merged with: a misprint.</p>\n"
             .to_owned()
             + &table(&header, &rows);
     let title = "Table 1: full model and reduced models at a friction coefficient of 1".to_owned();

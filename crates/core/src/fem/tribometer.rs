@@ -84,7 +84,7 @@ pub struct Dimensions {
     pub column_half: [f64; 2],
     /// Height of the force sensor.
     pub sensor_height: f64,
-    /// Heights of three sections of the sensor holder: `shank_height` below the bearing, `bearing_height` beside it and
+    /// Heights of three sections of the sensor holder: `shank_height` below the bearing, `bearing_height` at it and
     /// `collar_height` above it.
     pub shank_height: f64,
     /// Height of the sensor holder beside the bearing.
