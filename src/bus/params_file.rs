@@ -70,7 +70,7 @@ fn check_events(text: &str) -> Result<(), ParseError> {
             }
             Event::SequenceStart(..) | Event::MappingStart(..) => depth += 1,
             Event::SequenceEnd | Event::MappingEnd => depth = depth.saturating_sub(1),
-            Event::Alias(_) => return refuse("an alias (`*name`): write what it stands for"),
+            Event::Alias(_) => return refuse("an alias (`*name`): write its value instead"),
             _ => {}
         }
     }
@@ -193,12 +193,12 @@ other:
         }
         let text = "/**: {ros__parameters: {x: [1], y: ~}}";
         assert_eq!(values(text, "/"), ["x", "y"].map(|name| (name.to_owned(), "a list, or nothing".to_owned())));
-        assert_eq!(values("/**/squealcast: {ros__parameters: {x: 1}}", "/").len(), 1, "** stands for none, too");
+        assert_eq!(values("/**/squealcast: {ros__parameters: {x: 1}}", "/").len(), 1, "** also matches no token");
         assert_eq!(values("/a: {b: {squealcast: {ros__parameters: {x: 1}}}}", "/a/b").len(), 1);
     }
 
     #[test]
-    fn what_is_not_laid_out_so_is_refused() {
+    fn another_layout_is_refused() {
         assert_eq!(problem("ros__parameters: {x: 1}"), "top level: ros__parameters without a node name above");
         assert_eq!(problem("[1, 2]"), "top level: expected a mapping of node names");
         assert_eq!(problem("squealcast: 3"), "squealcast: expected a mapping of node names");
@@ -226,7 +226,7 @@ other:
         for level in 1..40 {
             text += &format!("a{level}: &a{level} [*a{0}, *a{0}]\n", level - 1);
         }
-        assert_eq!(problem(&text), "line 2: an alias (`*name`): write what it stands for");
+        assert_eq!(problem(&text), "line 2: an alias (`*name`): write its value instead");
     }
 
     proptest::proptest! {

@@ -40,7 +40,7 @@ pub(super) fn config(file_prefix: Option<&str>) -> Result<Config, ShmError> {
         static SAID: Once = Once::new();
         SAID.call_once(|| {
             note!(
-                "shared memory: {} {why}; using {} with the prefix {prefix} instead. Programs of other users are not heard; \
+                "shared memory: {} {why}; using {} with the prefix {prefix} instead. Programs of other users are not reached; \
                  yours that use iceoryx2 need this root-path and prefix in their iceoryx2.toml",
                 root.display(),
                 own.display()
@@ -100,7 +100,7 @@ fn make_own(folder: &Path, user: u32) -> Result<(), ShmError> {
     }
     let metadata = folder.symlink_metadata().map_err(|error| place(folder, error))?;
     if !metadata.is_dir() || metadata.uid() != user || metadata.mode() & 0o022 != 0 {
-        return Err(place(folder, format!("expected a folder of user {user} that nobody else can write to")));
+        return Err(place(folder, format!("expected a folder of user {user} that no other user can write to")));
     }
     Ok(())
 }
@@ -142,7 +142,7 @@ mod tests {
         assert_eq!(own.metadata().unwrap().mode() & 0o777, 0o700);
         make_own(&own, user).unwrap();
         std::fs::set_permissions(&own, std::fs::Permissions::from_mode(0o777)).unwrap();
-        assert!(make_own(&own, user).unwrap_err().to_string().contains("nobody else can write to"));
+        assert!(make_own(&own, user).unwrap_err().to_string().contains("no other user can write to"));
         let link = folder.path().join("link");
         std::os::unix::fs::symlink(folder.path(), &link).unwrap();
         assert!(make_own(&link, user).is_err(), "a link planted under the name");

@@ -1,5 +1,5 @@
-//! What every surface shows first of a node: its status, the fastest growing mode, the window its margin refers to, and
-//! one sentence. Page, terminal, log, events and reports take all of it from here.
+//! The assessment of a node, which all displays show first: its status, the fastest growing mode, the window its margin
+//! refers to, and one sentence. Page, terminal, log, events and reports take it from here.
 
 use std::fmt::Write;
 
@@ -147,7 +147,7 @@ impl NextSqueal {
     }
 }
 
-/// What every surface shows first of a node.
+/// The assessment of a node, which all displays show first.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Assessment {
     pub status: Status,

@@ -60,7 +60,7 @@ fn a_folder_that_others_could_write_to_is_refused() {
         mkdir -m 777 /tmp/iceoryx2-2222; chown 1111 /tmp/iceoryx2-2222
         as 2222 run nine-dof --no-ros --no-display";
     let Some(ran) = in_a_namespace(script) else { return };
-    ran.exits(1).complains("/tmp/iceoryx2-2222: expected a folder of user 2222 that nobody else can write to");
+    ran.exits(1).complains("/tmp/iceoryx2-2222: expected a folder of user 2222 that no other user can write to");
 }
 
 /// A page of shared memory without memory behind it would end the node with a signal.

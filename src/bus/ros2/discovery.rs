@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_done_is_refused_or_said() {
+    fn impossible_requests_are_refused_or_reported() {
         let error = |variables: &[(&str, &str)]| discovery(variables).expect_err("refused").to_string();
         let off =
             "ROS_AUTOMATIC_DISCOVERY_RANGE=OFF: this node cannot join without being discovered; --no-ros stays off";

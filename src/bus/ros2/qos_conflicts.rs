@@ -103,7 +103,8 @@ impl QosConflicts {
             let peer = &writer.publication_topic_data;
             let Some(ours) = self.subscribed.iter().find(|ours| ours.dds_name == peer.topic_name) else { continue };
             if let Some(policy) = peer.qos().compliance_failure_wrt(&ours.qos) {
-                let what = format!("a publisher of {} is not heard: its {policy:?} policy is incompatible", ours.name);
+                let what =
+                    format!("a publisher of {} is not connected: its {policy:?} policy is incompatible", ours.name);
                 found.insert(peer.key, what);
             }
         }
@@ -112,7 +113,7 @@ impl QosConflicts {
             let Some(ours) = self.published.iter().find(|ours| ours.dds_name == peer.topic_name) else { continue };
             if let Some(policy) = ours.qos.compliance_failure_wrt(&peer.qos()) {
                 let what = format!(
-                    "a subscriber of {} gets nothing: it requests a {policy:?} policy that is not offered",
+                    "a subscriber of {} is not connected: it requests a {policy:?} policy that is not offered",
                     ours.name
                 );
                 found.insert(reader.reader_proxy.remote_reader_guid, what);
