@@ -37,6 +37,8 @@ const MOST_TONES: usize = 64;
 const HARMONIC_TOLERANCE: f64 = 0.002;
 /// Highest harmonic that is recognised.
 const HIGHEST_HARMONIC: u32 = 10;
+/// Frames that tell the frequency at the onset.
+const EARLY_FRAMES: u64 = 8;
 /// The steady part of a squeal: within 3 dB of its highest level, in steps of 0.25 dB.
 const STEPS_PER_DB: f64 = 4.0;
 const STEADY_STEPS: i32 = 12;
@@ -232,6 +234,8 @@ struct Track {
     rose_to: f64,
     /// Tone and noise when first found.
     first: Found,
+    /// The first frames: the frequency may drift later.
+    early: Level,
     /// Frames by level, in steps of 0.25 dB.
     levels: BTreeMap<i32, Level>,
     /// Set when it is announced.
@@ -603,9 +607,9 @@ impl Detector {
         (middle - first as f64) / self.sample_rate_hz
     }
 
-    /// The samples from `seconds` before frame `from` up to the end of the latest frame, demodulated, with the index of
-    /// the first.
-    fn envelope(&self, track: &Track, from: u64, seconds: f64) -> Option<(Envelope, u64)> {
+    /// The samples from `seconds` before frame `from` up to the end of the latest frame, demodulated at `frequency_hz`,
+    /// with the index of the first.
+    fn envelope(&self, track: &Track, frequency_hz: f64, from: u64, seconds: f64) -> Option<(Envelope, u64)> {
         let stream = self.stream.as_ref()?;
         let end = self.first_sample(stream.frame.checked_sub(1)?) + self.spectra.length() as u64;
         let oldest = end.saturating_sub((HISTORY_S * self.sample_rate_hz) as u64);
@@ -614,15 +618,18 @@ impl Detector {
         let factor = self.calibration.factor;
         let samples = samples.iter().map(|&sample| factor * f64::from(sample));
         let noise = noise_density(track.first.noise, self.frame_s());
-        Some((Envelope::new(samples, self.sample_rate_hz, track.steady().0, noise), first))
+        Some((Envelope::new(samples, self.sample_rate_hz, frequency_hz, noise), first))
     }
 
     fn measure_onset(&self, index: usize) -> Onset {
         let track = &self.tracks[index];
         let first_frame_ns = self.stamp_ns(self.first_sample(track.first_frame) + self.spectra.length() as u64 / 2);
         let none = Onset { stamp_ns: first_frame_ns, cut: true, growth: None };
-        let Some((envelope, first)) = self.envelope(track, track.first_frame, BEFORE_ONSET_S) else { return none };
-        let threshold = self.plain_threshold(track);
+        let frequency_hz = track.early.power_times_hz / track.early.power;
+        let Some((envelope, first)) = self.envelope(track, frequency_hz, track.first_frame, BEFORE_ONSET_S) else {
+            return none;
+        };
+        let threshold = self.plain_threshold(frequency_hz);
         let near_s = self.middle_s(track.first_frame, first);
         let fitted = envelope.growth(track.highest_plain, near_s, threshold);
         let in_the_fit = |&(growth, at_s): &(Growth, f64)| {
@@ -642,19 +649,24 @@ impl Detector {
 
     fn measure_end(&self, index: usize) -> (i64, bool) {
         let track = &self.tracks[index];
-        let last_sample = self.first_sample(track.last_frame) + self.spectra.length() as u64;
-        let Some((envelope, first)) = self.envelope(track, track.last_frame, self.frame_s()) else {
-            return (self.stamp_ns(last_sample), true);
-        };
-        match envelope.falls_below(self.plain_threshold(track), self.middle_s(track.last_frame, first)) {
-            Some(at_s) => (self.stamp_ns(first) + (at_s * 1e9).round() as i64, false),
-            None => (self.stamp_ns(last_sample), true),
+        let (first_sample, length) = (self.first_sample(track.last_frame), self.spectra.length() as u64);
+        let latest_frame = self.stream.as_ref().map_or(0, |stream| stream.frame.saturating_sub(1));
+        let falls =
+            self.envelope(track, track.frequency_hz, track.last_frame, self.frame_s()).and_then(|(envelope, first)| {
+                let near_s = self.middle_s(track.last_frame, first);
+                let at_s = envelope.falls_below(self.plain_threshold(track.frequency_hz), near_s)?;
+                Some(self.stamp_ns(first) + (at_s * 1e9).round() as i64)
+            });
+        match falls {
+            Some(end_ns) => (end_ns, false),
+            None if latest_frame - track.last_frame <= 1 => (self.stamp_ns(first_sample + length), true),
+            None => (self.stamp_ns(first_sample + length / 2), false),
         }
     }
 
-    /// Mean square without frequency weighting of a tone of the frequency of a track at the threshold.
-    fn plain_threshold(&self, track: &Track) -> f64 {
-        self.threshold() / power_weight(self.calibration.quantity, track.steady().0)
+    /// Mean square without frequency weighting of a tone at the threshold.
+    fn plain_threshold(&self, frequency_hz: f64) -> f64 {
+        self.threshold() / power_weight(self.calibration.quantity, frequency_hz)
     }
 
     /// The squeal of which the one of a track is a harmonic: that with the lowest order, whose time covers at least half
@@ -675,6 +687,14 @@ impl Detector {
             (is_multiple && together && (2..=HIGHEST_HARMONIC).contains(&harmonic.order)).then_some(harmonic)
         });
         candidates.min_by_key(|harmonic| (harmonic.order, harmonic.of))
+    }
+}
+
+impl Level {
+    fn add(&mut self, tone: &Found) {
+        self.frames += 1;
+        self.power += tone.weighted;
+        self.power_times_hz += tone.weighted * tone.frequency_hz;
     }
 }
 
@@ -699,6 +719,7 @@ impl Track {
             rose_frame: frame,
             rose_to: 0.0,
             first: tone,
+            early: Level::default(),
             levels: BTreeMap::new(),
             number: None,
             onset: None,
@@ -717,11 +738,11 @@ impl Track {
         if tone.weighted > RISE * self.rose_to {
             (self.rose_frame, self.rose_to) = (frame, tone.weighted);
         }
+        if self.hits <= EARLY_FRAMES {
+            self.early.add(tone);
+        }
         let step = (STEPS_PER_DB * 10.0 * tone.weighted.log10()).floor() as i32;
-        let level = self.levels.entry(step).or_default();
-        level.frames += 1;
-        level.power += tone.weighted;
-        level.power_times_hz += tone.weighted * tone.frequency_hz;
+        self.levels.entry(step).or_default().add(tone);
     }
 
     /// Mean frequency, Hz, and mean weighted square of the steady part.
