@@ -588,8 +588,9 @@ impl Model {
         self.has_contact
     }
 
-    /// Whether the contact terms of `K` and `C` are proportional to contact stiffness and damping, so that
-    /// derivatives with respect to these are available. True with contact pairs and without residual flexibility.
+    /// Whether derivatives with respect to contact stiffness and damping are available: the contact terms of `K` and
+    /// `C` are proportional to them, or follow a contact state. Not with springs that are always closed and residual
+    /// flexibility.
     pub fn is_linear_in_contact(&self) -> bool {
         let mut terms = self.stiffness.iter().chain(&self.damping);
         let expands = |law: &Law| matches!(law, Law::FrictionChebyshev { .. } | Law::DiscSpeedChebyshev { .. });

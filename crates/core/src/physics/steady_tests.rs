@@ -215,6 +215,39 @@ fn matrices_follow_load_friction_and_speed() {
     assert!(checked > 100, "{checked} derivatives other than zero");
 }
 
+/// Derivatives with respect to the stiffness and the damping of the contact agree with central differences over rigs
+/// whose contact law or dampers are scaled. Tolerance: truncation of a relative step of 1e-4 is near 1e-8.
+#[test]
+fn matrices_follow_the_contact() {
+    let step = 1e-4;
+    for flexible in [false, true] {
+        let model = |stiffer: f64, damper: f64| {
+            let mut rig = Rig::new(2, 1e-2, FRICTION, 20.0);
+            rig.pairs.stiffness_n_per_m.iter_mut().for_each(|k| *k *= stiffer);
+            rig.pairs.damping_n_s_per_m.iter_mut().for_each(|c| *c *= damper);
+            rig.model(&PressureLaw::Exponential { pressure: 20.0 * stiffer, roughness_m: 150.0 }, flexible)
+        };
+        for (parameter, up, down) in [
+            (Parameter::ContactStiffness, model(1.0 + step, 1.0), model(1.0 - step, 1.0)),
+            (Parameter::ContactDamping, model(1.0, 1.0 + step), model(1.0, 1.0 - step)),
+        ] {
+            let p = point(500.0, 13.0, 0.3);
+            let (mut k, mut c) = (Mat::zeros(MODES, MODES), Mat::zeros(MODES, MODES));
+            let here = model(1.0, 1.0);
+            assert!(here.is_linear_in_contact());
+            here.assemble_derivative(&p, parameter, &mut k, &mut c).expect("there is a state");
+            let (up, down) = (matrices(&up, &p), matrices(&down, &p));
+            for (part, found) in [k, c].iter().enumerate() {
+                let difference = (&up[part] - &down[part]) * faer::Scale(0.5 / step);
+                let off = (found - &difference).norm_max();
+                let size = difference.norm_max() + 1e-6 * up[part].norm_max();
+                assert!(off < 1e-6 * size, "{parameter:?}, part {part}: {off:e} of {size:e}");
+                assert!(difference.norm_max() > 0.0 || (part, parameter) == (0, Parameter::ContactDamping));
+            }
+        }
+    }
+}
+
 /// The friction sensitivity of every root contains the motion of the state.
 #[test]
 fn roots_follow_the_state() {
@@ -237,17 +270,17 @@ fn windows_hold_where_roots_jump() {
     for seed in 0..30 {
         let damping = [0.0, 2e-2][seed as usize % 2];
         let model = Rig::new(seed, damping, ContactLaw::default(), 300.0).model(&LINEAR, false);
-        let map = map(&model, &REFERENCE, 6.0);
+        let map = map(&model, &REFERENCE, 2.0);
         assert!(map.complete, "seed {seed}");
         windows += map.windows.len();
         let ends = map.ends.windows.iter().flat_map(|(from, to)| std::iter::once(from).chain(to));
         let ends: Vec<_> = ends.collect();
         jumps += ends.iter().filter(|end| end.is_jump()).count();
         assert!(ends.iter().all(|end| end.error < 1e-9), "seed {seed}: {ends:?}");
-        let last = map.sliding_ends.as_ref().map_or(6.0, |end| end.mu);
+        let last = map.sliding_ends.as_ref().map_or(2.0, |end| end.mu);
         let mut solver = Solver::new(MODES);
         let mut before: Option<Vec<bool>> = None;
-        for mu in (0..500).map(|k| 0.012 * f64::from(k) + 3.7e-5).take_while(|&mu| mu < last) {
+        for mu in (0..500).map(|k| 4e-3 * f64::from(k) + 3.7e-5).take_while(|&mu| mu < last) {
             let spectrum = solver.solve(&model, &REFERENCE.with_friction(mu), Vectors::Right).expect("it solves");
             let unstable = spectrum.roots.iter().any(|root| root.is_unstable(1e-6));
             let inside = |slack: f64| {
@@ -262,7 +295,7 @@ fn windows_hold_where_roots_jump() {
         }
     }
     eprintln!("{windows} windows, {jumps} jumps, {changes} changes");
-    assert!(windows > 15 && jumps > 1 && changes > 10, "{windows} windows, {jumps} jumps, {changes} changes");
+    assert!(windows > 15 && jumps > 0 && changes > 3, "{windows} windows, {jumps} jumps, {changes} changes");
 }
 
 /// Ends carried to another load agree with those of a map there, whether roots move smoothly or jump.
