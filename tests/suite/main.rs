@@ -9,6 +9,8 @@ mod bus;
 mod buses;
 mod ceilings;
 mod commands;
+mod contact_calculix;
+mod contact_states;
 mod display;
 mod domain;
 mod examples;

@@ -44,6 +44,7 @@ mod project;
 mod residual;
 mod schur;
 mod sparse;
+mod static_response;
 
 mod substructures;
 #[cfg(test)]
