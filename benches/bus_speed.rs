@@ -10,11 +10,11 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use bus::{answer, into, next, point, shm, wait_until};
-use crossbeam_channel::{Receiver, Sender, unbounded};
-use squealcast::bus::received::Received;
+use crossbeam_channel::{Receiver, unbounded};
 use squealcast::bus::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource};
+use squealcast::bus::{Received, ShmConnection, Sink};
 use squealcast::msgs::{OperatingPoint, Prediction};
-use squealcast::node::{Incoming, Node, Outputs, Shortcut, Watch, session_chart};
+use squealcast::node::{Incoming, Inlet, Node, Outputs, Watch, session_chart};
 use squealcast::physics::{Chart, ContactLaw};
 use squealcast::proof::synthetic::{Synthetic, rig};
 use squealcast::rig::Rig;
@@ -36,36 +36,31 @@ fn median_and_p99(times: &mut [Duration]) -> [f64; 2] {
 
 /// A node of a rig on shared memory, as `run` starts it.
 struct NodeOnShm {
-    stop: Sender<Incoming>,
+    inlet: Inlet,
     thread: Option<thread::JoinHandle<Outputs>>,
     watch: Watch,
 }
 
 impl NodeOnShm {
     fn start(options: &ShmOptions, rig: Arc<Rig>, chart: Option<Arc<Chart>>) -> Self {
-        let (sender, receiver) = squealcast::node::channel();
-        let mut outputs = Outputs { shm: Some(ShmOutput::new(options).expect("output")), ..Default::default() };
-        let shortcut = Shortcut::new(sender.clone());
-        let inputs = shortcut.clone();
-        let input = ShmInput::spawn_with_backlog(options, move |received, more_waits| {
-            assert!(inputs.input(received, more_waits), "the queue is full");
-        });
-        outputs.shm_input = Some(input.expect("input"));
-        // Between its blocks nothing is received, and that is no fault.
+        // Without inputs between its blocks there is no silence.
         let settings = Settings { silence_timeout_s: 1e6, ..Settings::for_rig(&rig) };
         let watch = Watch::default();
-        let node = Node::new(rig, settings, outputs, sender.clone(), watch.clone()).with_shortcut(&shortcut);
+        let (node, inlet) = Node::new(rig, settings, watch.clone());
+        let sink: Arc<dyn Sink> = Arc::new(inlet.clone());
+        let shm = ShmConnection::of_node(options, &sink).expect("shared memory");
+        let outputs = Outputs { buses: vec![Box::new(shm)], ..Default::default() };
         if let Some(chart) = chart {
-            sender.send(Incoming::Chart(Ok(chart))).expect("room");
+            assert!(inlet.send(Incoming::Chart(Ok(chart))), "room");
         }
-        let thread = thread::spawn(move || node.run(&receiver));
-        Self { stop: sender, thread: Some(thread), watch }
+        let thread = thread::spawn(move || node.run(outputs));
+        Self { inlet, thread: Some(thread), watch }
     }
 }
 
 impl Drop for NodeOnShm {
     fn drop(&mut self) {
-        let _ = self.stop.send(Incoming::Stop);
+        self.inlet.stop();
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }

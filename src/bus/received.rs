@@ -6,18 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use serde::{Deserialize, Serialize};
 
+use super::Bus;
 use crate::system::clock::Reading;
-
-/// The bus over which a message was received.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Bus {
-    /// Shared memory (iceoryx2).
-    Shm,
-    /// ROS 2.
-    Ros2,
-    /// No bus: the rig simulator of `demo`, in this process.
-    Simulator,
-}
 
 /// A message received over a bus.
 #[derive(Clone, Debug, PartialEq)]

@@ -6,6 +6,7 @@
 //! The DDS implementation is RustDDS, in pure Rust: no ROS 2 installation is needed. Publishing works from any thread
 //! and never blocks. A killed peer is only forgotten after its lease, so receivers should check sequence numbers.
 
+mod connection;
 mod discovery;
 mod frame;
 mod link;
@@ -24,9 +25,12 @@ use ros2_client::{MessageTypeName, NodeOptions, ParameterValue, Publisher};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+pub use self::connection::{Ros2NodeConnection, Ros2ReplayConnection};
+
 use self::discovery::Discovery;
 use self::link::{Durability, Link, MAX_UNANSWERED};
-use super::received::{Bus, Counts, Received};
+use super::Bus;
+use super::received::{Counts, Received};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
 use crate::msgs::schema::Topic;
 use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};

@@ -25,7 +25,8 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use iceoryx2::waitset::{WaitSetAttachmentError, WaitSetCreateError};
 use thiserror::Error;
 
-use super::received::{Bus, Counters, Counts, Gaps, Received};
+use super::Bus;
+use super::received::{Counters, Counts, Gaps, Received};
 use super::shm_place;
 use crate::msgs::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
 

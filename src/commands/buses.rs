@@ -1,13 +1,19 @@
 //! Options for the buses that a command joins.
 
+use std::sync::Arc;
+
+use anyhow::Context;
 use clap::Args;
 
 use crate::bus::ros_args::RosArgs;
-use crate::bus::ros2::{NODE_NAME, Ros2Error, Ros2Options};
+use crate::bus::ros2::{NODE_NAME, Ros2Error, Ros2NodeConnection, Ros2Options, Ros2ReplayConnection, Ros2Source};
 use crate::bus::shm::ShmOptions;
+use crate::bus::{Bus, Connection, ShmConnection, Sink};
 use crate::msgs::shm::{Form, OperatingPointForm};
 use crate::msgs::topic;
+use crate::node::NodeName;
 use crate::node::status::InputSources;
+use crate::session::settings::Settings;
 
 /// Which buses to join, and how
 #[derive(Clone, Debug, Args)]
@@ -37,26 +43,121 @@ impl BusOptions {
         Self { loopback: true, shm_prefix, ..self.clone() }
     }
 
-    /// Options of ROS 2; `None` if the command does not join it.
-    pub fn ros2(&self, args: RosArgs) -> Result<Option<Ros2Options>, Ros2Error> {
-        if self.no_ros { Ok(None) } else { Ros2Options::new(self.domain, self.loopback, args).map(Some) }
+    /// Checks the options of every bus.
+    ///
+    /// # Errors
+    /// A ROS 2 domain or environment variable that is not valid.
+    pub fn resolve(&self, args: RosArgs) -> Result<Buses, Ros2Error> {
+        let shm = || ShmOptions { service_prefix: self.shm_prefix.clone(), ..Default::default() };
+        let ros2 = || Ros2Options::new(self.domain, self.loopback, args);
+        Ok(Buses { shm: (!self.no_shm).then(shm), ros2: (!self.no_ros).then(ros2).transpose()?, options: self.clone() })
+    }
+}
+
+/// The buses that a command joins; `None` for those it does not.
+pub struct Buses {
+    options: BusOptions,
+    shm: Option<ShmOptions>,
+    ros2: Option<Ros2Options>,
+}
+
+/// How a node starts on its buses.
+pub struct NodeStart {
+    pub name: NodeName,
+    pub settings: Settings,
+    /// Names and values of the parameters, those of the settings included.
+    pub parameters: Vec<(String, f64)>,
+}
+
+/// What tells a user how to do without a bus that cannot be joined.
+const SHM_FAILED: &str = "shared memory; --no-shm stays off it";
+const ROS2_FAILED: &str = "ROS 2; --no-ros stays off it";
+
+impl Buses {
+    /// How a node with these `settings` starts: the arguments of ROS 2 may name it and change settings.
+    ///
+    /// # Errors
+    /// A parameter that is not known, or whose value is not valid.
+    pub fn node(&self, mut settings: Settings) -> anyhow::Result<NodeStart> {
+        let Some(ros2) = &self.ros2 else {
+            return Ok(NodeStart { name: NodeName::default(), settings, parameters: vec![] });
+        };
+        let declared: Vec<(&str, f64)> = settings.values().collect();
+        let name = ros2.args.node_name(NODE_NAME);
+        let namespace = ros2.args.namespace(&name, "/");
+        let (values, ignored) = ros2.args.parameters(&declared, &namespace, &name)?;
+        for what in ignored {
+            note!("ROS 2: {what}");
+        }
+        for (name, value) in &values {
+            settings.set(name, *value)?;
+        }
+        Ok(NodeStart { name: NodeName::new(&namespace, &name), settings, parameters: values })
     }
 
-    /// Options of shared memory; `None` if the command does not join it.
-    pub fn shm(&self) -> Option<ShmOptions> {
-        (!self.no_shm).then(|| ShmOptions { service_prefix: self.shm_prefix.clone(), ..Default::default() })
+    /// Joins the buses as a node with these `parameters`, which receives into `sink`.
+    ///
+    /// # Errors
+    /// A bus cannot be joined.
+    pub fn join_as_node(
+        &self,
+        parameters: &[(String, f64)],
+        sink: &Arc<dyn Sink>,
+    ) -> anyhow::Result<Vec<Box<dyn Connection>>> {
+        self.join(|bus| match bus {
+            Bus::Shm => boxed(self.shm.as_ref().map(|shm| ShmConnection::of_node(shm, sink)), SHM_FAILED),
+            Bus::Ros2 => {
+                let start = |ros2| Ros2NodeConnection::start(ros2, parameters.to_vec(), sink);
+                boxed(self.ros2.as_ref().map(start), ROS2_FAILED)
+            }
+            Bus::Simulator => Ok(None),
+        })
     }
 
-    /// Where a node with these options and with `ros2` expects its inputs, and the command that simulates them.
-    pub fn sources(&self, ros2: Option<&Ros2Options>) -> InputSources {
+    /// Joins the buses as a rig, which publishes operating points and, if it measures it, the vibration.
+    ///
+    /// # Errors
+    /// A bus cannot be joined.
+    pub fn join_as_rig(&self, measures_vibration: bool) -> anyhow::Result<Vec<Box<dyn Connection>>> {
+        self.join(|bus| match bus {
+            Bus::Shm => boxed(self.shm.as_ref().map(|shm| ShmConnection::of_rig(shm, measures_vibration)), SHM_FAILED),
+            Bus::Ros2 => boxed(self.ros2.as_ref().map(|ros2| Ros2Source::start(ros2, |_| {})), ROS2_FAILED),
+            Bus::Simulator => Ok(None),
+        })
+    }
+
+    /// Joins the buses as a replay, which publishes the messages of a rig and of its node.
+    ///
+    /// # Errors
+    /// A bus cannot be joined.
+    pub fn join_as_replay(&self) -> anyhow::Result<Vec<Box<dyn Connection>>> {
+        self.join(|bus| match bus {
+            Bus::Shm => boxed(self.shm.as_ref().map(ShmConnection::of_replay), SHM_FAILED),
+            Bus::Ros2 => boxed(self.ros2.as_ref().map(Ros2ReplayConnection::start), ROS2_FAILED),
+            Bus::Simulator => Ok(None),
+        })
+    }
+
+    fn join(
+        &self,
+        join: impl Fn(Bus) -> anyhow::Result<Option<Box<dyn Connection>>>,
+    ) -> anyhow::Result<Vec<Box<dyn Connection>>> {
+        Bus::ALL.into_iter().filter_map(|bus| join(bus).transpose()).collect()
+    }
+
+    /// Where a node on these buses expects its inputs, and the command that simulates them.
+    pub fn sources(&self) -> InputSources {
+        let Self { options, ros2, shm } = self;
+        let ros2 = ros2.as_ref();
         let topic = ros2.map(|ros2| {
             let name = ros2.args.node_name(NODE_NAME);
             ros2.args.topic(topic::relative(topic::OPERATING_POINT), &ros2.args.namespace(&name, "/"), &name)
         });
-        let service = self.shm().map(|shm| format!("{}{}", shm.service_prefix, OperatingPointForm::SERVICE));
+        let service = shm.as_ref().map(|shm| format!("{}{}", shm.service_prefix, OperatingPointForm::SERVICE));
         let start = (topic.is_some() || service.is_some()).then(|| {
             let mut command = "squealcast simulate".to_owned();
-            for (given, option) in [(self.no_ros, "--no-ros"), (self.no_shm, "--no-shm"), (self.loopback, "--loopback")]
+            for (given, option) in
+                [(options.no_ros, "--no-ros"), (options.no_shm, "--no-shm"), (options.loopback, "--loopback")]
             {
                 if given {
                     command += &format!(" {option}");
@@ -65,8 +166,8 @@ impl BusOptions {
             if let Some(ros2) = ros2.filter(|ros2| ros2.domain_id != 0) {
                 command += &format!(" --domain {}", ros2.domain_id);
             }
-            if !self.no_shm && !self.shm_prefix.is_empty() {
-                command += &format!(" --shm-prefix {}", self.shm_prefix);
+            if let Some(shm) = shm.as_ref().filter(|shm| !shm.service_prefix.is_empty()) {
+                command += &format!(" --shm-prefix {}", shm.service_prefix);
             }
             if let Some(topic) = topic.as_ref().filter(|topic| *topic != topic::OPERATING_POINT) {
                 command += &format!(" --ros-args -r {}:={topic}", topic::OPERATING_POINT);
@@ -75,6 +176,15 @@ impl BusOptions {
         });
         InputSources { topic, domain: ros2.map(|ros2| ros2.domain_id), service, start }
     }
+}
+
+/// A connection that was joined, if one was requested.
+fn boxed<C: Connection + 'static, E: std::error::Error + Send + Sync + 'static>(
+    joined: Option<Result<C, E>>,
+    failed: &'static str,
+) -> anyhow::Result<Option<Box<dyn Connection>>> {
+    let joined = joined.transpose().context(failed)?;
+    Ok(joined.map(|connection| -> Box<dyn Connection> { Box::new(connection) }))
 }
 
 #[cfg(test)]
@@ -89,9 +199,7 @@ mod tests {
     fn the_simulator_command_publishes_on_the_topic_of_the_node() {
         let arguments = ["--ros-args", "-r", "/rig/operating_point:=/brake1/point"].map(str::to_owned);
         let (args, _) = RosArgs::split(arguments).expect("rules");
-        let buses = options();
-        let ros2 = buses.ros2(args).expect("a domain");
-        let sources = buses.sources(ros2.as_ref());
+        let sources = options().resolve(args).expect("a domain").sources();
         assert_eq!((sources.topic.as_deref(), sources.domain), (Some("/brake1/point"), Some(7)));
         assert_eq!(sources.service.as_deref(), Some("cell2/rig/operating_point"));
         assert_eq!(
@@ -102,6 +210,6 @@ mod tests {
             )
         );
         let deaf = BusOptions { no_ros: true, no_shm: true, ..options() };
-        assert_eq!(deaf.sources(None), InputSources::default());
+        assert_eq!(deaf.resolve(RosArgs::default()).expect("no buses").sources(), InputSources::default());
     }
 }

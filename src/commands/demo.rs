@@ -4,12 +4,12 @@ use std::time::{Duration, Instant};
 use clap::Args;
 
 use super::buses::BusOptions;
-use super::run::{Listening, NodeOptions, serve};
+use super::run::{Inputs, NodeOptions, serve};
 use super::simulate::{Measuring, VibrationOption, period, rate_hz};
 use super::{Outcome, not_negative};
-use crate::bus::received::{Bus, Received};
 use crate::bus::ros_args::RosArgs;
-use crate::node::{self, Incoming};
+use crate::bus::{Bus, Received};
+use crate::node::{Incoming, Inlet};
 use crate::rig::{EMBEDDED, Rig};
 use crate::simulator::{Profile, Simulator};
 use crate::system::clock;
@@ -41,30 +41,30 @@ pub struct Options {
 impl Options {
     pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
         let rig = Arc::new(Rig::load(&self.rig)?);
-        let (sender, receiver) = node::channel();
         let period = period(self.rate);
         let mut measuring = Measuring::new(Simulator::new(Profile::demo(), self.seed), self.vibration, period);
-        let (measurements, duration) = (sender.clone(), self.duration);
-        std::thread::spawn(move || {
+        let duration = self.duration;
+        let simulate = move |node: Inlet| {
             let started = Instant::now();
             for seq in 0u32.. {
                 let time_s = measuring.time_s(seq);
                 if duration.is_some_and(|duration| time_s >= duration) {
-                    let _ = measurements.send(Incoming::Stop);
+                    node.stop();
                     return;
                 }
                 let due = started + Duration::from_secs_f64(time_s);
                 std::thread::sleep(due.saturating_duration_since(Instant::now()));
                 let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
                 let conditions = Incoming::Input(Received::now(Bus::Simulator, conditions));
-                let vibration = vibration.map(|received| Incoming::Vibration(Received::now(Bus::Simulator, received)));
-                for received in std::iter::once(conditions).chain(vibration) {
-                    if measurements.send(received).is_err() {
+                let vibration = vibration.map(|measured| Incoming::Vibration(Received::now(Bus::Simulator, measured)));
+                for measured in std::iter::once(conditions).chain(vibration) {
+                    if !node.send(measured) {
                         return;
                     }
                 }
             }
-        });
-        serve(&rig, &self.buses.for_demo(), &self.shown, ros_args, Listening::ToNobody, (sender, receiver))
+        };
+        let inputs = Inputs::Simulator(Box::new(simulate));
+        serve(&rig, &self.buses.for_demo(), &self.shown, ros_args, inputs)
     }
 }

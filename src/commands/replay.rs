@@ -126,7 +126,7 @@ impl Options {
     fn play(&self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
         let (path, recording) = self.recordings.only()?;
         let recording = &recording;
-        let player = Player::join(self.buses.shm(), self.buses.ros2(ros_args)?)?;
+        let mut player = Player::join(&self.buses.resolve(ros_args)?)?;
         let first = recording.messages().next().context("the recording is empty")?;
         let stopped = Arc::new(AtomicBool::new(false));
         let stop = stopped.clone();
@@ -135,7 +135,7 @@ impl Options {
         let watch = Watch::default();
         let played = Arc::new(AtomicU64::new(0));
         let shown = live::show(frame(&path, recording, &played, &stopped), watch.clone(), self.plain);
-        let done = self.play_rounds(recording, first.log_time_ns, &player, &watch, &played, &stopped);
+        let done = self.play_rounds(recording, first.log_time_ns, &mut player, &watch, &played, &stopped);
         shown.stop();
         done?;
         note!("played {} messages", played.load(Ordering::Relaxed));
@@ -168,7 +168,7 @@ impl Options {
         &self,
         recording: &Recording,
         first_ns: u64,
-        player: &Player,
+        player: &mut Player,
         watch: &Watch,
         played: &AtomicU64,
         stopped: &AtomicBool,

@@ -3,15 +3,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, ensure};
+use anyhow::ensure;
 use clap::Args;
 
 use super::buses::BusOptions;
 use super::simulated_sound::SoundOptions;
 use super::{Outcome, finite, not_negative, positive, signals};
+use crate::bus::Outgoing;
 use crate::bus::ros_args::RosArgs;
-use crate::bus::ros2::Ros2Source;
-use crate::bus::shm::{ShmSource, ShmVibrationSource};
 use crate::msgs::{Header, OperatingPoint, Time, Vibration};
 use crate::offline::{self, Measured, Quantity};
 use crate::rig::Rig;
@@ -149,16 +148,8 @@ impl Options {
     }
 
     fn publish(&self, profile: Profile, period: Duration, ros_args: RosArgs) -> anyhow::Result<Outcome> {
-        let measures = self.vibration.tone.is_some();
-        let shm = self.buses.shm().map(|shm| {
-            let vibration = measures.then(|| ShmVibrationSource::new(&shm)).transpose()?;
-            anyhow::Ok((ShmSource::new(&shm)?, vibration))
-        });
-        let shm = shm.transpose();
-        let shm = shm.context("shared memory; --no-shm stays off it")?;
-        let ros2 = self.buses.ros2(ros_args)?.map(|ros2| Ros2Source::start(&ros2, |_| {})).transpose();
-        let ros2 = ros2.context("ROS 2; --no-ros stays off it")?;
-        ensure!(shm.is_some() || ros2.is_some(), "nothing to publish to: both --no-shm and --no-ros are given");
+        let mut buses = self.buses.resolve(ros_args)?.join_as_rig(self.vibration.tone.is_some())?;
+        ensure!(!buses.is_empty(), "nothing to publish to: both --no-shm and --no-ros are given");
         let stopped = Arc::new(AtomicBool::new(false));
         let stop = stopped.clone();
         signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;
@@ -174,16 +165,10 @@ impl Options {
                 break;
             }
             let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
-            if let Some((shm, shm_vibration)) = &shm {
-                shm.publish(&conditions)?;
-                if let (Some(shm), Some(vibration)) = (shm_vibration, &vibration) {
-                    shm.publish(vibration)?;
-                }
-            }
-            if let Some(ros2) = &ros2 {
-                ros2.publish(&conditions)?;
+            for bus in &mut buses {
+                bus.publish(Outgoing::OperatingPoint(&conditions))?;
                 if let Some(vibration) = &vibration {
-                    ros2.publish_vibration(vibration)?;
+                    bus.publish(Outgoing::Vibration(vibration))?;
                 }
             }
         }

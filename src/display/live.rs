@@ -113,7 +113,7 @@ impl Followed {
             warn_margin: snapshot.warn_margin,
             map: self.map_number,
             events: self.event_changes,
-            counters: Some(CountersShown::new(snapshot.counters, snapshot.passed_over, snapshot.ros2_falls)),
+            counters: Some(CountersShown::new(snapshot.counters, snapshot.passed_over, snapshot.bus_restarts)),
             bins,
         };
         // Only numbers and strings, so serialisation cannot fail.

@@ -1,36 +1,41 @@
 //! The node: feeds what it receives to the session and carries out the session's requests.
 //!
-//! One thread at a time holds the session and publishes. Usually that is the node's own thread, which reads one bounded
-//! channel. An input that can be predicted without a dense solve is handled on the thread that received it
-//! ([`Shortcut`]). Everything that affects predictions is recorded in the order in which the session gets it, so that a
-//! replay can reproduce it.
+//! # Locking
+//!
+//! One mutex ([`inlet::Running`]) guards the [`Worker`]: the session and everything that is done for it. The node's own
+//! thread takes it for a whole [`Worker::work_off`] and waits for items without it. A thread that received an input may
+//! take it in [`Inlet::input`], by `try_lock`, so it never waits. Items are put into the queue without the lock, but
+//! taken out of it only under the lock: whoever holds it and finds queue and backlog empty knows that every earlier input
+//! has been handled, and overtakes none. Publishing and recording happen under the lock and put messages into bounded
+//! queues or shared memory without waiting, so it is held no longer than the computation takes. Everything that affects
+//! predictions is recorded in the order in which the session gets it, so that a replay can reproduce it.
 
+mod inlet;
 mod mapper;
 mod outputs;
 #[cfg(test)]
 mod recorded_tests;
 mod sensitivity;
-mod shortcut;
 mod statistics;
 pub mod status;
 mod watch;
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
 
+pub use inlet::Inlet;
 pub use mapper::{
     chart_hash, ends_hash, kept_chart, map_hash, session_chart, session_ends, session_map, yield_to_predictions,
 };
 pub use outputs::{NodeName, Outputs};
 pub use sensitivity::end_derivatives;
-pub use shortcut::Shortcut;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
-use crate::bus::received::{Bus, Received};
+use crate::bus::{Bus, Received};
 use crate::files::chart_file::ChartFile;
 use crate::msgs::{self, Header, RigInfo, SessionEvent, Time, event_kind};
 use crate::physics::{Chart, Ends, OperatingPoint, StabilityMap};
@@ -39,12 +44,12 @@ use crate::rig::{Certificate, Rig};
 use crate::session::{Event, Session, Want, map_serves};
 use crate::session::{conditions, settings::Settings};
 use crate::system::clock;
+use inlet::Running;
 use mapper::Mapper;
 use sensitivity::Question;
-use shortcut::Place;
 use statistics::Statistics;
 
-/// Capacity of the node's channel. Inputs that do not fit are lost before they are recorded, and counted.
+/// Capacity of the node's queue. Inputs that do not fit are lost before they are recorded, and counted.
 const QUEUE: usize = 16_384;
 /// A backlog is predicted completely if that takes at most this time; of a longer one only the newest input is
 /// predicted.
@@ -63,7 +68,7 @@ const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
 /// Minimum interval between sensitivities.
 const SENSITIVITY_EVERY: Duration = Duration::from_secs(1);
 
-/// An item of the node's channel.
+/// An item of the node's queue.
 #[derive(Clone, Debug)]
 pub enum Incoming {
     /// An operating point received over a bus.
@@ -85,13 +90,16 @@ pub enum Incoming {
     Stop,
 }
 
-/// The channel that feeds a node.
-pub fn channel() -> (Sender<Incoming>, Receiver<Incoming>) {
-    bounded(QUEUE)
+/// A node that is not running yet.
+pub struct Node {
+    worker: Worker,
+    sender: Sender<Incoming>,
+    queue: Receiver<Incoming>,
+    running: Running,
 }
 
-/// A session with its channel, outputs, background computations and statistics.
-pub struct Node {
+/// A session with its backlog, outputs, background computations and statistics.
+struct Worker {
     session: Session,
     rig: Arc<Rig>,
     outputs: Outputs,
@@ -113,23 +121,24 @@ pub struct Node {
     /// predicted.
     passing_over: bool,
     next_diagnostics: Instant,
-    /// Shared with the [`Shortcut`]; holds the node while it runs.
-    place: Place,
     /// Set when the node ends; stops the thread that builds the chart.
     stopped: Arc<AtomicBool>,
     next_sensitivity: Instant,
 }
 
 impl Node {
-    /// A node for `rig` with initial `settings`. `sender` must belong to the channel that [`Node::run`] will read.
-    pub fn new(rig: Arc<Rig>, settings: Settings, outputs: Outputs, sender: Sender<Incoming>, watch: Watch) -> Self {
-        Self {
+    /// A node for `rig` with initial `settings`, and the inlet that hands items to it.
+    pub fn new(rig: Arc<Rig>, settings: Settings, watch: Watch) -> (Self, Inlet) {
+        let (sender, queue) = bounded(QUEUE);
+        let (running, lost) = (Running::default(), Arc::<AtomicU64>::default());
+        let inlet = Inlet::new(sender.clone(), running.clone(), lost.clone());
+        let worker = Worker {
             session: Session::new(rig.clone(), settings),
-            mapper: Mapper::spawn(rig.clone(), sender),
+            mapper: Mapper::spawn(rig.clone(), sender.clone()),
             stopped: Arc::new(AtomicBool::new(false)),
             rig,
-            outputs,
-            statistics: Statistics::default(),
+            outputs: Outputs::default(),
+            statistics: Statistics::new(lost),
             watch,
             received_before: Remembered::new(REMEMBERED),
             vibration_received_before: Remembered::new(VIBRATIONS_REMEMBERED),
@@ -140,50 +149,48 @@ impl Node {
             prediction_times: Times::default(),
             passing_over: false,
             next_diagnostics: Instant::now() + DIAGNOSTICS_EVERY,
-            place: Place::default(),
             next_sensitivity: Instant::now(),
-        }
+        };
+        (Self { worker, sender, queue, running }, inlet)
     }
 
     /// Builds the chart of the rig in the background, or loads it from the file `kept`. Predictions use the chart as
     /// soon as it is available.
-    pub fn with_chart(self, kept: Option<ChartFile>, sender: Sender<Incoming>) -> Self {
-        mapper::spawn_chart(self.rig.clone(), kept, sender, self.stopped.clone());
+    pub fn with_chart(self, kept: Option<ChartFile>) -> Self {
+        mapper::spawn_chart(self.worker.rig.clone(), kept, self.sender.clone(), self.worker.stopped.clone());
         self
     }
 
-    /// Lets holders of `shortcut` submit inputs past the channel while the node runs.
-    pub fn with_shortcut(mut self, shortcut: &Shortcut) -> Self {
-        self.place = shortcut.place.clone();
-        self
-    }
-
-    /// Runs until [`Incoming::Stop`] or until all senders are gone, then returns the outputs.
-    pub fn run(mut self, incoming: &Receiver<Incoming>) -> Outputs {
-        self.begin();
-        let place = std::mem::take(&mut self.place);
-        let mut next = Next::Wait(self.deadline());
-        *place.lock() = Some(self);
+    /// Runs until [`Incoming::Stop`], then returns the outputs.
+    pub fn run(self, outputs: Outputs) -> Outputs {
+        let Self { mut worker, sender, queue, running } = self;
+        drop(sender);
+        worker.outputs = outputs;
+        worker.begin();
+        let mut next = Next::Wait(worker.deadline());
+        *running.lock() = Some(worker);
         loop {
-            // The channel is only waited on here; items are taken out under the lock, see `Shortcut::input`.
+            // The queue is only waited on here; items are taken out under the lock, see `Inlet::input`.
             if let Next::Wait(deadline) = next {
                 let mut ready = Select::new();
-                ready.recv(incoming);
+                ready.recv(&queue);
                 let _ = ready.ready_deadline(deadline);
             }
-            let mut place = place.lock();
-            next = place.as_mut().map_or(Next::Stop, |node| node.work_off(incoming));
+            let mut running = running.lock();
+            next = running.as_mut().map_or(Next::Stop, |worker| worker.work_off(&queue));
             if matches!(next, Next::Stop)
-                && let Some(mut node) = place.take()
+                && let Some(mut worker) = running.take()
             {
-                drop(place);
-                node.stopped.store(true, Ordering::Relaxed);
-                node.diagnose(0);
-                return node.outputs;
+                drop(running);
+                worker.stopped.store(true, Ordering::Relaxed);
+                worker.diagnose(0);
+                return worker.outputs;
             }
         }
     }
+}
 
+impl Worker {
     /// Handles all items, until none is left or diagnostics are due; then detects silence and publishes diagnostics.
     fn work_off(&mut self, incoming: &Receiver<Incoming>) -> Next {
         loop {
@@ -246,7 +253,7 @@ impl Node {
 
     /// Publishes the rig, records the initial settings and requests the map at the reference conditions.
     fn begin(&mut self) {
-        self.outputs.rig_info(&rig_info(&self.rig));
+        self.outputs.rig_info(rig_info(&self.rig));
         let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
         for (name, value) in settings {
             self.note(parameter_event(now_header(), name, value));
@@ -418,19 +425,19 @@ impl Node {
         self.outputs.session_event(event);
     }
 
-    /// Feeds an event to the session; `input` is the received message if the event is one. The prediction is first sent
-    /// over shared memory, since a reader waits for it there. Then input and prediction are recorded, in this order.
+    /// Feeds an event to the session; `input` is the received message if the event is one. The prediction is published
+    /// first, since readers wait for it. Then input and prediction are recorded, in this order.
     fn step(&mut self, event: Event, input: Option<Received<msgs::OperatingPoint>>) {
         match self.session.step(event) {
             Ok(effects) => {
                 if let Some(prediction) = effects.publish {
                     self.statistics.published(prediction.level);
-                    self.outputs.prediction_to_shm(prediction);
+                    self.outputs.prediction(prediction);
                     if let Some(received) = input {
                         self.watch.input(&received.message);
                         self.outputs.record(received.at, Payload::OperatingPoint(received.message));
                     }
-                    self.outputs.prediction(prediction);
+                    self.outputs.record_prediction(prediction);
                     self.watch.prediction(prediction);
                 }
                 match effects.want {
@@ -451,7 +458,7 @@ impl Node {
         let counters = self.session.counters();
         let pending = self.mapper.pending();
         let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, &mut self.outputs);
-        self.watch.counters(counters, self.statistics.passed_over, self.outputs.ros2_before.falls);
+        self.watch.counters(counters, self.statistics.passed_over, self.statistics.restarts);
         self.watch.recording_problem(self.outputs.recorder.as_ref().and_then(|recorder| recorder.status().problem()));
         self.outputs.diagnostics(array);
     }
@@ -575,7 +582,8 @@ mod tests {
         const COUNT: u64 = 8000;
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
         let settings = Settings { warn_margin: 0.3, ..Settings::for_rig(&rig) };
-        let (sender, receiver) = channel();
+        let watch = Watch::default();
+        let (mut node, inlet) = Node::new(rig, settings, watch.clone());
         for seq in 0..COUNT {
             let message = msgs::OperatingPoint {
                 header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
@@ -585,15 +593,13 @@ mod tests {
                 friction_coefficient: 0.3 + 1e-6 * seq as f64,
             };
             for bus in [Bus::Ros2, Bus::Shm] {
-                sender.try_send(Incoming::Input(Received::now(bus, message.clone()))).expect("room");
+                assert!(inlet.input(Received::now(bus, message.clone()), false), "room");
             }
         }
-        sender.try_send(Incoming::Stop).expect("room");
-        let watch = Watch::default();
-        let mut node = Node::new(rig, settings, Outputs::default(), sender, watch.clone());
+        inlet.stop();
         // Pretend that a prediction takes 10 ms: at most ten inputs may then wait.
-        node.prediction_times.note(Duration::from_millis(10));
-        node.run(&receiver);
+        node.worker.prediction_times.note(Duration::from_millis(10));
+        node.run(Outputs::default());
         let seen = watch.snapshot();
         assert_eq!(seen.warn_margin, Some(0.3), "of the settings, not of the rig");
         assert_eq!(seen.prediction.expect("one").input_seq, COUNT - 1);
@@ -623,16 +629,13 @@ mod tests {
     #[test]
     fn an_input_is_answered_past_the_queue_but_overtakes_none() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let (sender, receiver) = channel();
-        let shortcut = Shortcut::new(sender.clone());
         let watch = Watch::default();
-        let node = Node::new(rig.clone(), Settings::for_rig(&rig), Outputs::default(), sender.clone(), watch.clone());
-        let node = node.with_shortcut(&shortcut);
+        let (node, inlet) = Node::new(rig.clone(), Settings::for_rig(&rig), watch.clone());
         let chart = Arc::new(session_chart(&rig, 1, &|| true).expect("charted"));
-        sender.send(Incoming::Chart(Ok(chart))).expect("room");
+        assert!(inlet.send(Incoming::Chart(Ok(chart))));
         let mut samples = vec![];
         watch.take_samples(&mut samples);
-        let thread = std::thread::spawn(move || node.run(&receiver));
+        let thread = std::thread::spawn(move || node.run(Outputs::default()));
         let (mut seq, mut at_once, mut all) = (0, 0, vec![]);
         let mut ask = |disc_speed_rad_s: f64| {
             let message = msgs::OperatingPoint {
@@ -642,7 +645,7 @@ mod tests {
                 disc_speed_rad_s,
                 friction_coefficient: 0.3 + 1e-6 * seq as f64,
             };
-            assert!(shortcut.input(Received::now(Bus::Shm, message), seq % 7 == 0));
+            assert!(inlet.input(Received::now(Bus::Shm, message), seq % 7 != 0));
             seq += 1;
             at_once += u32::from(watch.snapshot().prediction.is_some_and(|answer| answer.input_seq == seq - 1));
             // Only a few inputs wait, so that none is passed over. Now and then none waits, so that the next can be
@@ -663,7 +666,7 @@ mod tests {
             asked += 1;
             assert!(begun.elapsed() < Duration::from_secs(60), "hardly any was answered at once");
         }
-        sender.send(Incoming::Stop).expect("it runs");
+        inlet.stop();
         thread.join().expect("it ended");
         watch.take_samples(&mut samples);
         all.append(&mut samples);
@@ -675,12 +678,11 @@ mod tests {
     #[test]
     fn silence_is_a_fault_once_after_the_first_input_and_none_before() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let (sender, receiver) = channel();
         let watch = Watch::default();
         let settings = Settings { silence_timeout_s: 0.02, ..Settings::for_rig(&rig) };
-        let mut node = Node::new(rig, settings, Outputs::default(), sender.clone(), watch.clone());
-        node.next_diagnostics = Instant::now();
-        let thread = std::thread::spawn(move || node.run(&receiver));
+        let (mut node, inlet) = Node::new(rig, settings, watch.clone());
+        node.worker.next_diagnostics = Instant::now();
+        let thread = std::thread::spawn(move || node.run(Outputs::default()));
         let (mut samples, mut all) = (vec![], vec![]);
         watch.take_samples(&mut samples);
         let mut wait_for = |count: usize| -> Vec<(Status, u64)> {
@@ -702,7 +704,7 @@ mod tests {
                 disc_speed_rad_s: 13.0,
                 friction_coefficient: 0.2,
             };
-            sender.send(Incoming::Input(Received::now(Bus::Shm, point))).expect("it runs");
+            assert!(inlet.send(Incoming::Input(Received::now(Bus::Shm, point))), "it runs");
         };
         // Several times the silence timeout.
         std::thread::sleep(Duration::from_millis(200));
@@ -712,7 +714,7 @@ mod tests {
         input(8);
         let found = wait_for(4);
         assert_eq!(found[2..], [(Status::Ok, 8), (Status::NoData, 8)], "one FAULT for each silence");
-        sender.send(Incoming::Stop).expect("it runs");
+        inlet.stop();
         thread.join().expect("it ended");
     }
 
@@ -720,7 +722,8 @@ mod tests {
     #[test]
     fn old_inputs_are_passed_over_but_for_the_newest() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let (sender, receiver) = channel();
+        let watch = Watch::default();
+        let (node, inlet) = Node::new(rig.clone(), Settings::for_rig(&rig), watch.clone());
         let mut old = Received::now(Bus::Shm, msgs::OperatingPoint::default());
         while clock::monotonic_ns().saturating_sub(old.at.monotonic_ns) <= LATEST.as_nanos() as u64 {
             std::thread::sleep(Duration::from_millis(10));
@@ -733,11 +736,10 @@ mod tests {
                 friction_coefficient: 0.2,
                 ..Default::default()
             };
-            sender.send(Incoming::Input(old.clone())).expect("room");
+            assert!(inlet.input(old.clone(), false), "room");
         }
-        sender.send(Incoming::Stop).expect("room");
-        let watch = Watch::default();
-        Node::new(rig.clone(), Settings::for_rig(&rig), Outputs::default(), sender, watch.clone()).run(&receiver);
+        inlet.stop();
+        node.run(Outputs::default());
         let seen = watch.snapshot();
         assert_eq!((seen.passed_over, seen.prediction.expect("one").input_seq), (2, 2));
     }

@@ -13,7 +13,7 @@ const PATIENCE: Duration = Duration::from_secs(120);
 
 /// A recording node on its own thread.
 struct Recorded9Dof {
-    sender: Sender<Incoming>,
+    inlet: Inlet,
     watch: Watch,
     node: std::thread::JoinHandle<Outputs>,
     recorder: Recorder,
@@ -28,16 +28,15 @@ impl Recorded9Dof {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
         let mut settings = Settings::for_rig(&rig);
         change(&mut settings);
-        let (sender, receiver) = channel();
-        waiting.into_iter().for_each(|incoming| sender.send(incoming).expect("room"));
         let (watch, outputs) = (Watch::default(), Outputs { recorder: Some(recorder.handle()), ..Default::default() });
-        let node = Node::new(rig, settings, outputs, sender.clone(), watch.clone());
-        let node = std::thread::spawn(move || node.run(&receiver));
-        Self { sender, watch, node, recorder, folder }
+        let (node, inlet) = Node::new(rig, settings, watch.clone());
+        waiting.into_iter().for_each(|incoming| assert!(inlet.send(incoming)));
+        let node = std::thread::spawn(move || node.run(outputs));
+        Self { inlet, watch, node, recorder, folder }
     }
 
     fn send(&self, incoming: Incoming) {
-        self.sender.send(incoming).expect("it runs");
+        assert!(self.inlet.send(incoming), "it runs");
     }
 
     fn level(&self) -> Option<u8> {

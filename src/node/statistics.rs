@@ -1,11 +1,12 @@
 //! The node's counters and prediction times, reported as diagnostics.
 
-use std::sync::atomic::Ordering;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use super::Outputs;
 use super::status::{Inputs, Status};
-use crate::bus::received::{Bus, Counts};
+use crate::bus::{Bus, Counts, Report};
 use crate::msgs::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
 use crate::physics::Chart;
 use crate::recording::recorder::State;
@@ -22,9 +23,12 @@ mod diagnostic_level {
 /// Counts since the start, and prediction times since the last report.
 #[derive(Default)]
 pub struct Statistics {
-    received_shm: u64,
-    received_ros2: u64,
-    received_simulator: u64,
+    /// Inputs by the bus that delivered them first, as [`Bus::ALL`] lists them.
+    received: [u64; Bus::ALL.len()],
+    /// Inputs and vibrations lost because the queue was full.
+    lost: Arc<AtomicU64>,
+    /// How often buses were started again, at the last report.
+    pub restarts: u64,
     pub duplicates: u64,
     pub passed_over: u64,
     pub maps: u64,
@@ -56,13 +60,13 @@ struct Lost {
 }
 
 impl Lost {
-    fn new(passed_over: u64, outputs: &mut Outputs) -> Self {
+    fn new(statistics: &Statistics, outputs: &mut Outputs, reports: &[(Bus, Report)]) -> Self {
         Self {
-            passed_over,
-            overflowed: outputs.lost_inputs.load(Ordering::Relaxed),
+            passed_over: statistics.passed_over,
+            overflowed: statistics.lost.load(Ordering::Relaxed),
             unpublished: outputs.failures,
             why_unpublished: outputs.last_failure.take(),
-            buses: outputs.counts(),
+            buses: reports.iter().filter_map(|(bus, report)| Some((bus.name(), report.counts?))).collect(),
         }
     }
 
@@ -94,13 +98,15 @@ impl Lost {
 }
 
 impl Statistics {
+    /// Statistics of a node whose queue counts what it loses in `lost`.
+    pub fn new(lost: Arc<AtomicU64>) -> Self {
+        Self { lost, ..Self::default() }
+    }
+
+    /// Takes note of an input received over `bus`.
     pub fn received(&mut self, bus: Bus) {
         self.inputs.came();
-        match bus {
-            Bus::Shm => self.received_shm += 1,
-            Bus::Ros2 => self.received_ros2 += 1,
-            Bus::Simulator => self.received_simulator += 1,
-        }
+        self.received[bus as usize] += 1;
     }
 
     /// Takes note of a silence.
@@ -131,19 +137,19 @@ impl Statistics {
         map_pending: bool,
         outputs: &mut Outputs,
     ) -> DiagnosticArray {
-        let lost = Lost::new(self.passed_over, outputs);
-        let mut values = self.values(counters, queued, map_pending, outputs);
+        let mut reports = outputs.reports();
+        let lost = Lost::new(self, outputs, &reports);
+        self.restarts = reports.iter().map(|(_, report)| report.restarts).sum();
+        let skipped: u64 = reports.iter().map(|(_, report)| report.encodings_skipped).sum();
+        let mut values = self.values(counters, queued, map_pending, skipped, outputs.failures);
         for (bus, counts) in &lost.buses {
             values.push(pair(&format!("{bus}_missed"), counts.missed));
             values.push(pair(&format!("{bus}_malformed"), counts.malformed));
             values.push(pair(&format!("{bus}_failures"), counts.failures));
             values.push(pair(&format!("{bus}_incompatible_peers"), counts.incompatible));
         }
-        let ros2 = outputs.ros2_health();
-        if let Some((health, _)) = &ros2 {
-            values.push(pair("ros2_side_falls", health.falls));
-            values.push(pair("ros2_side_process", health.process_id));
-            values.push(pair("ros2_refused", health.refused));
+        for (_, report) in &mut reports {
+            values.extend(report.values.drain(..).map(|(key, value)| pair(key, value)));
         }
         self.times.clear();
         let mut warnings: Vec<String> = vec![];
@@ -151,8 +157,7 @@ impl Statistics {
         warnings.extend(self.chart_failure.iter().map(|why| format!("no chart: {why}")));
         warnings.extend(self.sensitivity_failure.iter().map(|why| format!("no sensitivities: {why}")));
         warnings.extend(self.refused.take());
-        warnings.extend(outputs.other_nodes());
-        warnings.extend(ros2.into_iter().flat_map(|(_, wrong)| wrong));
+        warnings.extend(reports.into_iter().flat_map(|(_, report)| report.warnings));
         let incompatible = lost.buses.iter().map(|(_, counts)| counts.incompatible).sum::<u64>();
         if incompatible > 0 {
             warnings.push(format!("peers not connected, their quality of service is incompatible: {incompatible}"));
@@ -178,19 +183,25 @@ impl Statistics {
         DiagnosticArray { header, status }
     }
 
-    fn values(&mut self, counters: Counters, queued: usize, map_pending: bool, outputs: &Outputs) -> Vec<KeyValue> {
+    fn values(
+        &mut self,
+        counters: Counters,
+        queued: usize,
+        map_pending: bool,
+        encodings_skipped: u64,
+        publish_failures: u64,
+    ) -> Vec<KeyValue> {
         self.times.sort_unstable();
         let quantile = |q: f64| {
             let index = (q * self.times.len().saturating_sub(1) as f64).round() as usize;
             self.times.get(index).map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)
         };
-        let mut values = vec![
-            pair("inputs_from_shm", self.received_shm),
-            pair("inputs_from_ros2", self.received_ros2),
-            pair("inputs_from_simulator", self.received_simulator),
+        let from = |bus: Bus| pair(&format!("inputs_from_{}", bus.name()), self.received[bus as usize]);
+        let mut values: Vec<KeyValue> = Bus::ALL.into_iter().map(from).collect();
+        values.extend([
             pair("inputs_twice", self.duplicates),
             pair("inputs_passed_over", self.passed_over),
-            pair("inputs_lost", outputs.lost_inputs.load(Ordering::Relaxed)),
+            pair("inputs_lost", self.lost.load(Ordering::Relaxed)),
             pair("inputs_waiting", queued),
             pair("predictions_solved", counters.solved),
             pair("predictions_from_chart", counters.charted),
@@ -207,9 +218,9 @@ impl Statistics {
             pair("skipped_zero_terms", counters.zero_terms),
             pair("skipped_decoupled_modes", counters.decoupled_modes),
             pair("skipped_roots_beyond_band", counters.roots_beyond_band),
-            pair("skipped_encodings", outputs.encodings_skipped),
-            pair("publish_failures", outputs.failures),
-        ];
+            pair("skipped_encodings", encodings_skipped),
+            pair("publish_failures", publish_failures),
+        ]);
         if let Some((leaves, bytes)) = self.chart {
             values.push(pair("chart_leaves", leaves));
             values.push(pair("chart_bytes", bytes));
@@ -315,7 +326,7 @@ mod tests {
         let warns = |message: &str| (diagnostic_level::WARN, format!("OK; {message}"));
         assert_eq!(reporter.report(), warns("inputs passed over since the last report: 3"));
         assert_eq!(reporter.report(), quiet);
-        reporter.outputs.lost_inputs.fetch_add(2, Ordering::Relaxed);
+        reporter.statistics.lost.fetch_add(2, Ordering::Relaxed);
         assert_eq!(reporter.report(), warns("inputs lost in a full queue since the last report: 2"));
         assert_eq!(reporter.report(), quiet);
         (reporter.outputs.failures, reporter.outputs.last_failure) = (1, Some("no room".to_owned()));

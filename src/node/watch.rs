@@ -29,7 +29,7 @@ pub struct Snapshot {
     pub counters: Counters,
     pub passed_over: u64,
     /// Number of restarts of the ROS 2 side.
-    pub ros2_falls: u64,
+    pub bus_restarts: u64,
     /// Why some messages are not recorded.
     pub recording_problem: Option<String>,
 }
@@ -252,9 +252,9 @@ impl Watch {
         self.with(|watched| watched.snapshot.recording_problem = problem);
     }
 
-    pub(super) fn counters(&self, counters: Counters, passed_over: u64, ros2_falls: u64) {
+    pub(super) fn counters(&self, counters: Counters, passed_over: u64, bus_restarts: u64) {
         self.with(|Watched { snapshot, .. }| {
-            (snapshot.counters, snapshot.passed_over, snapshot.ros2_falls) = (counters, passed_over, ros2_falls);
+            (snapshot.counters, snapshot.passed_over, snapshot.bus_restarts) = (counters, passed_over, bus_restarts);
         });
     }
 }

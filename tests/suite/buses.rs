@@ -9,12 +9,12 @@ use std::time::{Duration, Instant};
 use crate::bus::{PATIENCE, answer, into, next, point, shm, wait_until};
 use crate::domain::Domain;
 use crossbeam_channel::unbounded;
-use squealcast::bus::received::{Bus, Received};
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::bus::shm::{
     ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, ShmVibrationInput, ShmVibrationSource,
 };
+use squealcast::bus::{Bus, Received};
 use squealcast::msgs::shm::{Form, OperatingPointForm};
 use squealcast::msgs::{OperatingPoint, Prediction, RigInfo, Vibration};
 

@@ -19,7 +19,8 @@ use crossbeam_channel::{Receiver, Sender, bounded, select};
 
 use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide, encode};
 use super::{NOTE, Ros2Error, Ros2Options};
-use crate::bus::received::{Bus, Counts, Received};
+use crate::bus::Bus;
+use crate::bus::received::{Counts, Received};
 use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
 
 /// The command that runs the ROS 2 side of a node.

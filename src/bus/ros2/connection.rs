@@ -1,0 +1,209 @@
+//! ROS 2 as a bus: the connections of a node, of a rig and of a replay.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::process::{Health, Ros2Process, Sinks};
+use super::{Parameters, Ros2, Ros2Error, Ros2Options, Ros2Source};
+use crate::bus::{Bus, BusError, Connection, Outgoing, Report, Sink};
+use crate::msgs::schema::Topic;
+
+/// The connection of a long-running node, whose ROS 2 side is a child process.
+pub struct Ros2NodeConnection {
+    process: Ros2Process,
+    readers: Readers,
+    encodings_skipped: u64,
+    /// State at the last report.
+    health_before: Health,
+}
+
+impl Ros2NodeConnection {
+    /// Starts the ROS 2 side with these initial `parameters` and passes what it receives to `sink`.
+    ///
+    /// # Errors
+    /// As [`Ros2Process::start`].
+    pub fn start(
+        options: &Ros2Options,
+        parameters: Vec<(String, f64)>,
+        sink: &Arc<dyn Sink>,
+    ) -> Result<Self, Ros2Error> {
+        let (inputs, vibrations, changes) = (sink.clone(), sink.clone(), sink.clone());
+        let sinks = Sinks {
+            // The thread that receives from the child process serves all topics: it must not be held up.
+            input: Box::new(move |received| {
+                if inputs.takes_inputs() {
+                    inputs.operating_point(received, false);
+                }
+            }),
+            vibration: Box::new(move |received| {
+                if vibrations.takes_inputs() {
+                    vibrations.vibration(received);
+                }
+            }),
+            parameter: Box::new(move |name, value| changes.parameter(name, value)),
+            fell: Box::new(|why| note!("the ROS 2 side fell and is started again: {why}")),
+        };
+        Ok(Self {
+            process: Ros2Process::start(options, parameters, sinks)?,
+            readers: Readers::default(),
+            encodings_skipped: 0,
+            health_before: Health::default(),
+        })
+    }
+}
+
+impl Connection for Ros2NodeConnection {
+    fn bus(&self) -> Bus {
+        Bus::Ros2
+    }
+
+    fn publish(&mut self, message: Outgoing<'_>) -> Result<(), BusError> {
+        match message {
+            Outgoing::Prediction(message) => {
+                if self.readers.any(|| self.process.prediction_readers()) {
+                    self.process.publish_prediction(message)?;
+                } else {
+                    self.encodings_skipped += 1;
+                }
+            }
+            Outgoing::SessionEvent(message) => self.process.publish_session_event(message)?,
+            Outgoing::RigInfo(message) => self.process.publish_rig(message)?,
+            Outgoing::Sensitivity(message) => self.process.publish_sensitivity(message)?,
+            Outgoing::Diagnostics(message) => self.process.publish_diagnostics(message)?,
+            // Published by the rig.
+            Outgoing::OperatingPoint(_) | Outgoing::Vibration(_) => {}
+        }
+        Ok(())
+    }
+
+    fn readers(&self, topic: Topic) -> usize {
+        match topic {
+            Topic::Prediction => self.process.prediction_readers(),
+            Topic::Sensitivity => self.process.sensitivity_readers(),
+            // The child process does not report readers of these.
+            Topic::OperatingPoint | Topic::Vibration | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0,
+        }
+    }
+
+    fn report(&mut self) -> Report {
+        let now = self.process.health();
+        let before = std::mem::replace(&mut self.health_before, now.clone());
+        let mut warnings = vec![];
+        if now.falls > before.falls {
+            warnings.push(format!("the ROS 2 side fell and is started again: {}", now.last_fall));
+        } else if !now.up {
+            warnings.push(format!("the ROS 2 side is down: {}", now.last_fall));
+        }
+        if now.refused > before.refused {
+            warnings.push(format!("{} messages {}", now.refused - before.refused, now.last_refusal));
+        }
+        Report {
+            counts: Some(self.process.counts()),
+            encodings_skipped: self.encodings_skipped,
+            restarts: now.falls,
+            values: vec![
+                ("ros2_side_falls", now.falls.to_string()),
+                ("ros2_side_process", now.process_id.to_string()),
+                ("ros2_refused", now.refused.to_string()),
+            ],
+            warnings,
+        }
+    }
+}
+
+/// Whether a topic has readers. The answer is cached, since asking takes locks.
+#[derive(Default)]
+struct Readers {
+    asked: Option<Instant>,
+    any: bool,
+}
+
+/// How long the answer is cached. A new reader may miss what is published in this time.
+const LOOK_FOR_READERS_EVERY: Duration = Duration::from_millis(20);
+
+impl Readers {
+    fn any(&mut self, count: impl FnOnce() -> usize) -> bool {
+        if self.asked.is_none_or(|asked| asked.elapsed() >= LOOK_FOR_READERS_EVERY) {
+            (self.asked, self.any) = (Some(Instant::now()), count() > 0);
+        }
+        self.any
+    }
+}
+
+impl Connection for Ros2Source {
+    fn bus(&self) -> Bus {
+        Bus::Ros2
+    }
+
+    fn publish(&mut self, message: Outgoing<'_>) -> Result<(), BusError> {
+        match message {
+            Outgoing::OperatingPoint(message) => Self::publish(self, message)?,
+            Outgoing::Vibration(message) => self.publish_vibration(message)?,
+            // Published by the node.
+            Outgoing::Prediction(_)
+            | Outgoing::SessionEvent(_)
+            | Outgoing::RigInfo(_)
+            | Outgoing::Sensitivity(_)
+            | Outgoing::Diagnostics(_) => {}
+        }
+        Ok(())
+    }
+
+    fn readers(&self, topic: Topic) -> usize {
+        match topic {
+            Topic::OperatingPoint => Self::readers(self),
+            Topic::Vibration => self.vibration_readers(),
+            Topic::Prediction | Topic::SessionEvent | Topic::RigInfo | Topic::Sensitivity | Topic::Diagnostics => 0,
+        }
+    }
+}
+
+/// Number of the replay's own readers of a topic: a reliable and a best-effort one.
+const OWN_READERS: usize = 2;
+
+/// The connection of a replay, which stands for the rig and for its node.
+pub struct Ros2ReplayConnection {
+    rig: Ros2Source,
+    node: Ros2,
+}
+
+impl Ros2ReplayConnection {
+    /// Joins the network with two nodes. Neither has the default name of a node, so that one can receive the messages.
+    ///
+    /// # Errors
+    /// Invalid names, or an error of DDS.
+    pub fn start(options: &Ros2Options) -> Result<Self, Ros2Error> {
+        let rig = Ros2Source::start(options, |_| {})?;
+        let options = Ros2Options { args: options.args.clone().renamed("squealcast_replay"), ..options.clone() };
+        Ok(Self { rig, node: Ros2::start(&options, Parameters::none(), |_| {}, |_| {})? })
+    }
+}
+
+impl Connection for Ros2ReplayConnection {
+    fn bus(&self) -> Bus {
+        Bus::Ros2
+    }
+
+    fn publish(&mut self, message: Outgoing<'_>) -> Result<(), BusError> {
+        match message {
+            Outgoing::OperatingPoint(message) => self.rig.publish(message)?,
+            Outgoing::Vibration(message) => self.rig.publish_vibration(message)?,
+            Outgoing::Prediction(message) => self.node.publish_prediction(message)?,
+            Outgoing::SessionEvent(message) => self.node.publish_session_event(message)?,
+            Outgoing::RigInfo(message) => self.node.publish_rig(message)?,
+            Outgoing::Sensitivity(message) => self.node.publish_sensitivity(message)?,
+            Outgoing::Diagnostics(message) => self.node.publish_diagnostics(message)?,
+        }
+        Ok(())
+    }
+
+    fn readers(&self, topic: Topic) -> usize {
+        // The two nodes receive each other's messages.
+        match topic {
+            Topic::OperatingPoint => self.rig.readers().saturating_sub(OWN_READERS),
+            Topic::Vibration => self.rig.vibration_readers().saturating_sub(OWN_READERS),
+            Topic::Prediction => self.node.readers(topic).saturating_sub(OWN_READERS),
+            Topic::Sensitivity | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => self.node.readers(topic),
+        }
+    }
+}

@@ -1,0 +1,128 @@
+//! Shared memory as a bus: the ports of a node, of a rig and of a replay.
+
+use std::sync::Arc;
+
+use super::Bus;
+use super::connection::{BusError, Connection, Outgoing, Report, Sink};
+use super::shm::{
+    ShmError, ShmInput, ShmOptions, ShmOutput, ShmSensitivity, ShmSource, ShmVibrationInput, ShmVibrationSource,
+    ShmWriter,
+};
+use crate::msgs::schema::Topic;
+use crate::msgs::shm::Form;
+
+/// The ports of a program that has joined shared memory. Topics without a port are neither published nor received.
+#[derive(Default)]
+pub struct ShmConnection {
+    predictions: Option<ShmOutput>,
+    sensitivities: Option<ShmSensitivity>,
+    operating_points: Option<ShmSource>,
+    vibrations: Option<ShmVibrationSource>,
+    inputs: Option<ShmInput>,
+    vibration_inputs: Option<ShmVibrationInput>,
+}
+
+impl ShmConnection {
+    /// The ports of a node: publishes predictions and sensitivities, and receives into `sink` if it takes inputs.
+    ///
+    /// # Errors
+    /// Errors of iceoryx2.
+    pub fn of_node(options: &ShmOptions, sink: &Arc<dyn Sink>) -> Result<Self, ShmError> {
+        let mut ports = Self {
+            predictions: Some(ShmOutput::new(options)?),
+            sensitivities: Some(ShmSensitivity::new(options)?),
+            ..Self::default()
+        };
+        if sink.takes_inputs() {
+            let (inputs, vibrations) = (sink.clone(), sink.clone());
+            ports.inputs = Some(ShmInput::spawn_with_backlog(options, move |received, more_waits| {
+                inputs.operating_point(received, !more_waits);
+            })?);
+            ports.vibration_inputs =
+                Some(ShmVibrationInput::spawn(options, move |received| vibrations.vibration(received))?);
+        }
+        Ok(ports)
+    }
+
+    /// The ports of a rig: publishes operating points and, if the rig measures it, the vibration.
+    ///
+    /// # Errors
+    /// Errors of iceoryx2.
+    pub fn of_rig(options: &ShmOptions, measures_vibration: bool) -> Result<Self, ShmError> {
+        Ok(Self {
+            vibrations: measures_vibration.then(|| ShmVibrationSource::new(options)).transpose()?,
+            operating_points: Some(ShmSource::new(options)?),
+            ..Self::default()
+        })
+    }
+
+    /// The ports of a replay: publishes every topic that has a form in shared memory.
+    ///
+    /// # Errors
+    /// Errors of iceoryx2.
+    pub fn of_replay(options: &ShmOptions) -> Result<Self, ShmError> {
+        Ok(Self {
+            predictions: Some(ShmOutput::new(options)?),
+            sensitivities: Some(ShmSensitivity::new(options)?),
+            operating_points: Some(ShmSource::new(options)?),
+            vibrations: Some(ShmVibrationSource::new(options)?),
+            ..Self::default()
+        })
+    }
+}
+
+impl Connection for ShmConnection {
+    fn bus(&self) -> Bus {
+        Bus::Shm
+    }
+
+    fn publish(&mut self, message: Outgoing<'_>) -> Result<(), BusError> {
+        match message {
+            Outgoing::OperatingPoint(message) => publish(self.operating_points.as_ref(), message),
+            Outgoing::Prediction(message) => publish(self.predictions.as_ref(), message),
+            Outgoing::Sensitivity(message) => publish(self.sensitivities.as_ref(), message),
+            Outgoing::Vibration(message) => publish(self.vibrations.as_ref(), message),
+            // These have no form in shared memory.
+            Outgoing::SessionEvent(_) | Outgoing::RigInfo(_) | Outgoing::Diagnostics(_) => Ok(()),
+        }
+    }
+
+    fn readers(&self, topic: Topic) -> usize {
+        match topic {
+            Topic::OperatingPoint => readers(self.operating_points.as_ref()),
+            Topic::Prediction => readers(self.predictions.as_ref()),
+            Topic::Sensitivity => readers(self.sensitivities.as_ref()),
+            Topic::Vibration => readers(self.vibrations.as_ref()),
+            Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0,
+        }
+    }
+
+    /// The counts of its receiver, and a warning if other nodes publish predictions on the same service: readers cannot
+    /// tell them apart.
+    fn report(&mut self) -> Report {
+        let others = self.predictions.as_ref().map_or(0, ShmOutput::other_writers);
+        let service = self.predictions.as_ref().map_or("", ShmOutput::service);
+        let warning = || {
+            format!(
+                "{others} more publish on the service {service} over shared memory, whose readers get the predictions \
+                 of all; --shm-prefix keeps nodes apart"
+            )
+        };
+        Report {
+            counts: self.inputs.as_ref().map(ShmInput::counts),
+            warnings: (others > 0).then(warning).into_iter().collect(),
+            ..Report::default()
+        }
+    }
+}
+
+fn publish<F: Form>(writer: Option<&ShmWriter<F>>, message: &F::Message) -> Result<(), BusError> {
+    if let Some(writer) = writer {
+        writer.publish(message)?;
+    }
+    Ok(())
+}
+
+fn readers<F: Form>(writer: Option<&ShmWriter<F>>) -> usize {
+    writer.map_or(0, ShmWriter::readers)
+}
