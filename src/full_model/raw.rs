@@ -4,7 +4,7 @@ use serde::Deserialize;
 
 use crate::rig::raw::{
     RawBand, RawChart, RawFriction, RawLimits, RawLoad, RawPatch, RawReference, RawRig, RawSearch, RawSystem,
-    RawWarning,
+    RawWarning, first_format,
 };
 
 /// A whole full model: the common tables of a rig file, and either parts or a system.
@@ -12,6 +12,8 @@ use crate::rig::raw::{
 #[serde(deny_unknown_fields)]
 pub struct RawFullModel {
     pub name: String,
+    #[serde(default = "first_format")]
+    pub format: i64,
     #[serde(default)]
     pub reference: RawReference,
     #[serde(default)]
@@ -100,6 +102,7 @@ impl RawFullModel {
         };
         let common = RawRig {
             name: self.name,
+            format: self.format,
             reference: self.reference,
             band: self.band,
             search: self.search,

@@ -16,6 +16,7 @@ use mcap::records::Metadata;
 use super::bag;
 use super::message::Payload;
 use super::record_walker::{Attachment, Channel, Damage, Depth, Item, RawMessage, RecordWalker};
+use super::recorder::{FORMAT, METADATA_NAME};
 use super::topics::{ChoiceError, RecordedTopics, Unread};
 use crate::files::input_file;
 use crate::msgs::{CdrError, schema::Topic};
@@ -50,6 +51,11 @@ pub enum RecordingError {
     Compressed { path: PathBuf },
     #[error("{}: holds no *.mcap and no *.mcap.active file", .path.display())]
     NoFiles { path: PathBuf },
+    #[error(
+        "{}: a recording of format {found}, expected {expected} or earlier, which this version of squealcast reads",
+        .path.display()
+    )]
+    Format { path: PathBuf, found: String, expected: u32 },
     #[error("{}: {source}", .path.display())]
     Choice { path: PathBuf, source: ChoiceError },
 }
@@ -151,7 +157,10 @@ impl Recording {
                         }
                         recording.attachments.push(attachment);
                     }
-                    Item::Metadata(metadata) => recording.metadata.push(metadata),
+                    Item::Metadata(metadata) => {
+                        check_format(file, &metadata)?;
+                        recording.metadata.push(metadata);
+                    }
                     Item::Message(_) => {}
                 }
             }
@@ -193,10 +202,10 @@ impl Recording {
         &self.metadata
     }
 
-    /// A value of the recorder's metadata record (see [`super::recorder::METADATA_NAME`]) in the first file that has
+    /// A value of the recorder's metadata record (see [`METADATA_NAME`]) in the first file that has
     /// one.
     pub fn session_metadata(&self, key: &str) -> Option<&str> {
-        let record = self.metadata.iter().find(|record| record.name == super::recorder::METADATA_NAME)?;
+        let record = self.metadata.iter().find(|record| record.name == METADATA_NAME)?;
         record.metadata.get(key).map(String::as_str)
     }
 
@@ -227,6 +236,17 @@ impl Recording {
             undecoded: None,
             damage: Vec::new(),
         }
+    }
+}
+
+/// Refuses a file whose metadata say that it has a format this program does not read.
+fn check_format(file: &Path, metadata: &Metadata) -> Result<(), RecordingError> {
+    let found = metadata.metadata.get("format").filter(|_| metadata.name == METADATA_NAME);
+    match found {
+        Some(found) if !found.parse().is_ok_and(|format: u32| (1..=FORMAT).contains(&format)) => {
+            Err(RecordingError::Format { path: file.to_owned(), found: format!("{found:.20}"), expected: FORMAT })
+        }
+        _ => Ok(()),
     }
 }
 

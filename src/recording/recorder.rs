@@ -31,7 +31,11 @@ use crate::files::whole_file::{folder_of, sync_folder};
 use crate::rig::RigFile;
 use worker::Worker;
 
-/// Name of the metadata record in each file. Its keys: `session_id`, `squealcast_version`, `rig_name`,
+/// The format of recordings that this program writes, and the latest that it reads. A recording whose metadata do not say
+/// it has format 1.
+pub const FORMAT: u32 = 1;
+
+/// Name of the metadata record in each file. Its keys: `format`, `session_id`, `squealcast_version`, `rig_name`,
 /// `rig_content_hash`, `split_index`, `started_utc`.
 pub const METADATA_NAME: &str = "squealcast";
 

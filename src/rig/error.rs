@@ -20,6 +20,8 @@ pub enum RigError {
     UnknownKey { file: String, line: usize, field: String, limit: String },
     #[error("{file}: `{field}` is missing; expected {limit}")]
     MissingKey { file: String, field: String, limit: String },
+    #[error("{file}: `format` is {value}, expected {limit}, the format that this version of squealcast reads")]
+    Format { file: String, value: i64, limit: i64 },
     #[error("{file}: `{field}` {value}; expected {limit}")]
     Kind { file: String, field: String, value: String, limit: String },
     #[error("{file}: `{field}` has shape {value}, expected {limit}")]

@@ -6,11 +6,16 @@ use super::RigError;
 use super::certificate::Certificate;
 use crate::files::input_file;
 
+/// The format of rig files and full models that this program reads. A file without the key `format` has format 1.
+pub const FORMAT: i64 = 1;
+
 /// A whole rig file.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RawRig {
     pub name: String,
+    #[serde(default = "first_format")]
+    pub format: i64,
     #[serde(default)]
     pub reference: RawReference,
     #[serde(default)]
@@ -209,10 +214,33 @@ fn one() -> String {
     "1".to_owned()
 }
 
+/// The format of a file that does not say its own.
+pub fn first_format() -> i64 {
+    1
+}
+
+/// The key `format` of a file whose other keys may be unknown.
+#[derive(Deserialize)]
+struct Versioned {
+    #[serde(default = "first_format")]
+    format: i64,
+}
+
+/// Refuses a file of a format that this program does not read.
+///
+/// # Errors
+/// [`RigError::Format`].
+fn check_format(file: &str, format: i64) -> Result<(), RigError> {
+    if format == FORMAT {
+        return Ok(());
+    }
+    Err(RigError::Format { file: file.to_owned(), value: format, limit: FORMAT })
+}
+
 /// Parses the TOML text of a rig file or of a full model.
 ///
 /// # Errors
-/// [`RigError::TooLong`], [`RigError::Syntax`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
+/// [`RigError::TooLong`], [`RigError::Syntax`], [`RigError::Format`], [`RigError::UnknownKey`], [`RigError::MissingKey`].
 pub fn parse<T: serde::de::DeserializeOwned>(file: &str, bytes: &[u8]) -> Result<T, RigError> {
     if bytes.len() as u64 > input_file::TOML {
         return Err(RigError::TooLong { file: file.to_owned(), bytes: bytes.len(), limit: input_file::TOML });
@@ -222,6 +250,11 @@ pub fn parse<T: serde::de::DeserializeOwned>(file: &str, bytes: &[u8]) -> Result
         let value = format!("bytes that are not UTF-8 ({error})");
         RigError::Syntax { file: file.to_owned(), line, value, limit: "TOML text".to_owned() }
     })?;
+    // First, because a file of a later format may have keys that are unknown here. What is no TOML, or has another type of
+    // `format`, is reported below with its line.
+    if let Ok(Versioned { format }) = toml::from_str(text) {
+        check_format(file, format)?;
+    }
     toml::from_str(text).map_err(|error| {
         let span = error.span().unwrap_or_default();
         let line = 1 + bytes.iter().take(span.start).filter(|byte| **byte == b'\n').count();

@@ -257,6 +257,57 @@ fn recordings_in_other_formats_are_named() {
     failed.complains("3 messages cannot be decoded").complains("compressed message by message; `ros2 bag convert`");
 }
 
+/// Recordings that older programs made, each with the sentence that says what is not read of it.
+#[test]
+fn recordings_of_older_versions_are_read_or_the_reason_is_given() {
+    let folder = folder();
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/recordings");
+    // Without the margin's error bound a prediction is not one of today's.
+    let oldest = text(&data.join("without_margin_error.mcap"));
+    let out = text(&folder.path().join("oldest"));
+    for args in [&["report", &oldest, "-o", &out][..], &["view", &oldest], &["replay", "--verify", &oldest]] {
+        let failed = run(args).exits(1).complains("holds no prediction that can be read");
+        failed.complains("/squealcast/prediction is not read").complains("lacks `float64 friction_margin_error`");
+    }
+    // Predictions have the fields of today, but other reasons: they are read, and verification reports the differences.
+    let older = text(&data.join("without_reduction.mcap"));
+    let out = folder.path().join("older");
+    let unread = "/squealcast/rig is not read";
+    run(["report", &older, "-o", &text(&out)]).exits(0).complains(unread).complains("lacks `string reduction`");
+    assert!(std::fs::read_to_string(out.join("report.html")).expect("a report").contains("nine-dof-case-2"));
+    let verified = run(["replay", "--verify", &older, "--no-chart-cache"]).exits(3).complains(unread);
+    verified.says("200 inputs, 200 of them predicted").says("0 missing, 0 extra");
+}
+
+/// A later format is refused, whatever else could be read.
+#[test]
+fn a_recording_of_a_later_format_is_refused_by_its_number() {
+    let folder = folder();
+    let ramp = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings/ramp");
+    let recording = Recording::open(&ramp).expect("a recording");
+    let made = |format: &str| {
+        let path = folder.path().join(format!("format-{format}.mcap"));
+        let mut file = RecordingFile::create(&path, ".part", Arc::new(FileSystem)).expect("a file");
+        for metadata in recording.metadata() {
+            let mut metadata = metadata.clone();
+            metadata.metadata.insert("format".to_owned(), format.to_owned());
+            file.write_metadata(&metadata).expect("written");
+        }
+        file.finish().expect("finished");
+        path
+    };
+    assert!(Recording::open(&made("1")).is_ok());
+    for format in ["2", "0", "one"] {
+        let path = text(&made(format));
+        let why =
+            format!("a recording of format {format}, expected 1 or earlier, which this version of squealcast reads");
+        let out = text(&folder.path().join("out"));
+        for args in [&["report", &path, "-o", &out][..], &["view", &path], &["replay", "--verify", &path]] {
+            run(args).exits(1).complains(&why);
+        }
+    }
+}
+
 // --- several recordings ------------------------------------------------------------------------------------------------------
 
 #[test]

@@ -79,6 +79,7 @@ fn recorded_messages_are_read_back() {
     assert_eq!(names, [("rig.toml", 18), ("M.mtx", 256)]);
     assert_eq!(recording.session_metadata("rig_name"), Some("nine-dof"));
     assert_eq!(recording.session_metadata("split_index"), Some("0"));
+    assert_eq!(recording.session_metadata("format"), Some("1"));
     assert!(directory.join("metadata.yaml").exists());
     assert_eq!(recover(&directory).unwrap().recoveries.len(), 1);
 }

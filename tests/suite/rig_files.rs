@@ -80,6 +80,21 @@ macro_rules! refused {
 }
 
 #[test]
+fn a_rig_file_says_its_format() {
+    Rig::from_files(&[file("x.toml", format!("format = 1\n{INLINE}"))]).unwrap();
+    // Keys of a later format are unknown here: the format is what is wrong.
+    for (format, rest) in [(2, "colour = 3\n"), (0, ""), (-1, "")] {
+        refused!(
+            refused(&[file("x.toml", format!("format = {format}\n{rest}{INLINE}"))]),
+            RigError::Format { limit: 1, .. },
+            format!("x.toml: `format` is {format}, expected 1, the format that this version of squealcast reads")
+        );
+    }
+    let (error, text) = inline("name =", "format = \"1\"\nname =");
+    assert!(matches!(error, RigError::Syntax { line: 1, .. }), "{text}");
+}
+
+#[test]
 fn bad_files_of_kind_1() {
     Rig::from_files(&[file("x.toml", INLINE)]).unwrap();
     let missing = Rig::load("nowhere/rig.toml").map(|_| ()).unwrap_err().to_string();

@@ -11,7 +11,7 @@ use std::{
 use crossbeam_channel::{Receiver, RecvTimeoutError};
 use mcap::records::Metadata;
 
-use super::{Command, METADATA_NAME, RecorderConfig, RecorderError, Shared, State, chain, make_directory};
+use super::{Command, FORMAT, METADATA_NAME, RecorderConfig, RecorderError, Shared, State, chain, make_directory};
 use crate::msgs::{event_kind, schema::Topic};
 use crate::recording::bag::{self, FileSummary};
 use crate::recording::mcap_file::{RecordingFile, Whereabouts, WriteError};
@@ -345,6 +345,7 @@ impl Worker {
         let now = jiff::Timestamp::now();
         let now_ns = u64::try_from(now.as_nanosecond()).unwrap_or(0);
         let entries = [
+            ("format", FORMAT.to_string()),
             ("session_id", self.config.session_id.clone()),
             ("squealcast_version", env!("CARGO_PKG_VERSION").to_owned()),
             ("rig_name", self.config.rig_name.clone()),
