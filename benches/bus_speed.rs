@@ -14,10 +14,11 @@ use crossbeam_channel::{Receiver, unbounded};
 use squealcast::bus::shm::{ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource};
 use squealcast::bus::{Received, ShmConnection, Sink};
 use squealcast::msgs::{OperatingPoint, Prediction};
-use squealcast::node::{Incoming, Inlet, Node, Outputs, Watch, session_chart};
+use squealcast::node::{Incoming, Inlet, Node, Outputs, Watch};
 use squealcast::physics::{Chart, ContactLaw};
 use squealcast::proof::synthetic::{Synthetic, rig};
 use squealcast::rig::Rig;
+use squealcast::session::computed::session_chart;
 use squealcast::session::settings::Settings;
 use squealcast::system::clock;
 

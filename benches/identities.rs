@@ -4,11 +4,11 @@
 
 use std::time::{Duration, Instant};
 
-use squealcast::node::session_chart;
 use squealcast::physics::{Chart, ContactLaw, MapOptions};
 use squealcast::proof::identities::{Agreement, compare};
 use squealcast::proof::synthetic::{Synthetic, rig};
 use squealcast::rig::{EMBEDDED, Rig};
+use squealcast::session::computed::session_chart;
 use squealcast::session::{chart_options, map_options};
 
 const CONDITIONS: usize = 1000;

@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use squealcast::msgs::shm::{Form, PredictionForm};
 use squealcast::msgs::{self, Header, OperatingPoint, Time};
-use squealcast::node::session_chart;
 use squealcast::physics::{ContactLaw, Solver};
 use squealcast::proof::synthetic::{Synthetic, rig};
 use squealcast::rig::Rig;
+use squealcast::session::computed::session_chart;
 use squealcast::session::settings::Settings;
 use squealcast::session::{Event, Session, map_options};
 

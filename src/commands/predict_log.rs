@@ -10,12 +10,13 @@ use super::{Outcome, print};
 use crate::files::chart_file::ChartFile;
 use crate::import::{operating_point, read_log};
 use crate::msgs::schema::Topic;
-use crate::node::{kept_chart, session_chart};
+use crate::node::kept_chart;
 use crate::offline::{self, Measured, Predicted, Quantity};
 use crate::physics::Chart;
 use crate::recording::message::Payload;
 use crate::recording::reader::{Recorded, is_recording};
 use crate::rig::Rig;
+use crate::session::computed::session_chart;
 use crate::session::conditions;
 
 /// Predict recorded conditions as fast as possible, from recordings with operating points and from tribometer logs. For

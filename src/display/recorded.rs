@@ -13,11 +13,12 @@ use super::state::{Shown, State, spread, trend_per_s};
 use super::time_line::TimeLine;
 use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind, level};
 use crate::node::status::{Assessment, Inputs, Status};
-use crate::node::{Sample, VibrationSample, session_map};
+use crate::node::{Sample, VibrationSample};
 use crate::physics::{Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded as Content, Recording};
 use crate::rig::Rig;
+use crate::session::computed::session_map;
 use crate::session::conditions;
 use crate::simulator;
 

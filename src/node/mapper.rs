@@ -1,4 +1,4 @@
-//! Computes stability maps, window ends and sensitivities on a background thread.
+//! Computes stability maps, window ends and sensitivities on a background thread, and builds the chart on another.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -6,50 +6,18 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Sender, bounded};
-use sha2::{Digest, Sha256};
 
 use super::Incoming;
 use super::sensitivity::{self, Question};
 use crate::files::chart_file::ChartFile;
-use crate::physics::chart::build::{ChartOptions, build, resume};
+use crate::physics::chart::build::{ChartOptions, resume};
 use crate::physics::{Chart, Ends, OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
-use crate::session::{chart_options, map_options};
-use crate::text::hex::hex;
+use crate::session::chart_options;
+use crate::session::computed::{Request, compute, session_chart};
 
 /// Interval between saves of an unfinished chart.
 const SAVE_EVERY: Duration = Duration::from_secs(20);
-
-/// The stability map that a session uses at the load and speed of `point`.
-///
-/// # Errors
-/// Why it cannot be computed, as text.
-pub fn session_map(rig: &Rig, solver: &mut Solver, point: &OperatingPoint) -> Result<StabilityMap, String> {
-    StabilityMap::build(&rig.model, solver, point, &map_options(rig)).map_err(|error| error.to_string())
-}
-
-/// The window ends of `map` that a session uses at the load and speed of `point`; `None` if a new map is needed there.
-///
-/// # Errors
-/// Why they cannot be computed, as text.
-pub fn session_ends(
-    rig: &Rig,
-    solver: &mut Solver,
-    map: &StabilityMap,
-    point: &OperatingPoint,
-) -> Result<Option<Ends>, String> {
-    Ends::carried(&rig.model, solver, map, point).map_err(|error| error.to_string())
-}
-
-/// The chart that a session uses. It does not depend on the number of threads. The build stops when `go_on` returns
-/// false.
-///
-/// # Errors
-/// Why it cannot be built, as text.
-pub fn session_chart(rig: &Rig, threads: usize, go_on: &dyn Fn() -> bool) -> Result<Chart, String> {
-    let options = ChartOptions { threads, ..chart_options(rig) };
-    build(&rig.model, &options, &|_| go_on()).map_err(|error| error.to_string())
-}
 
 /// The chart that a session uses, loaded from the file `kept` or continued from an unfinished one there. The build
 /// stops when `go_on` returns false.
@@ -83,29 +51,6 @@ pub fn kept_chart(rig: &Rig, kept: &ChartFile, threads: usize, go_on: &dyn Fn() 
     Ok(chart)
 }
 
-/// SHA-256 of all numbers of a map that can affect predictions, hexadecimal.
-pub fn map_hash(map: &StabilityMap) -> String {
-    hash(map.words().into_iter())
-}
-
-/// SHA-256 of all numbers of window ends that can affect predictions, hexadecimal.
-pub fn ends_hash(ends: &Ends) -> String {
-    hash(ends.words())
-}
-
-/// SHA-256 of all numbers of a chart that can affect predictions, hexadecimal.
-pub fn chart_hash(chart: &Chart) -> String {
-    hash(chart.words().into_iter())
-}
-
-fn hash(words: impl Iterator<Item = u64>) -> String {
-    let mut hasher = Sha256::new();
-    for word in words {
-        hasher.update(word.to_le_bytes());
-    }
-    hex(&hasher.finalize())
-}
-
 /// Gives the calling thread the lowest priority. If the system does not allow it, the priority stays as it is.
 pub fn yield_to_predictions() {
     let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
@@ -134,9 +79,16 @@ const NICENESS: i32 = 10;
 /// A task for the background thread.
 #[derive(Clone, Debug)]
 enum Work {
-    Map(OperatingPoint),
-    Ends { map: Arc<StabilityMap>, point: OperatingPoint },
-    Sensitivity { question: Question, map: Option<Arc<StabilityMap>>, ends: Option<Ends> },
+    /// A request of the session, with the map in force when it was made.
+    Request {
+        request: Request,
+        map: Option<Arc<StabilityMap>>,
+    },
+    Sensitivity {
+        question: Question,
+        map: Option<Arc<StabilityMap>>,
+        ends: Option<Ends>,
+    },
 }
 
 /// Runs one task at a time: maps before ends before sensitivities, and of each kind the newest request.
@@ -157,16 +109,19 @@ impl Mapper {
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
             let mut solver = Solver::new(rig.model.dimension());
             for work in requests {
-                let computed = catch_unwind(AssertUnwindSafe(|| compute(&rig, &mut solver, &work)));
-                let answer = computed.unwrap_or_else(|_| {
-                    solver = Solver::new(rig.model.dimension());
-                    let reason = "internal error beside the predictions".to_owned();
-                    match work {
-                        Work::Map(point) => Incoming::Map { point, map: Err(reason) },
-                        Work::Ends { map, .. } => Incoming::Ends { map, ends: Err(reason) },
-                        Work::Sensitivity { .. } => Incoming::Sensitivity(Box::new(Err(reason))),
+                let answer = match work {
+                    Work::Request { request, map } => {
+                        let result =
+                            guarded(&rig, &mut solver, |solver| compute(&rig, solver, map.as_deref(), &request));
+                        Incoming::Computed { request, map, result }
                     }
-                });
+                    Work::Sensitivity { question, map, ends } => {
+                        let answer = |solver: &mut Solver| {
+                            sensitivity::answer(&rig, solver, &question, map.as_deref(), ends.as_ref())
+                        };
+                        Incoming::Sensitivity(Box::new(guarded(&rig, &mut solver, answer)))
+                    }
+                };
                 if done.send(answer).is_err() {
                     return;
                 }
@@ -176,7 +131,7 @@ impl Mapper {
     }
 
     /// Requests the map at the load and speed of `point`. While a task runs, only the newest request is kept.
-    pub fn want(&mut self, point: OperatingPoint) {
+    pub fn request_map(&mut self, point: OperatingPoint) {
         let same = |other: OperatingPoint| other.with_friction(0.0) == point.with_friction(0.0);
         if self.given_up.is_some_and(same) {
             return;
@@ -184,22 +139,27 @@ impl Mapper {
         if self.pending {
             self.next_map = Some(point);
         } else {
-            self.start(Work::Map(point));
+            self.start(Work::Request { request: Request::Map(point), map: None });
         }
     }
 
     /// Requests the window ends of `map` at the load and speed of `point`.
-    pub fn want_ends(&mut self, map: Arc<StabilityMap>, point: OperatingPoint) {
+    pub fn request_ends(&mut self, map: Arc<StabilityMap>, point: OperatingPoint) {
         if self.pending {
             self.next_ends = Some((map, point));
         } else {
-            self.start(Work::Ends { map, point });
+            self.start(Work::Request { request: Request::Ends(point), map: Some(map) });
         }
     }
 
     /// Requests sensitivities unless a task is running; returns whether it was accepted. Refused requests are not kept,
     /// since the next prediction does as well.
-    pub fn want_sensitivity(&mut self, question: Question, map: Option<Arc<StabilityMap>>, ends: Option<Ends>) -> bool {
+    pub fn request_sensitivity(
+        &mut self,
+        question: Question,
+        map: Option<Arc<StabilityMap>>,
+        ends: Option<Ends>,
+    ) -> bool {
         if !self.pending {
             self.start(Work::Sensitivity { question, map, ends });
             return true;
@@ -216,10 +176,10 @@ impl Mapper {
     pub fn done(&mut self, served: impl Fn(&OperatingPoint) -> bool) {
         self.pending = false;
         if let Some(point) = self.next_map.take().filter(|point| !served(point)) {
-            self.want(point);
+            self.request_map(point);
         }
         if let Some((map, point)) = self.next_ends.take() {
-            self.want_ends(map, point);
+            self.request_ends(map, point);
         }
     }
 
@@ -234,16 +194,14 @@ impl Mapper {
     }
 }
 
-fn compute(rig: &Rig, solver: &mut Solver, work: &Work) -> Incoming {
-    match work {
-        Work::Map(point) => Incoming::Map { point: *point, map: session_map(rig, solver, point).map(Arc::new) },
-        Work::Ends { map, point } => {
-            let ends = session_ends(rig, solver, map, point);
-            let ends = ends.map(|found| found.map(Arc::new).ok_or(*point));
-            Incoming::Ends { map: map.clone(), ends }
-        }
-        Work::Sensitivity { question, map, ends } => {
-            Incoming::Sensitivity(Box::new(sensitivity::answer(rig, solver, question, map.as_deref(), ends.as_ref())))
-        }
-    }
+/// The result of `task`. A task that panics is an error, and its solver is replaced.
+fn guarded<T>(
+    rig: &Rig,
+    solver: &mut Solver,
+    task: impl FnOnce(&mut Solver) -> Result<T, String>,
+) -> Result<T, String> {
+    catch_unwind(AssertUnwindSafe(|| task(solver))).unwrap_or_else(|_| {
+        *solver = Solver::new(rig.model.dimension());
+        Err("internal error in the background thread".to_owned())
+    })
 }

@@ -28,20 +28,19 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
 
 pub use inlet::Inlet;
-pub use mapper::{
-    chart_hash, ends_hash, kept_chart, map_hash, session_chart, session_ends, session_map, yield_to_predictions,
-};
+pub use mapper::{kept_chart, yield_to_predictions};
 pub use outputs::{NodeName, Outputs};
 pub use sensitivity::end_derivatives;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
 
 use crate::bus::{Bus, Received};
 use crate::files::chart_file::ChartFile;
-use crate::msgs::{self, Header, RigInfo, SessionEvent, Time, event_kind};
-use crate::physics::{Chart, Ends, OperatingPoint, StabilityMap};
+use crate::msgs::{self, Header, RigInfo, Time};
+use crate::physics::{Chart, OperatingPoint, StabilityMap};
 use crate::recording::message::Payload;
 use crate::rig::{Certificate, Rig};
-use crate::session::{Event, Session, Want, map_serves};
+use crate::session::computed::{Request, parameter_record, record_of};
+use crate::session::{Event, Session, map_serves};
 use crate::session::{conditions, settings::Settings};
 use crate::system::clock;
 use inlet::Running;
@@ -77,11 +76,10 @@ pub enum Incoming {
     Vibration(Received<msgs::Vibration>),
     /// A changed setting; its value is already validated.
     Parameter { name: String, value: f64 },
-    /// The requested stability map, or why it could not be computed.
-    Map { point: OperatingPoint, map: Result<Arc<StabilityMap>, String> },
-    /// The requested window ends of `map`. The inner error is a load and speed at which a new map is needed instead;
-    /// the outer one says why the computation failed.
-    Ends { map: Arc<StabilityMap>, ends: Result<Result<Arc<Ends>, OperatingPoint>, String> },
+    /// The result of a request of the session, as [`compute`] returns it, with the map in force when it was made.
+    ///
+    /// [`compute`]: crate::session::computed::compute
+    Computed { request: Request, map: Option<Arc<StabilityMap>>, result: Result<Option<Event>, String> },
     /// The requested sensitivities, or why they could not be computed.
     Sensitivity(Box<Result<msgs::Sensitivity, String>>),
     /// The chart of the rig, or why it could not be built.
@@ -210,8 +208,7 @@ impl Worker {
                 }
                 Some(Incoming::Vibration(received)) => self.vibration(received),
                 Some(Incoming::Parameter { name, value }) => self.parameter(name, value),
-                Some(Incoming::Map { point, map }) => self.map(point, map),
-                Some(Incoming::Ends { map, ends }) => self.ends(&map, ends),
+                Some(Incoming::Computed { request, map, result }) => self.computed(&request, map.as_ref(), result),
                 Some(Incoming::Sensitivity(found)) => self.sensitivity(*found),
                 Some(Incoming::Chart(chart)) => self.chart(chart),
             }
@@ -256,10 +253,10 @@ impl Worker {
         self.outputs.rig_info(rig_info(&self.rig));
         let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
         for (name, value) in settings {
-            self.note(parameter_event(now_header(), name, value));
+            self.outputs.session_event(parameter_record(now_header(), name, value));
         }
         self.watch.warn_margin(self.session.settings().warn_margin);
-        self.mapper.want(self.rig.reference);
+        self.mapper.request_map(self.rig.reference);
     }
 
     /// Appends an item to the backlog. Duplicates from the other bus are dropped here: once queued, a duplicate would
@@ -320,44 +317,46 @@ impl Worker {
     }
 
     fn parameter(&mut self, name: String, value: f64) {
-        self.note(parameter_event(now_header(), &name, value));
-        self.step(Event::Parameter { name, value }, None);
+        self.record_and_step(Event::Parameter { name, value }, now_header());
         self.watch.warn_margin(self.session.settings().warn_margin);
     }
 
-    fn map(&mut self, point: OperatingPoint, map: Result<Arc<StabilityMap>, String>) {
-        match map {
-            Ok(map) => {
+    /// Hands the result of a request to the session. `requested_of` is the map in force when it was made.
+    fn computed(
+        &mut self,
+        request: &Request,
+        requested_of: Option<&Arc<StabilityMap>>,
+        result: Result<Option<Event>, String>,
+    ) {
+        let (model, tolerance) = (&self.rig.model, self.session.settings().map_tolerance);
+        match &result {
+            Ok(Some(Event::MapReady(map))) => self.mapper.done(|wish| map_serves(model, map, wish, tolerance)),
+            Err(_) if matches!(request, Request::Map(_)) => {
+                self.mapper.give_up_on(*request.point());
+                self.mapper.done(|_| false);
+            }
+            Ok(_) | Err(_) => self.mapper.done(|_| false),
+        }
+        // Ends belong to their map: those of a map that is no longer in force are discarded.
+        let in_force = match (self.session.map(), requested_of) {
+            (Some(map), Some(of)) => Arc::ptr_eq(map, of),
+            (None, _) | (_, None) => false,
+        };
+        match (request, result) {
+            (_, Err(reason)) => self.statistics.map_failure = Some(reason),
+            (Request::Map(_), Ok(event)) => {
                 self.statistics.maps += 1;
                 self.statistics.map_failure = None;
-                self.note(at_load_and_speed(event_kind::STABILITY_MAP, &point, map_hash(&map)));
-                let tolerance = self.session.settings().map_tolerance;
-                self.mapper.done(|wish| map_serves(&self.rig.model, &map, wish, tolerance));
-                self.watch.map(&map);
-                self.step(Event::MapReady(map), None);
+                if let Some(event) = event {
+                    self.record_and_step(event, now_header());
+                }
             }
-            Err(reason) => {
-                self.mapper.give_up_on(point);
-                self.mapper.done(|_| false);
-                self.statistics.map_failure = Some(reason);
-            }
-        }
-    }
-
-    fn ends(&mut self, map: &Arc<StabilityMap>, ends: Result<Result<Arc<Ends>, OperatingPoint>, String>) {
-        self.mapper.done(|_| false);
-        // Ends belong to their map: discard those of a map that is no longer in force.
-        let in_force = self.session.map().is_some_and(|other| Arc::ptr_eq(other, map));
-        match ends {
-            Ok(Ok(ends)) if in_force => {
+            (Request::Ends(_), Ok(Some(event))) if in_force => {
                 self.statistics.ends += 1;
-                self.note(at_load_and_speed(event_kind::WINDOW_ENDS, &ends.point, ends_hash(&ends)));
-                self.watch.ends(&ends);
-                self.step(Event::EndsReady(ends), None);
+                self.record_and_step(event, now_header());
             }
-            Ok(Err(point)) if in_force => self.mapper.want(point),
-            Ok(_) => {}
-            Err(reason) => self.statistics.map_failure = Some(reason),
+            (Request::Ends(point), Ok(None)) if in_force => self.mapper.request_map(*point),
+            (Request::Ends(_), Ok(_)) => {}
         }
     }
 
@@ -376,7 +375,7 @@ impl Worker {
         let question = Question::new(prediction, point);
         let map = self.session.numbering_at(&point).cloned();
         let ends = self.session.map_at(&point).and_then(|_| self.session.ends().cloned());
-        if !self.mapper.want_sensitivity(question, map, ends) {
+        if !self.mapper.request_sensitivity(question, map, ends) {
             self.next_sensitivity = now; // busy: the next prediction will do as well
         }
     }
@@ -396,9 +395,7 @@ impl Worker {
         match chart {
             Ok(chart) => {
                 self.statistics.charted(&chart);
-                let hash = chart_hash(&chart);
-                self.note(SessionEvent { header: now_header(), kind: event_kind::CHART, hash, ..Default::default() });
-                self.step(Event::ChartReady(chart), None);
+                self.record_and_step(Event::ChartReady(chart), now_header());
             }
             Err(reason) => self.statistics.chart_failure = Some(reason),
         }
@@ -412,17 +409,23 @@ impl Worker {
 
     fn silence(&mut self) {
         self.silent = true;
-        let header = now_header();
-        let stamp = header.stamp;
-        self.note(SessionEvent { header, kind: event_kind::SILENCE, ..Default::default() });
         self.watch.silence();
         self.statistics.silence();
-        self.step(Event::Silence { stamp }, None);
+        let header = now_header();
+        self.record_and_step(Event::Silence { stamp: header.stamp }, header);
     }
 
-    /// Records and publishes a session event, before the session gets it.
-    fn note(&mut self, event: SessionEvent) {
-        self.outputs.session_event(event);
+    /// Records and publishes an event that is not an input, shows it, then hands it to the session.
+    fn record_and_step(&mut self, event: Event, header: Header) {
+        if let Some(record) = record_of(&event, header) {
+            self.outputs.session_event(record);
+        }
+        match &event {
+            Event::MapReady(map) => self.watch.map(map),
+            Event::EndsReady(ends) => self.watch.ends(ends),
+            Event::Input(_) | Event::Parameter { .. } | Event::Silence { .. } | Event::ChartReady(_) => {}
+        }
+        self.step(event, None);
     }
 
     /// Feeds an event to the session; `input` is the received message if the event is one. The prediction is published
@@ -440,11 +443,11 @@ impl Worker {
                     self.outputs.record_prediction(prediction);
                     self.watch.prediction(prediction);
                 }
-                match effects.want {
-                    Some(Want::Map(point)) => self.mapper.want(point),
-                    Some(Want::Ends(point)) => {
+                match effects.request {
+                    Some(Request::Map(point)) => self.mapper.request_map(point),
+                    Some(Request::Ends(point)) => {
                         if let Some(map) = self.session.map() {
-                            self.mapper.want_ends(map.clone(), point);
+                            self.mapper.request_ends(map.clone(), point);
                         }
                     }
                     None => {}
@@ -506,18 +509,6 @@ fn now_header() -> Header {
     Header { stamp: Time::from_ns(clock::now_ns()), frame_id: String::new() }
 }
 
-/// The session event for a result computed at a load and speed.
-pub fn at_load_and_speed(kind: u8, point: &OperatingPoint, hash: String) -> SessionEvent {
-    let OperatingPoint { normal_load_n, disc_speed_rad_s, .. } = *point;
-    SessionEvent { header: now_header(), kind, normal_load_n, disc_speed_rad_s, hash, ..Default::default() }
-}
-
-/// The session event for a changed setting.
-pub fn parameter_event(header: Header, name: &str, value: f64) -> SessionEvent {
-    let name = name.to_owned();
-    SessionEvent { header, kind: event_kind::PARAMETER, name, value, ..Default::default() }
-}
-
 /// Recent stamps and sequence numbers, each with the bus that delivered it first.
 struct Remembered {
     count: usize,
@@ -554,6 +545,7 @@ impl Remembered {
 mod tests {
     use super::status::Status;
     use super::*;
+    use crate::session::computed::{session_chart, session_map};
 
     #[test]
     fn a_bus_may_repeat_itself_but_not_another() {
@@ -610,17 +602,18 @@ mod tests {
     #[test]
     fn window_ends_of_a_replaced_map_are_discarded() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let (sender, _receiver) = channel();
-        let settings = Settings::for_rig(&rig);
-        let mut node = Node::new(rig.clone(), settings, Outputs::default(), sender, Watch::default());
+        let (mut node, _inlet) = Node::new(rig.clone(), Settings::for_rig(&rig), Watch::default());
+        let worker = &mut node.worker;
         let mut solver = crate::physics::Solver::new(rig.model.dimension());
         let mut map = || Arc::new(session_map(&rig, &mut solver, &rig.reference).expect("mapped"));
         let (former, present) = (map(), map());
-        node.map(rig.reference, Ok(former.clone()));
-        node.map(rig.reference, Ok(present.clone()));
+        for map in [&former, &present] {
+            worker.computed(&Request::Map(rig.reference), None, Ok(Some(Event::MapReady(map.clone()))));
+        }
         for (of, taken) in [(&former, 0), (&present, 1)] {
-            node.ends(of, Ok(Ok(Arc::new(of.ends.clone()))));
-            assert_eq!(node.statistics.ends, taken);
+            let ends = Event::EndsReady(Arc::new(of.ends.clone()));
+            worker.computed(&Request::Ends(rig.reference), Some(of), Ok(Some(ends)));
+            assert_eq!(worker.statistics.ends, taken);
         }
     }
 

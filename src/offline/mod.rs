@@ -10,15 +10,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::msgs::{Header, OperatingPoint, SessionEvent, Time, Vibration, event_kind};
-use crate::node::{
-    at_load_and_speed, chart_hash, ends_hash, map_hash, parameter_event, rig_info, session_ends, session_map,
-};
+use crate::msgs::{Header, OperatingPoint, Time, Vibration};
+use crate::node::rig_info;
 use crate::physics::{self, Chart, Solver};
 use crate::recording::message::{Message, Payload};
 use crate::recording::recorder::{Recorder, RecorderConfig, RecorderError};
 use crate::rig::Rig;
-use crate::session::{Event, Session, Want};
+use crate::session::computed::{Request, compute, parameter_record, record_of};
+use crate::session::{Event, Session};
 use crate::session::{conditions, settings::Settings};
 use ahead::Ahead;
 
@@ -157,23 +156,24 @@ impl Offline {
         self.recorder.record(Message { log_time_ns, publish_time_ns, payload });
     }
 
-    /// Records a session event, then passes it to the session.
-    fn event(&mut self, stamp: Time, log_time_ns: u64, record: SessionEvent, event: Event) {
-        let header = Header { stamp, ..Default::default() };
-        self.write(log_time_ns, log_time_ns, Payload::SessionEvent(SessionEvent { header, ..record }));
+    /// Records an event that is not an input, then hands it to the session.
+    fn event(&mut self, stamp: Time, log_time_ns: u64, event: Event) {
+        if let Some(record) = record_of(&event, Header { stamp, ..Default::default() }) {
+            self.write(log_time_ns, log_time_ns, Payload::SessionEvent(record));
+        }
         self.step(log_time_ns, event);
     }
 
     /// One step of the session. Records its prediction and returns the computation it requests.
-    fn step(&mut self, log_time_ns: u64, event: Event) -> Option<Want> {
+    fn step(&mut self, log_time_ns: u64, event: Event) -> Option<Request> {
         // Settings are those of the rig and no event changes them, so the session refuses nothing.
         let effects = self.session.step(event).unwrap_or_default();
-        let (prediction, want) = (effects.publish.cloned(), effects.want);
+        let (prediction, request) = (effects.publish.cloned(), effects.request);
         if let Some(prediction) = prediction {
             self.levels[usize::from(prediction.level).min(3)] += 1;
             self.write(log_time_ns, log_time_ns, Payload::Prediction(prediction));
         }
-        want
+        request
     }
 
     /// Records the initial state of the session: rig, settings and chart.
@@ -182,12 +182,11 @@ impl Offline {
         let header = Header { stamp, ..Default::default() };
         let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
         for (name, value) in settings {
-            let event = parameter_event(header.clone(), name, value);
+            let event = parameter_record(header.clone(), name, value);
             self.write(log_time_ns, log_time_ns, Payload::SessionEvent(event));
         }
         if let Some(chart) = chart {
-            let record = SessionEvent { kind: event_kind::CHART, hash: chart_hash(&chart), ..Default::default() };
-            self.event(stamp, log_time_ns, record, Event::ChartReady(chart));
+            self.event(stamp, log_time_ns, Event::ChartReady(chart));
         }
     }
 
@@ -200,8 +199,7 @@ impl Offline {
         {
             let silent = Time::from_ns(last.as_ns() + timeout_ns);
             let log_ns = last_log_ns.saturating_add(timeout_ns.unsigned_abs()).min(log_time_ns);
-            let record = SessionEvent { kind: event_kind::SILENCE, ..Default::default() };
-            self.event(silent, log_ns, record, Event::Silence { stamp: silent });
+            self.event(silent, log_ns, Event::Silence { stamp: silent });
         }
         self.last = Some((stamp, log_time_ns));
     }
@@ -210,7 +208,7 @@ impl Offline {
     fn prepare(&mut self, input: &OperatingPoint, log_time_ns: u64) {
         let point = conditions(input);
         if self.session.lacks_map(&point) {
-            self.map(input.header.stamp, log_time_ns, &point);
+            self.compute(input.header.stamp, log_time_ns, Request::Map(point));
         }
     }
 
@@ -218,39 +216,28 @@ impl Offline {
         self.inputs += 1;
         let stamp = input.header.stamp;
         self.write(log_time_ns, publish_time_ns, Payload::OperatingPoint(input.clone()));
-        match self.step(log_time_ns, Event::Input(input)) {
-            None => {}
-            Some(Want::Map(point)) => self.map(stamp, log_time_ns, &point),
-            Some(Want::Ends(point)) => self.ends(stamp, log_time_ns, &point),
+        if let Some(request) = self.step(log_time_ns, Event::Input(input)) {
+            self.compute(stamp, log_time_ns, request);
         }
     }
 
-    fn map(&mut self, stamp: Time, log_time_ns: u64, point: &physics::OperatingPoint) {
-        let place = point.with_friction(0.0);
-        if self.given_up == Some(place) {
+    /// Computes what the session requested, records it and hands it to the session.
+    fn compute(&mut self, stamp: Time, log_time_ns: u64, request: Request) {
+        let place = request.point().with_friction(0.0);
+        let is_map = matches!(request, Request::Map(_));
+        if is_map && self.given_up == Some(place) {
             return;
         }
-        match session_map(&self.rig, &mut self.solver, point) {
-            Ok(map) => {
-                let record = at_load_and_speed(event_kind::STABILITY_MAP, point, map_hash(&map));
-                self.event(stamp, log_time_ns, record, Event::MapReady(Arc::new(map)));
-            }
+        let map = self.session.map().cloned();
+        match compute(&self.rig, &mut self.solver, map.as_deref(), &request) {
+            Ok(Some(event)) => self.event(stamp, log_time_ns, event),
+            Ok(None) => self.compute(stamp, log_time_ns, Request::Map(*request.point())),
             Err(reason) => {
-                self.given_up = Some(place);
+                if is_map {
+                    self.given_up = Some(place);
+                }
                 self.map_failure.get_or_insert(reason);
             }
-        }
-    }
-
-    fn ends(&mut self, stamp: Time, log_time_ns: u64, point: &physics::OperatingPoint) {
-        let Some(map) = self.session.map().cloned() else { return };
-        match session_ends(&self.rig, &mut self.solver, &map, point) {
-            Ok(Some(ends)) => {
-                let record = at_load_and_speed(event_kind::WINDOW_ENDS, point, ends_hash(&ends));
-                self.event(stamp, log_time_ns, record, Event::EndsReady(Arc::new(ends)));
-            }
-            Ok(None) => self.map(stamp, log_time_ns, point),
-            Err(reason) => drop(self.map_failure.get_or_insert(reason)),
         }
     }
 

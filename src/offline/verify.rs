@@ -13,11 +13,11 @@ use bytes::Bytes;
 use super::ahead::Ahead;
 use crate::files::chart_file::ChartFile;
 use crate::msgs::{self, Prediction, SessionEvent, Time, event_kind};
-use crate::node::{chart_hash, ends_hash, map_hash, session_chart, session_ends, session_map};
-use crate::physics::{OperatingPoint, Solver, StabilityMap};
+use crate::physics::{Chart, OperatingPoint, Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded, Recording};
 use crate::rig::Rig;
+use crate::session::computed::{Request, chart_hash, compute, record_of, session_chart};
 use crate::session::{Event, Session};
 use crate::session::{conditions, settings::Settings};
 
@@ -172,62 +172,52 @@ impl NewEvents {
 
 /// Converts a recorded session event. Maps, ends and charts are recomputed and their hashes compared.
 fn session_event(
-    event: SessionEvent,
+    recorded: SessionEvent,
     rig: &Rig,
     charts: Charts,
     map: Option<&StabilityMap>,
     solver: &mut Solver,
     found: &mut Verification,
 ) -> Result<Event, VerifyError> {
-    match event.kind {
-        event_kind::PARAMETER => Ok(Event::Parameter { name: event.name, value: event.value }),
-        event_kind::SILENCE => Ok(Event::Silence { stamp: event.header.stamp }),
+    let SessionEvent { normal_load_n, disc_speed_rad_s, .. } = recorded;
+    let point = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient: 0.0 };
+    let failed = |reason: String| VerifyError::Map { normal_load_n, disc_speed_rad_s, reason };
+    let mut computed = |request: Request| {
+        let event = compute(rig, solver, map, &request).map_err(failed)?;
+        event.ok_or_else(|| failed("the ends of its windows are not found again".to_owned()))
+    };
+    let (event, what) = match recorded.kind {
+        event_kind::PARAMETER => return Ok(Event::Parameter { name: recorded.name, value: recorded.value }),
+        event_kind::SILENCE => return Ok(Event::Silence { stamp: recorded.header.stamp }),
         event_kind::STABILITY_MAP => {
-            let SessionEvent { normal_load_n, disc_speed_rad_s, hash, .. } = event;
-            let point = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient: 0.0 };
-            let map = session_map(rig, solver, &point).map_err(|reason| VerifyError::Map {
-                normal_load_n,
-                disc_speed_rad_s,
-                reason,
-            })?;
-            if map_hash(&map) != hash {
-                found.different_maps += 1;
-                found.describe(|| format!("stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s differs"));
-            }
-            Ok(Event::MapReady(Arc::new(map)))
+            (computed(Request::Map(point))?, format!("stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s"))
         }
         event_kind::WINDOW_ENDS => {
-            let SessionEvent { normal_load_n, disc_speed_rad_s, hash, .. } = event;
-            let point = OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient: 0.0 };
-            let failed = |reason: String| VerifyError::Map { normal_load_n, disc_speed_rad_s, reason };
-            let map = map.ok_or_else(|| failed("ends of windows before any map".to_owned()))?;
-            let ends = session_ends(rig, solver, map, &point).map_err(failed)?;
-            let ends = ends.ok_or_else(|| failed("the ends of its windows are not found again".to_owned()))?;
-            if ends_hash(&ends) != hash {
-                found.different_maps += 1;
-                found.describe(|| format!("ends of windows at {normal_load_n} N, {disc_speed_rad_s} rad/s differ"));
-            }
-            Ok(Event::EndsReady(Arc::new(ends)))
+            (computed(Request::Ends(point))?, format!("window ends at {normal_load_n} N, {disc_speed_rad_s} rad/s"))
         }
-        event_kind::CHART => {
-            let kept = match charts {
-                Charts::Kept => ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash),
-                Charts::Anew => None,
-            };
-            let kept = kept.and_then(|file| file.load().ok().flatten());
-            // A chart with the recorded hash is bit-identical to the recorded one, whoever built it.
-            let chart = match kept.filter(|chart| chart.is_complete() && chart_hash(chart) == event.hash) {
-                Some(chart) => chart,
-                None => session_chart(rig, std::thread::available_parallelism().map_or(1, usize::from), &|| true)
-                    .map_err(VerifyError::Chart)?,
-            };
-            if chart_hash(&chart) != event.hash {
-                found.different_maps += 1;
-                found.describe(|| "chart differs".to_owned());
-            }
-            Ok(Event::ChartReady(Arc::new(chart)))
-        }
-        kind => Err(VerifyError::EventKind { kind }),
+        event_kind::CHART => (Event::ChartReady(Arc::new(chart(rig, charts, &recorded.hash)?)), "chart".to_owned()),
+        kind => return Err(VerifyError::EventKind { kind }),
+    };
+    let again = record_of(&event, recorded.header).map(|record| record.hash);
+    if again != Some(recorded.hash) {
+        found.different_maps += 1;
+        found.describe(|| format!("{what}: other numbers than recorded"));
+    }
+    Ok(event)
+}
+
+/// The chart of `rig`: the kept one if it has the recorded hash, for it is then identical to the recorded one, whoever
+/// built it; otherwise a new one.
+fn chart(rig: &Rig, charts: Charts, recorded_hash: &str) -> Result<Chart, VerifyError> {
+    let kept = match charts {
+        Charts::Kept => ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash),
+        Charts::Anew => None,
+    };
+    let kept = kept.and_then(|file| file.load().ok().flatten());
+    match kept.filter(|chart| chart.is_complete() && chart_hash(chart) == recorded_hash) {
+        Some(chart) => Ok(chart),
+        None => session_chart(rig, std::thread::available_parallelism().map_or(1, usize::from), &|| true)
+            .map_err(VerifyError::Chart),
     }
 }
 

@@ -3,6 +3,7 @@
 //! A node and a replay drive the same step. The session reads no clock: time comes from the stamps of its events. A
 //! prediction depends only on the rig, the settings and the events so far.
 
+pub mod computed;
 pub mod settings;
 
 use std::fmt::Write;
@@ -18,6 +19,7 @@ use crate::physics::{
 };
 use crate::rig::Rig;
 use crate::text::number::Significant;
+use computed::Request;
 use settings::{SettingError, Settings};
 
 /// The operating point of an input, as the physics uses it.
@@ -52,16 +54,7 @@ pub struct Effects<'a> {
     /// The prediction to publish and record, if the step made one.
     pub publish: Option<&'a Prediction>,
     /// What to compute in the background, if later predictions would use it.
-    pub want: Option<Want>,
-}
-
-/// A result that later predictions would use and the session does not compute itself.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Want {
-    /// A stability map at this load and speed.
-    Map(OperatingPoint),
-    /// The window ends of the map in force, at this load and speed.
-    Ends(OperatingPoint),
+    pub request: Option<Request>,
 }
 
 /// Number of predictions by route, and the work they avoided.
@@ -269,8 +262,8 @@ impl Session {
     pub fn step(&mut self, event: Event) -> Result<Effects<'_>, SettingError> {
         match event {
             Event::Input(input) => {
-                let want = self.input(input);
-                return Ok(Effects { publish: Some(&self.prediction), want });
+                let request = self.input(input);
+                return Ok(Effects { publish: Some(&self.prediction), request });
             }
             Event::Silence { stamp } => {
                 let timeout_s = self.settings.silence_timeout_s;
@@ -279,7 +272,7 @@ impl Session {
                     self.last_seq,
                     format_args!("stale: no input for {timeout_s} s"),
                 );
-                return Ok(Effects { publish: Some(&self.prediction), want: None });
+                return Ok(Effects { publish: Some(&self.prediction), request: None });
             }
             Event::Parameter { name, value } => self.settings.set(&name, value)?,
             Event::MapReady(map) => (self.map, self.ends) = (Some(map), None),
@@ -292,7 +285,7 @@ impl Session {
     }
 
     /// Predicts for an input; returns what should be computed for later predictions.
-    fn input(&mut self, input: msgs::OperatingPoint) -> Option<Want> {
+    fn input(&mut self, input: msgs::OperatingPoint) -> Option<Request> {
         let point = conditions(&input);
         let (header, seq) = (input.header, input.seq);
         let nanosec = header.stamp.nanosec;
@@ -328,13 +321,13 @@ impl Session {
             return None;
         }
         match map.filter(|map| map_serves(&self.rig.model, map, &point, 0.5 * tolerance)) {
-            None => Some(Want::Map(point)),
-            Some(map) => self.want_ends(&map, &point, stamp),
+            None => Some(Request::Map(point)),
+            Some(map) => self.request_ends(&map, &point, stamp),
         }
     }
 
     /// Requests new window ends for `point` if those in force were computed elsewhere and are not accurate enough.
-    fn want_ends(&mut self, map: &StabilityMap, point: &OperatingPoint, stamp: Time) -> Option<Want> {
+    fn request_ends(&mut self, map: &StabilityMap, point: &OperatingPoint, stamp: Time) -> Option<Request> {
         let ends = self.ends.as_deref().unwrap_or(&map.ends);
         let moved = ends.point.with_friction(0.0) != point.with_friction(0.0);
         let lately = self.ends_asked.is_some_and(|asked| stamp.as_ns() - asked.as_ns() < ENDS_EVERY_NS);
@@ -346,7 +339,7 @@ impl Session {
             return None;
         }
         self.ends_asked = Some(stamp);
-        Some(Want::Ends(*point))
+        Some(Request::Ends(*point))
     }
 
     /// Predicts for `point` by chart or dense solve; `map` is the map valid there. The error is the reason of a FAULT.

@@ -40,12 +40,12 @@ fn with_map(mut session: Session) -> Session {
 fn margin_is_pending_until_the_map_is_there() {
     let mut session = session();
     let effects = session.step(friction(0, 0.3)).unwrap();
-    assert!(matches!(effects.want, Some(Want::Map(_))));
+    assert!(matches!(effects.request, Some(Request::Map(_))));
     let pending = predict(&mut session, friction(1, 0.31));
     assert!(pending.friction_margin.is_nan() && pending.reason == "margin pending");
     let mut session = with_map(session);
     let effects = session.step(friction(2, 0.3)).unwrap();
-    assert_eq!(effects.want, None, "the rig knows no load or speed");
+    assert_eq!(effects.request, None, "the rig knows no load or speed");
     let ready = predict(&mut session, friction(3, 0.2));
     assert!((ready.friction_margin - (0.35592805826058 - 0.2)).abs() < 1e-10 && ready.reason.is_empty());
     assert!((ready.critical_friction - 0.35592805826058).abs() < 1e-10);
@@ -59,7 +59,11 @@ fn a_map_holds_for_one_direction_of_rotation() {
     let back = predict(&mut session, conditions(1, 500.0, -13.0, 0.3));
     assert!(back.friction_margin.is_nan() && back.reason.ends_with("margin pending"), "{back:?}");
     let effects = session.step(conditions(2, 500.0, -13.0, 0.31)).unwrap();
-    assert!(matches!(effects.want, Some(Want::Map(point)) if point.disc_speed_rad_s == -13.0), "{:?}", effects.want);
+    assert!(
+        matches!(effects.request, Some(Request::Map(point)) if point.disc_speed_rad_s == -13.0),
+        "{:?}",
+        effects.request
+    );
 }
 
 #[test]
@@ -152,7 +156,7 @@ fn the_margin_follows_the_load_and_is_exact_where_it_rests() {
             let prediction = effects.publish.unwrap();
             let off = (prediction.critical_friction - truth).abs();
             assert!(off <= prediction.friction_margin_error + 1e-12, "{load} N: {off} {prediction:?}");
-            if let Some(Want::Ends(point)) = effects.want {
+            if let Some(Request::Ends(point)) = effects.request {
                 largest = largest.max(off);
                 assert!(asked.replace(point).is_none(), "{load} N: requested once");
                 let map = session.map().cloned().unwrap();
@@ -381,7 +385,7 @@ fn ends_are_asked_for_at_most_ten_times_a_second() {
     for seq in 0..350 {
         // Stamps 1 ms apart.
         let effects = session.step(conditions(seq, 500.5 + 1e-3 * seq as f64, 13.0, 0.1)).unwrap();
-        asked.extend(matches!(effects.want, Some(Want::Ends(_))).then_some(seq));
+        asked.extend(matches!(effects.request, Some(Request::Ends(_))).then_some(seq));
     }
     assert_eq!(asked, [0, 100, 200, 300]);
 }

@@ -150,6 +150,6 @@ static RIG: LazyLock<Rig> = LazyLock::new(|| Rig::load("nine-dof").expect("embed
 
 /// The seeds of `chart`.
 pub fn charts() -> Vec<Vec<u8>> {
-    let chart = squealcast::node::session_chart(&RIG, 1, &|| true).expect("a chart");
+    let chart = squealcast::session::computed::session_chart(&RIG, 1, &|| true).expect("a chart");
     vec![chart.words().into_iter().flat_map(u64::to_le_bytes).collect()]
 }

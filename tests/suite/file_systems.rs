@@ -18,11 +18,11 @@ use crate::records::*;
 use squealcast::files::chart_file::ChartFile;
 use squealcast::files::whole_file::{write_together, write_whole};
 use squealcast::import::{ImportOptions, import};
-use squealcast::node::{chart_hash, session_chart};
 use squealcast::recording::bag::{self, FileSummary};
 use squealcast::recording::recorder::{Recorder, State};
 use squealcast::recording::recover::recover;
 use squealcast::rig::Rig;
+use squealcast::session::computed::{chart_hash, session_chart};
 use tempfile::TempDir;
 
 fn now_ns() -> u64 {

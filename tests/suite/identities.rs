@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use squealcast::display::shape::shape;
 use squealcast::msgs::{Header, OperatingPoint, Prediction, Time};
-use squealcast::node::{session_chart, session_map};
 use squealcast::physics::{MapOptions, Solver};
 use squealcast::proof::identities::compare;
 use squealcast::rig::{EMBEDDED, Rig};
+use squealcast::session::computed::{session_chart, session_map};
 use squealcast::session::settings::Settings;
 use squealcast::session::{Event, Session, chart_options, map_options};
 

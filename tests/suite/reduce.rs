@@ -5,10 +5,10 @@ use std::path::Path;
 
 use crate::program::{self, command, files_below, run, text, write};
 use squealcast::full_model::FullModelFile;
-use squealcast::node::session_map;
 use squealcast::physics::{OperatingPoint, Solver, Vectors, WindowKind};
 use squealcast::reduction::{FullSolver, FullVectors, lowest_modes};
 use squealcast::rig::Rig;
+use squealcast::session::computed::session_map;
 
 /// The band that is judged, Hz.
 const BAND_HZ: f64 = 4000.0;
