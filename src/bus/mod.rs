@@ -16,34 +16,25 @@ pub use connection::{BusError, Connection, Outgoing, Report, Sink};
 pub use received::{Counts, Received};
 pub use shm_connection::ShmConnection;
 
-/// Defines the enum of buses with the list of all and their names.
-macro_rules! buses {
-    ($($(#[$doc:meta])* $bus:ident = $name:literal),+ $(,)?) => {
-        /// The bus over which a message was received.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-        pub enum Bus {
-            $($(#[$doc])* $bus),+
-        }
-
-        impl Bus {
-            /// All buses, in the order in which they are joined and published to.
-            pub const ALL: [Self; [$($name),+].len()] = [$(Self::$bus),+];
-
-            /// Its name in diagnostics.
-            pub fn name(self) -> &'static str {
-                match self {
-                    $(Self::$bus => $name),+
-                }
-            }
-        }
-    };
+listed! {
+    /// The bus over which a message was received. Buses are joined and published to in this order.
+    pub enum Bus {
+        /// Shared memory (iceoryx2). First, because its readers wait for a prediction.
+        Shm,
+        /// ROS 2.
+        Ros2,
+        /// No bus: the rig simulator of `demo`, in this process.
+        Simulator,
+    }
 }
 
-buses! {
-    /// Shared memory (iceoryx2). First, because its readers wait for a prediction.
-    Shm = "shm",
-    /// ROS 2.
-    Ros2 = "ros2",
-    /// No bus: the rig simulator of `demo`, in this process.
-    Simulator = "simulator",
+impl Bus {
+    /// Its name in diagnostics.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Shm => "shm",
+            Self::Ros2 => "ros2",
+            Self::Simulator => "simulator",
+        }
+    }
 }

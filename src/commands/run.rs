@@ -135,7 +135,8 @@ fn frame(rig: &Rig, inputs: Option<InputSources>, display: Option<&Server>, node
         instability_threshold: rig.instability_threshold,
         inputs,
         foot: Box::new(|snapshot| {
-            let Counters { solved, charted, reused, faults, .. } = snapshot.counters;
+            let Counters { solved, charted, reused, faults, zero_terms: _, decoupled_modes: _, roots_beyond_band: _ } =
+                snapshot.counters;
             let passed_over = snapshot.passed_over;
             let mut counts = vec![
                 format!("solved {solved}"),

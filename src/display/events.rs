@@ -96,30 +96,63 @@ impl EventMoment {
             critical_friction: known(sample.critical_friction),
         }
     }
+}
 
-    /// Names of the CSV columns, with units, in the order of [`EventMoment::cells`].
-    const COLUMNS: [&str; 8] = [
-        "utc",
-        "mode_id",
-        "frequency_hz",
-        "growth_rate_per_s",
-        "normal_load_n",
-        "disc_speed_rad_s",
-        "friction_coefficient",
-        "critical_friction",
-    ];
+listed! {
+    /// A column of the event lists for a moment of an event. The CSV file has all, in this order.
+    pub enum MomentColumn {
+        Time,
+        Mode,
+        Frequency,
+        GrowthRate,
+        NormalLoad,
+        DiscSpeed,
+        Friction,
+        CriticalFriction,
+    }
+}
 
-    fn cells(&self) -> [String; Self::COLUMNS.len()] {
-        [
-            iso(self.time_s),
-            cell(self.mode_id),
-            cell(self.frequency_hz),
-            cell(self.growth_rate_per_s),
-            cell(self.normal_load_n),
-            cell(self.disc_speed_rad_s),
-            cell(self.friction_coefficient),
-            cell(self.critical_friction),
-        ]
+impl MomentColumn {
+    /// Its name in the CSV file, with unit.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Time => "utc",
+            Self::Mode => "mode_id",
+            Self::Frequency => "frequency_hz",
+            Self::GrowthRate => "growth_rate_per_s",
+            Self::NormalLoad => "normal_load_n",
+            Self::DiscSpeed => "disc_speed_rad_s",
+            Self::Friction => "friction_coefficient",
+            Self::CriticalFriction => "critical_friction",
+        }
+    }
+
+    /// Its heading in a report; `None` if reports omit it.
+    pub fn heading(self) -> Option<&'static str> {
+        match self {
+            Self::Time => Some("after, s"),
+            Self::Mode => Some("mode"),
+            Self::Frequency => Some("frequency, Hz"),
+            Self::GrowthRate => Some("growth, 1/s"),
+            Self::NormalLoad => Some("load, N"),
+            Self::DiscSpeed => Some("speed, rad/s"),
+            Self::Friction => Some("μ"),
+            Self::CriticalFriction => None,
+        }
+    }
+
+    /// Its cell in the CSV file, empty if unknown.
+    fn cell(self, moment: &EventMoment) -> String {
+        match self {
+            Self::Time => iso(moment.time_s),
+            Self::Mode => cell(moment.mode_id),
+            Self::Frequency => cell(moment.frequency_hz),
+            Self::GrowthRate => cell(moment.growth_rate_per_s),
+            Self::NormalLoad => cell(moment.normal_load_n),
+            Self::DiscSpeed => cell(moment.disc_speed_rad_s),
+            Self::Friction => cell(moment.friction_coefficient),
+            Self::CriticalFriction => cell(moment.critical_friction),
+        }
     }
 }
 
@@ -213,13 +246,13 @@ impl Events {
                 .into();
         for when in ["onset", "peak"] {
             // The time of the onset already has a column.
-            let columns = EventMoment::COLUMNS.iter().skip(usize::from(when == "onset"));
-            header.extend(columns.map(|column| format!("{when}_{column}")));
+            let columns = MomentColumn::ALL.into_iter().skip(usize::from(when == "onset"));
+            header.extend(columns.map(|column| format!("{when}_{}", column.name())));
         }
         header.push("reason".to_owned());
         let mut text = header.join(",") + "\r\n";
         for event in &self.events {
-            let [onset_utc, onset @ ..] = event.onset.cells();
+            let [onset_utc, onset @ ..] = MomentColumn::ALL.map(|column| column.cell(&event.onset));
             let mut cells = vec![
                 event.number.to_string(),
                 event.kind.name().to_owned(),
@@ -230,7 +263,8 @@ impl Events {
                 event.input_seq.to_string(),
             ];
             cells.extend(onset);
-            cells.extend(event.peak.map_or_else(Default::default, |peak| peak.cells()));
+            let peak = |column: MomentColumn| event.peak.map_or_else(String::new, |peak| column.cell(&peak));
+            cells.extend(MomentColumn::ALL.map(peak));
             cells.push(event.reason.as_deref().map_or_else(String::new, quoted));
             text += &cells.join(",");
             text += "\r\n";

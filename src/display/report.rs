@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
-use super::events::{Event, EventKind, EventMoment, Events, iso, seconds};
+use super::events::{Event, EventKind, EventMoment, Events, MomentColumn, iso, seconds};
 use super::recorded::Recorded;
 use crate::figures::html::{escaped, facts, figure, page, section};
 use crate::figures::plot;
@@ -175,13 +175,13 @@ fn events(events: &Events, from_s: f64) -> String {
     if count == 0 {
         return "<p>None.</p>\n".to_owned();
     }
-    let of_moment =
-        "<th>mode</th><th>frequency, Hz</th><th>growth, 1/s</th><th>μ</th><th>load, N</th><th>speed, rad/s</th>";
+    let headings: Vec<&str> = MomentColumn::ALL.into_iter().filter_map(MomentColumn::heading).collect();
+    let (columns, of_moment) = (headings.len(), format!("<th>{}</th>", headings.join("</th><th>")));
     let mut html = format!(
         "<table><thead><tr><th rowspan=\"2\">no.</th><th rowspan=\"2\">event</th><th rowspan=\"2\">end, s</th>\
-         <th rowspan=\"2\">duration, s</th><th colspan=\"7\">onset</th><th colspan=\"7\">fastest growth</th>\
-         <th rowspan=\"2\">reason</th></tr>\n\
-         <tr><th>after, s</th>{of_moment}<th>after, s</th>{of_moment}</tr></thead><tbody>\n"
+         <th rowspan=\"2\">duration, s</th><th colspan=\"{columns}\">onset</th>\
+         <th colspan=\"{columns}\">fastest growth</th>\
+         <th rowspan=\"2\">reason</th></tr>\n<tr>{of_moment}{of_moment}</tr></thead><tbody>\n"
     );
     for event in events.iter().take(LISTED) {
         let cells = [
@@ -190,7 +190,7 @@ fn events(events: &Events, from_s: f64) -> String {
             event.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - from_s)),
             event.end_s.map_or_else(|| "–".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s)),
         ];
-        let peak = event.peak.map_or_else(|| vec!["–".to_owned(); 7], |peak| event_moment(&peak, from_s));
+        let peak = event.peak.map_or_else(|| vec!["–".to_owned(); columns], |peak| event_moment(&peak, from_s));
         let reason = event.reason.as_deref().map_or_else(|| "–".to_owned(), escaped);
         let cells = cells.into_iter().chain(event_moment(&event.onset, from_s)).chain(peak).chain([reason]);
         let cells: String = cells.map(|cell| format!("<td>{cell}</td>")).collect();
@@ -207,17 +207,19 @@ fn events(events: &Events, from_s: f64) -> String {
     html
 }
 
-/// Cells for a moment of an event: time, fastest growing mode and conditions.
+/// Cells for a moment of an event, one for every column with a heading.
 fn event_moment(moment: &EventMoment, from_s: f64) -> Vec<String> {
-    vec![
-        format!("{:.3}", moment.time_s - from_s),
-        moment.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
-        optional(moment.frequency_hz),
-        optional(moment.growth_rate_per_s),
-        optional(moment.friction_coefficient),
-        optional(moment.normal_load_n),
-        optional(moment.disc_speed_rad_s),
-    ]
+    let cell = |column: MomentColumn| match column {
+        MomentColumn::Time => format!("{:.3}", moment.time_s - from_s),
+        MomentColumn::Mode => moment.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
+        MomentColumn::Frequency => optional(moment.frequency_hz),
+        MomentColumn::GrowthRate => optional(moment.growth_rate_per_s),
+        MomentColumn::NormalLoad => optional(moment.normal_load_n),
+        MomentColumn::DiscSpeed => optional(moment.disc_speed_rad_s),
+        MomentColumn::Friction => optional(moment.friction_coefficient),
+        MomentColumn::CriticalFriction => optional(moment.critical_friction),
+    };
+    MomentColumn::ALL.into_iter().filter(|column| column.heading().is_some()).map(cell).collect()
 }
 
 /// The section on hits, misses and false alarms, with definitions.

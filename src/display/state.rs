@@ -77,9 +77,10 @@ pub struct CountersShown {
 }
 
 impl CountersShown {
-    pub fn new(counters: Counters, passed_over: u64, ros2_falls: u64) -> Self {
-        let Counters { solved, charted, reused, faults, .. } = counters;
-        Self { solved, charted, reused, faults, passed_over, ros2_falls }
+    pub fn new(counters: Counters, passed_over: u64, bus_restarts: u64) -> Self {
+        let Counters { solved, charted, reused, faults, zero_terms: _, decoupled_modes: _, roots_beyond_band: _ } =
+            counters;
+        Self { solved, charted, reused, faults, passed_over, ros2_falls: bus_restarts }
     }
 }
 

@@ -191,6 +191,7 @@ impl Statistics {
         encodings_skipped: u64,
         publish_failures: u64,
     ) -> Vec<KeyValue> {
+        let Counters { solved, charted, reused, faults, zero_terms, decoupled_modes, roots_beyond_band } = counters;
         self.times.sort_unstable();
         let quantile = |q: f64| {
             let index = (q * self.times.len().saturating_sub(1) as f64).round() as usize;
@@ -203,10 +204,10 @@ impl Statistics {
             pair("inputs_passed_over", self.passed_over),
             pair("inputs_lost", self.lost.load(Ordering::Relaxed)),
             pair("inputs_waiting", queued),
-            pair("predictions_solved", counters.solved),
-            pair("predictions_from_chart", counters.charted),
-            pair("predictions_reused", counters.reused),
-            pair("faults", counters.faults),
+            pair("predictions_solved", solved),
+            pair("predictions_from_chart", charted),
+            pair("predictions_reused", reused),
+            pair("faults", faults),
             pair("predictions_per_s", self.times.len()),
             pair("prediction_time_median_us", format!("{:.1}", quantile(0.5))),
             pair("prediction_time_p99_us", format!("{:.1}", quantile(0.99))),
@@ -215,9 +216,9 @@ impl Statistics {
             pair("sensitivities", self.sensitivities),
             pair("stability_map_pending", map_pending),
             // Work avoided. A charted prediction also avoids a dense solve with its vectors.
-            pair("skipped_zero_terms", counters.zero_terms),
-            pair("skipped_decoupled_modes", counters.decoupled_modes),
-            pair("skipped_roots_beyond_band", counters.roots_beyond_band),
+            pair("skipped_zero_terms", zero_terms),
+            pair("skipped_decoupled_modes", decoupled_modes),
+            pair("skipped_roots_beyond_band", roots_beyond_band),
             pair("skipped_encodings", encodings_skipped),
             pair("publish_failures", publish_failures),
         ]);
