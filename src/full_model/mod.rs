@@ -21,15 +21,12 @@ use crate::reduction::{
     FullContact, FullModel, FullPart, Kept, PartTurning, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
     Substructure, Wanted, keep_modes,
 };
-use crate::rig::raw::{RawPatch, RawSystem, RawTerm};
+use crate::rig::raw::{Common, RawPatch, RawSystem, RawTerm};
 use crate::rig::settings::Settings;
 use crate::rig::{Pair, RigError, patch, settings, system};
 
 use files::Files;
 use raw::{RawFullModel, RawPart};
-
-/// Tables that full models share with rig files.
-const COMMON: [&str; 8] = ["reference", "band", "search", "friction", "load", "limits", "warning", "chart"];
 
 /// A full model and everything its files contain.
 #[derive(Clone, Debug)]
@@ -96,11 +93,11 @@ impl FullModelFile {
     /// [`RigError`], naming file, field or line, value and limit.
     pub fn load(path: &Path) -> Result<Self, RigError> {
         let (mut files, bytes) = Files::open(path)?;
-        let (common, own) = crate::rig::raw::parse::<RawFullModel>(&files.toml, &bytes)?.split();
+        let own: RawFullModel = crate::rig::raw::parse(&files.toml, &bytes)?;
         let mut common_tables: toml::Table = crate::rig::raw::parse(&files.toml, &bytes)?;
         let contact_patches = common_tables.remove("contact_patch");
-        common_tables.retain(|key, _| COMMON.contains(&key));
-        let settings = settings::check(&files.toml, &common)?;
+        common_tables.retain(|key, _| Common::TABLES.contains(&key));
+        let settings = settings::check(&files.toml, &own.common())?;
         let toml = files.toml.clone();
         let refuse_beside_system = |field: &str| RigError::Kind {
             file: toml.clone(),
@@ -116,10 +113,10 @@ impl FullModelFile {
         let read = match (&own.system, &own.pad) {
             (Some(_), Some(_)) => return Err(refuse_beside_system("pad")),
             (Some(_), None) if own.disc.is_some() => return Err(refuse_beside_system("disc")),
-            (Some(_), None) if own.patches.is_some() => return Err(refuse_beside_system("contact_patch")),
+            (Some(_), None) if own.contact_patch.is_some() => return Err(refuse_beside_system("contact_patch")),
             (Some(system), None) => read_system(&mut files, system, &settings)?,
             (None, None) => return Err(missing("pad", "[pad] with stiffness and mass, or [system]")),
-            (None, Some(pad)) => match own.patches.as_deref() {
+            (None, Some(pad)) => match own.contact_patch.as_deref() {
                 None | Some([]) => return Err(missing("contact_patch", "at least one [[contact_patch]]")),
                 Some(patches) => read_parts(&mut files, pad, own.disc.as_ref(), patches, settings.contact_law)?,
             },
@@ -237,7 +234,7 @@ impl PartGeometry {
 }
 
 /// Field and file name of each matrix of pad and disc.
-fn matrix_files(raw: &raw::Own) -> Vec<(String, String)> {
+fn matrix_files(raw: &RawFullModel) -> Vec<(String, String)> {
     let parts = [("pad", &raw.pad), ("disc", &raw.disc)];
     let named = parts.into_iter().filter_map(|(name, part)| Some((name, part.as_ref()?)));
     named

@@ -263,7 +263,7 @@ impl Rig {
     fn build(rig_file: RigFile, read: &dyn Fn(&str) -> Result<Vec<u8>, String>, limit: &str) -> Result<Self, RigError> {
         let raw: raw::RawRig = raw::parse(&rig_file.name, &rig_file.bytes)?;
         let mut source = Source::new(rig_file, read, limit);
-        let settings = settings::check(&source.rig_file, &raw)?;
+        let settings = settings::check(&source.rig_file, &raw.common())?;
         let mut built = match settings::kind(&source.rig_file, &raw)? {
             settings::Kind::Inline { pad, disc, contacts } => {
                 inline::build(&source.rig_file, pad, disc, contacts, &settings)?

@@ -9,44 +9,85 @@ use crate::files::input_file;
 /// The format of rig files and full models that this program reads. A file without the key `format` has format 1.
 pub const FORMAT: i64 = 1;
 
-/// A whole rig file.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RawRig {
-    pub name: String,
-    #[serde(default = "first_format")]
-    pub format: i64,
-    #[serde(default)]
-    pub reference: RawReference,
-    #[serde(default)]
-    pub band: RawBand,
-    #[serde(default)]
-    pub search: RawSearch,
-    #[serde(default)]
-    pub friction: RawFriction,
-    #[serde(default)]
-    pub load: RawLoad,
-    #[serde(default)]
-    pub limits: RawLimits,
-    #[serde(default)]
-    pub warning: RawWarning,
-    #[serde(default)]
-    pub chart: RawChart,
-    pub pad: Option<RawSubstructure>,
-    pub disc: Option<RawSubstructure>,
-    pub contact: Option<Vec<RawContact>>,
-    pub contact_patch: Option<Vec<RawPatch>>,
-    pub system: Option<RawSystem>,
-    pub residual: Option<RawResidual>,
-    pub basis: Option<RawBasis>,
-    pub reduction: Option<Certificate>,
+/// Calls `$define` with the tables that rig files and full models share, each of which has defaults, then with the rest.
+macro_rules! with_common_tables {
+    ($define:ident! { $($rest:tt)* }) => {
+        $define! {
+            [
+                reference: RawReference,
+                band: RawBand,
+                search: RawSearch,
+                friction: RawFriction,
+                load: RawLoad,
+                limits: RawLimits,
+                warning: RawWarning,
+                chart: RawChart,
+            ]
+            $($rest)*
+        }
+    };
 }
+
+/// Declares the tables that rig files and full models share.
+macro_rules! define_common {
+    ([$($table:ident: $type:ident,)*]) => {
+        /// The tables that rig files and full models share.
+        #[derive(Clone, Debug)]
+        pub struct Common { $(pub $table: $type,)* }
+
+        impl Common {
+            /// Their names.
+            pub const TABLES: &[&str] = &[$(stringify!($table)),*];
+        }
+    };
+}
+
+/// Declares a file with the common tables and tables of its own.
+macro_rules! define_file {
+    ([$($table:ident: $type:ident,)*] $(#[$doc:meta])* $name:ident { $($own:ident: $own_type:ty,)* }) => {
+        $(#[$doc])*
+        #[derive(Debug, serde::Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct $name {
+            pub name: String,
+            /// Format of the file; [`crate::rig::raw::parse`] has checked it.
+            #[serde(default, rename = "format")]
+            _format: Option<i64>,
+            $(#[serde(default)] pub $table: $crate::rig::raw::$type,)*
+            $(pub $own: $own_type,)*
+        }
+
+        impl $name {
+            /// A copy of the common tables.
+            pub fn common(&self) -> $crate::rig::raw::Common {
+                $crate::rig::raw::Common { $($table: self.$table.clone(),)* }
+            }
+        }
+    };
+}
+
+pub(crate) use {define_file, with_common_tables};
+
+with_common_tables!(define_common! {});
+with_common_tables!(define_file! {
+    /// A whole rig file.
+    RawRig {
+        pad: Option<RawSubstructure>,
+        disc: Option<RawSubstructure>,
+        contact: Option<Vec<RawContact>>,
+        contact_patch: Option<Vec<RawPatch>>,
+        system: Option<RawSystem>,
+        residual: Option<RawResidual>,
+        basis: Option<RawBasis>,
+        reduction: Option<Certificate>,
+    }
+});
 
 /// Declares a table in which every key has a default.
 macro_rules! table_with_defaults {
     ($(#[$doc:meta])* $name:ident { $($field:ident: $type:ty = $default:expr,)* }) => {
         $(#[$doc])*
-        #[derive(Debug, Deserialize)]
+        #[derive(Clone, Debug, Deserialize)]
         #[serde(deny_unknown_fields, default)]
         pub struct $name { $(pub $field: $type,)* }
 
@@ -215,7 +256,7 @@ fn one() -> String {
 }
 
 /// The format of a file that does not say its own.
-pub fn first_format() -> i64 {
+fn first_format() -> i64 {
     1
 }
 

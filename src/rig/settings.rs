@@ -1,6 +1,6 @@
 //! The tables common to all kinds of rig, and how the kind of a rig is determined.
 
-use super::raw::{OneOrMany, RawContact, RawModes, RawPatch, RawRig, RawSubstructure, RawSystem};
+use super::raw::{Common, OneOrMany, RawContact, RawModes, RawPatch, RawRig, RawSubstructure, RawSystem};
 use super::{ChartRange, Limits, RigError, Warning};
 use crate::physics::{ContactLaw, OperatingPoint};
 use crate::reduction::ModeSelection;
@@ -69,7 +69,7 @@ pub fn at_most(file: &str, field: &str, count: usize, limit: usize) -> Result<()
 ///
 /// # Errors
 /// [`RigError::NotFinite`], [`RigError::Range`].
-pub fn check(file: &str, raw: &RawRig) -> Result<Settings, RigError> {
+pub fn check(file: &str, raw: &Common) -> Result<Settings, RigError> {
     let number = |field: &str, value: f64| finite(file, field, value);
     let positive = |field: &str, value: f64| within(file, field, value, value > 0.0, "more than 0");
     let not_negative = |field: &str, value: f64| within(file, field, value, value >= 0.0, "at least 0");
