@@ -40,10 +40,10 @@ fn triplet((row, column, value): (usize, usize, f64)) -> Triplet<usize, usize, f
 
 fn main() -> Result<(), Box<dyn Error>> {
     // Each contact pair is a linear form of the displacements: the row of the pad minus the row of the disc.
-    let row = |pad: usize, disc: usize| vec![(pad, 1.0), (300 + disc, -1.0)];
-    let contact_law = ContactLaw { exponent: 0.5, ..ContactLaw::default() };
+    let row = |pad: usize, disc: usize| vec![(pad, 1.0), (40 + disc, -1.0)];
+    let contact_law = ContactLaw { exponent: 0.5, reference_n: 500.0, slope_s_per_m: -0.01, lateral_damping: true };
     let full = FullModel {
-        parts: vec![chain("pad", 300, 4e6)?, chain("disc", 260, 5e6)?],
+        parts: vec![chain("pad", 40, 4e6)?, chain("disc", 35, 5e6)?],
         stiffness: vec![],
         damping: vec![],
         contact: Some(FullContact {
@@ -57,19 +57,19 @@ fn main() -> Result<(), Box<dyn Error>> {
         contact_law,
     };
 
-    let band_rad_s = 200.0;
+    let band_rad_s = 900.0;
     let request = ParametricRequest {
         range: OperatingBox {
-            friction_coefficient: [0.0, 0.8],
-            normal_load_n: [200.0, 800.0],
-            disc_speed_rad_s: [10.0, 10.0],
+            friction_coefficient: [0.0, 1.0],
+            normal_load_n: [100.0, 1000.0],
+            disc_speed_rad_s: [5.0, 20.0],
         },
         counted: Counted { band_rad_s, growth_floor_per_s: -20.0 },
         tolerance: 1e-6,
         training: 10,
         held_out: 4,
         most_samples: 20,
-        most_vectors: 200,
+        most_vectors: 70,
     };
     let mut full_solver = FullSolver::new("chains", &full, None, &mut |_| {})?;
     let basis = parametric_basis(&full, &mut full_solver, &request, &mut |_| {})?;
