@@ -1,4 +1,4 @@
-//! What every bus does for the program: publish messages, count their readers, report problems, deliver inputs.
+//! The operations of a bus: publish messages, count their readers, report problems, deliver inputs.
 
 use thiserror::Error;
 

@@ -206,7 +206,7 @@ impl<F: Form> ShmReader<F> {
         Self::spawn_with_backlog(options, move |received, _| sink(received))
     }
 
-    /// As [`ShmReader::spawn`]; `sink` is also told whether more samples are waiting. A sink that takes long for a
+    /// As [`ShmReader::spawn`]; `sink` also receives whether more samples are waiting. A sink that takes long for a
     /// message should only do so when none is waiting, or the oldest samples are lost.
     ///
     /// # Errors

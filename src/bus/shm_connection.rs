@@ -98,7 +98,7 @@ impl Connection for ShmConnection {
     }
 
     /// The counts of its receiver, and a warning if other nodes publish predictions on the same service: readers cannot
-    /// tell them apart.
+    /// distinguish them.
     fn report(&mut self) -> Report {
         let others = self.predictions.as_ref().map_or(0, ShmOutput::other_writers);
         let service = self.predictions.as_ref().map_or("", ShmOutput::service);

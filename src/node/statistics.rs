@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_bus_missed_or_could_not_read_is_a_loss() {
+    fn missed_and_malformed_messages_of_a_bus_are_losses() {
         let lost = |missed, malformed, failures| Lost {
             buses: vec![("ros2", Counts { received: 9, missed, malformed, failures, incompatible: 0, rivals: 0 })],
             ..Lost::default()

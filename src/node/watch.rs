@@ -316,7 +316,7 @@ mod tests {
         let watch = Watch::default();
         let mut samples = vec![];
         watch.prediction(&prediction(&[], 0));
-        assert_eq!((watch.take_samples(&mut samples), samples.len()), (0, 0), "nobody followed yet");
+        assert_eq!((watch.take_samples(&mut samples), samples.len()), (0, 0), "without a follower");
         for _ in 0..MOST_SAMPLES + 3 {
             watch.prediction(&prediction(&[], 0));
         }

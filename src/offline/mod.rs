@@ -207,7 +207,7 @@ impl Offline {
     /// Computes the stability map that the prediction for `input` needs, if the session does not have it.
     fn prepare(&mut self, input: &OperatingPoint, log_time_ns: u64) {
         let point = conditions(input);
-        if self.session.lacks_map(&point) {
+        if self.session.has_no_map(&point) {
             self.compute(input.header.stamp, log_time_ns, Request::Map(point));
         }
     }

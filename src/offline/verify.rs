@@ -89,7 +89,7 @@ pub enum VerifyError {
 /// Predicts the session in `recording` again with `rig` and compares.
 ///
 /// A file from the middle of a session can be verified alone, because it begins with the settings, map, ends and chart
-/// in force. It lacks two things: whether its first input reused the previous prediction, and whether the hysteresis of
+/// in force. Two things are not recorded in it: whether its first input reused the previous prediction, and whether the hysteresis of
 /// SQUEAL was active.
 ///
 /// # Errors

@@ -223,7 +223,7 @@ impl Session {
     }
 
     /// Whether a prediction at `point` would have no margin because no stability map is valid there.
-    pub fn lacks_map(&self, point: &OperatingPoint) -> bool {
+    pub fn has_no_map(&self, point: &OperatingPoint) -> bool {
         self.rig.limits.check(point).is_ok()
             && self.rig.model.contact_state(point) == ContactState::Sliding
             && !self.reuses(point)

@@ -72,9 +72,9 @@ impl Node {
         fs::read_to_string(self.folder.path().join("stderr")).unwrap_or_default()
     }
 
-    /// How often it said that its ROS 2 side fell.
+    /// How often it reported that its ROS 2 side ended.
     fn falls(&self) -> usize {
-        self.said().matches("the ROS 2 side fell").count()
+        self.said().matches("the ROS 2 side ended").count()
     }
 
     /// The process of its ROS 2 side.
@@ -321,7 +321,7 @@ fn a_ros2_side_that_is_killed_is_started_again_with_the_rig() {
         node.wait("the latched rig", |_| rig().is_some_and(|rig| rig.mode_count == 9))
     });
     let (states, _) = node.finish();
-    let warned = |state: &&DiagnosticStatus| state.level == 1 && state.message.contains("the ROS 2 side fell");
+    let warned = |state: &&DiagnosticStatus| state.level == 1 && state.message.contains("the ROS 2 side ended");
     assert!(states.iter().filter(warned).any(|state| state.message.contains("SIGKILL")), "{states:?}");
     let last = states.last().expect("one a second");
     assert!(last.values.iter().any(|pair| pair.key == "ros2_side_falls" && pair.value == "3"), "{last:?}");
@@ -420,7 +420,7 @@ fn a_ros2_side_that_hangs_is_replaced() {
     let side = node.side().expect("it is there");
     signal(side, "STOP");
     node.wait("the note of the fall", |node| node.answers() > Duration::ZERO && node.falls() == 1);
-    assert!(node.said().contains("no sign of life"), "{}", node.said());
+    assert!(node.said().contains("no message for"), "{}", node.said());
     peer.forget();
     node.wait("an answer over ROS 2 again", |node| node.answers() > Duration::ZERO && peer.is_answered());
     assert_ne!(node.side(), Some(side));

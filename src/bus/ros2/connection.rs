@@ -41,7 +41,7 @@ impl Ros2NodeConnection {
                 }
             }),
             parameter: Box::new(move |name, value| changes.parameter(name, value)),
-            fell: Box::new(|why| note!("the ROS 2 side fell and is started again: {why}")),
+            fell: Box::new(|why| note!("the ROS 2 side ended and is restarted: {why}")),
         };
         Ok(Self {
             process: Ros2Process::start(options, parameters, sinks)?,
@@ -90,7 +90,7 @@ impl Connection for Ros2NodeConnection {
         let before = std::mem::replace(&mut self.health_before, now.clone());
         let mut warnings = vec![];
         if now.falls > before.falls {
-            warnings.push(format!("the ROS 2 side fell and is started again: {}", now.last_fall));
+            warnings.push(format!("the ROS 2 side ended and is restarted: {}", now.last_fall));
         } else if !now.up {
             warnings.push(format!("the ROS 2 side is down: {}", now.last_fall));
         }

@@ -371,7 +371,7 @@ impl Supervisor {
             }
             if timeouts >= patience {
                 let seconds = (patience * READ_TIMEOUT).as_secs();
-                return Ok(Some(End::Fell(format!("no sign of life for {seconds} s"))));
+                return Ok(Some(End::Fell(format!("no message for {seconds} s"))));
             }
             if self.shared.stopping() && stopping_since.get_or_insert_with(Instant::now).elapsed() > LEAVE_WITHIN {
                 return Ok(Some(End::Stopped));
