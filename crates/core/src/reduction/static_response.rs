@@ -150,8 +150,11 @@ mod tests {
     fn chain(name: &str, n: usize, spring: f64, held: bool) -> FullPart {
         let mass: Vec<_> = (0..n).map(|i| Triplet::new(i, i, 0.3 + 0.1 * (i as f64).cos())).collect();
         let mut stiffness: Vec<_> = (1..n)
-            .flat_map(|i| [(i, i, 1.0), (i - 1, i - 1, 1.0), (i, i - 1, -1.0), (i - 1, i, -1.0)])
-            .map(|(i, j, sign)| Triplet::new(i, j, sign * spring * (1.0 + 0.2 * ((i + j) as f64).sin())))
+            .flat_map(|i| {
+                let k = spring * (1.0 + 0.2 * (i as f64).sin());
+                [(i, i, k), (i - 1, i - 1, k), (i, i - 1, -k), (i - 1, i, -k)]
+            })
+            .map(|(i, j, value)| Triplet::new(i, j, value))
             .collect();
         if held {
             stiffness.push(Triplet::new(0, 0, spring));
