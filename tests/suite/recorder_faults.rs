@@ -1,6 +1,7 @@
 //! The recorder when the process, the disk or the directory fails: losses are bounded, counted and reported.
 
 use std::{
+    collections::BTreeSet,
     fs::{self, File},
     io,
     path::Path,
@@ -14,7 +15,7 @@ use std::{
 
 use crate::program::{self, Running, command, files_below, folder, run, text};
 use crate::records::*;
-use squealcast::msgs::{Header, SessionEvent, Time};
+use squealcast::msgs::{Header, SessionEvent, Time, event_kind};
 use squealcast::recording::mcap_file::{Disk, FileSystem};
 use squealcast::recording::message::{Message, Payload};
 use squealcast::recording::reader::Recording;
@@ -634,7 +635,18 @@ fn each_file_of_a_session_verifies_by_itself() {
     assert_eq!(finished.files.len(), 4);
     let all = run(["replay", "--verify", &text(&finished.directory)]).exits(0);
     all.says("1200 predictions identical, 0 different, 0 missing, 0 extra");
+    let settings = |file: &Path| -> BTreeSet<String> {
+        let recording = Recording::open(file).unwrap();
+        let name = |payload: &Payload| match payload {
+            Payload::SessionEvent(event) if event.kind == event_kind::PARAMETER => Some(event.name.clone()),
+            _ => None,
+        };
+        recording.messages().filter_map(|entry| name(known(&entry)?)).collect()
+    };
+    let initial = settings(&finished.files[0]);
+    assert!(initial.contains("warn_margin"), "{initial:?}");
     for (number, file) in finished.files.iter().enumerate() {
+        assert_eq!(settings(file), initial, "file {number}");
         let one = run(["replay", "--verify", &text(file)]).exits(0).says("300 predictions identical, 0 different");
         assert_eq!(one.stderr.contains("begins in the middle of a session"), number > 0, "{}", one.stderr);
     }
