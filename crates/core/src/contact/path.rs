@@ -334,8 +334,9 @@ impl<'a> Equations<'a> {
         Point { closure, others }
     }
 
-    /// Newton steps from `start`; the state with its Jacobian, or the residual where they ended.
-    fn newton(&self, start: Point) -> Result<(Evaluated, Jacobian), f64> {
+    /// Newton steps from `start`; the state with its Jacobian, or the residual where they ended. `full` takes every step at
+    /// full length: where pairs open and close, the residual may have to grow before it vanishes.
+    fn newton(&self, start: Point, full: bool) -> Result<(Evaluated, Jacobian), f64> {
         let mut at = self.evaluate(start);
         let mut jacobian = self.jacobian(&at);
         for _ in 0..MOST_STEPS {
@@ -353,7 +354,7 @@ impl<'a> Equations<'a> {
                 let tried = self.evaluate(self.step(&at, &direction, t, polish));
                 let improves =
                     if polish { tried.accuracy < 0.5 * at.accuracy } else { tried.norm <= (1.0 - 1e-4 * t) * at.norm };
-                if improves || (!polish && tried.accuracy <= ROUNDING) {
+                if improves || (!polish && (tried.accuracy <= ROUNDING || (full && tried.norm.is_finite()))) {
                     better = Some(tried);
                     break;
                 }
@@ -523,8 +524,10 @@ pub(super) fn follow(statics: &Statics, load: f64, s_mu: f64) -> Result<SteadySt
         let equations = Equations::new(statics, load, next, 0.0, &scales);
         let along = next - x;
         let predicted = equations.predicted(&state, [0.0, along]);
-        let accepted =
-            equations.newton(predicted).ok().filter(|found| equations.is_near(&state, [0.0, along], sign, found));
+        let accepted = equations
+            .newton(predicted, false)
+            .ok()
+            .filter(|found| equations.is_near(&state, [0.0, along], sign, found));
         match accepted {
             Some((at, jacobian)) => {
                 state = equations.state(&at, &jacobian);
@@ -551,11 +554,12 @@ pub(super) fn follow(statics: &Statics, load: f64, s_mu: f64) -> Result<SteadySt
 /// The state without friction, the minimum of a convex energy.
 fn at_rest(statics: &Statics, load: f64, scales: &Scales) -> Result<(Evaluated, Jacobian), StaticsError> {
     let mut residual = f64::INFINITY;
-    for supports in SUPPORTS {
+    let ways = [false, true].into_iter().flat_map(|full| SUPPORTS.map(|supports| (supports, full)));
+    for (supports, full) in ways {
         let others = vec![0.0; statics.others()];
         let mut point = Point { closure: vec![0.0; statics.pairs()], others };
         for &support in supports {
-            match Equations::new(statics, load, 0.0, support, scales).newton(point) {
+            match Equations::new(statics, load, 0.0, support, scales).newton(point, full) {
                 Ok((at, jacobian)) if support == 0.0 && jacobian.sign != 0 => return Ok((at, jacobian)),
                 Ok((at, _)) => point = at.point,
                 Err(left) => {
@@ -641,7 +645,7 @@ pub(super) fn from_anchor(statics: &Statics, anchors: &[Anchor], load: f64, s_mu
             break;
         }
     }
-    let found = equations.newton(at.point).ok()?;
+    let found = equations.newton(at.point, false).ok()?;
     let near = equations.is_near(&anchor.state, along, anchor.jacobian.sign, &found);
     near.then(|| equations.state(&found.0, &found.1))
 }

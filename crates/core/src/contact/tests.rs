@@ -389,3 +389,48 @@ fn anchors_change_states_by_rounding_only() {
         }
     }
 }
+
+/// A floating pad, crowned by 2 micrometres and elastic like a half-space, has a state at every load, whichever pairs it
+/// closes; neighbouring loads close as many or more.
+#[test]
+fn a_crowned_pad_has_a_state_at_every_load() {
+    let (across, along, pitch) = (8, 13, 2e-3);
+    let c = across * along;
+    let place = |k: usize| {
+        [(k % across) as f64 - 0.5 * (across - 1) as f64, (k / across) as f64 - 0.5 * (along - 1) as f64]
+            .map(|x| pitch * x)
+    };
+    for law in
+        [linear(), PressureLaw::Power { stiffness: STIFFNESS, reference_m: 1e-5, exponent: 2.0, roughness_m: 0.0 }]
+    {
+        let distance = |i: usize, j: usize| (place(i)[0] - place(j)[0]).hypot(place(i)[1] - place(j)[1]);
+        let statics = Statics::new(StaticsParts {
+            law,
+            area: vec![1.0; c],
+            gap_m: (0..c).map(|k| 2e-6 * (place(k)[1] / (0.5 * along as f64 * pitch)).powi(2)).collect(),
+            response: StaticResponse {
+                normal_flexibility: Mat::from_fn(c, c, |i, j| {
+                    1.0 / (std::f64::consts::PI * 2e9 * if i == j { 0.28 * pitch } else { distance(i, j) })
+                }),
+                sliding_flexibility: Mat::zeros(c, c),
+                gap_per_load: vec![0.0; c],
+                rigid: RigidMotions {
+                    normal: Mat::from_fn(c, 3, |k, j| if j == 0 { 1.0 } else { place(k)[j - 1] / pitch }),
+                    sliding: Mat::from_fn(c, 3, |_, j| if j == 2 { 4.0 } else { 0.0 }),
+                    load: vec![-1.0, 0.0, 0.0],
+                },
+            },
+            measured: MeasuredLoad::Back,
+        })
+        .unwrap();
+        let mut before = 0;
+        for step in 0..40 {
+            let load = 30.0 * 1.15f64.powi(step);
+            let state = statics.state(load, 0.0).unwrap();
+            assert!(imbalance(&statics, &state) < 1e-11);
+            assert!(state.pairs_closed() >= before, "{load} N: {} after {before}", state.pairs_closed());
+            before = state.pairs_closed();
+        }
+        assert_eq!(before, c);
+    }
+}
