@@ -267,13 +267,13 @@ fn recordings_of_older_versions_are_read_or_the_reason_is_given() {
     let out = text(&folder.path().join("oldest"));
     for args in [&["report", &oldest, "-o", &out][..], &["view", &oldest], &["replay", "--verify", &oldest]] {
         let failed = run(args).exits(1).complains("holds no prediction that can be read");
-        failed.complains("/squealcast/prediction is not read").complains("lacks `float64 friction_margin_error`");
+        failed.complains("/squealcast/prediction is not read").complains("has no `float64 friction_margin_error`");
     }
     // Predictions have the fields of today, but other reasons: they are read, and verification reports the differences.
     let older = text(&data.join("without_reduction.mcap"));
     let out = folder.path().join("older");
     let unread = "/squealcast/rig is not read";
-    run(["report", &older, "-o", &text(&out)]).exits(0).complains(unread).complains("lacks `string reduction`");
+    run(["report", &older, "-o", &text(&out)]).exits(0).complains(unread).complains("has no `string reduction`");
     assert!(std::fs::read_to_string(out.join("report.html")).expect("a report").contains("nine-dof-case-2"));
     let verified = run(["replay", "--verify", &older, "--no-chart-cache"]).exits(3).complains(unread);
     verified.says("200 inputs, 200 of them predicted").says("0 missing, 0 extra");
