@@ -32,3 +32,25 @@ fn a_rust_client_on_shared_memory_gets_predictions() {
     assert!(levels.iter().all(|level| ["OK", "WARN", "SQUEAL"].contains(level)), "{printed}");
     node.signal("INT").exits(0);
 }
+
+/// Standard output of an example that needs no other program.
+fn printed(name: &str) -> String {
+    let output = Command::new(example(name)).output().unwrap();
+    assert!(output.status.success(), "{name}: {output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// numpy 2.4.6 finds the first growing mode of these matrices between friction coefficients 0.27 and 0.275.
+#[test]
+fn a_program_predicts_from_matrices_in_memory() {
+    let text = printed("predict_from_matrices");
+    let critical = text.lines().find_map(|line| line.strip_prefix("squeal from mu = ")).expect(&text);
+    assert!((0.27..0.275).contains(&critical.parse::<f64>().unwrap()), "{text}");
+    assert!(text.lines().any(|line| line.contains("Hz") && !line.contains('-')), "a mode grows: {text}");
+}
+
+#[test]
+fn a_program_reduces_its_own_sparse_matrices() {
+    let text = printed("reduce_sparse_matrices");
+    assert!(text.contains("degrees of freedom reduced to") && text.contains("held-out points"), "{text}");
+}

@@ -14,7 +14,7 @@ use squealcast_core::physics::{
 
 fn main() -> Result<(), Box<dyn Error>> {
     // Natural frequencies of the free parts, pad first; damping ratio 0.1 % each. Coordinates are mass-normalised.
-    let omega = [1900.0, 2600.0, 2000.0, 2900.0].map(|hz| TAU * hz);
+    let omega = [1900.0, 2300.0, 2000.0, 2250.0].map(|hz| TAU * hz);
     let diagonal = |value: &dyn Fn(f64) -> f64| Term {
         matrix: Mat::from_fn(4, 4, |i, j| if i == j { value(omega[i]) } else { 0.0 }),
         law: Law::Constant,
