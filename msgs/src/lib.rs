@@ -187,7 +187,7 @@ pub struct ModeSensitivity {
 pub mod sensitivity_law {
     /// Root and conditions are related linearly to first order.
     pub const LINEAR: u8 = 0;
-    /// Too close to merging for a tangent; the law of the pair is in [`Sensitivity::pairs`].
+    /// Too close to merging for a tangent; the law of the pair is in [`Sensitivity::pairs`](super::Sensitivity::pairs).
     pub const SQUARE_ROOT: u8 = 1;
 }
 

@@ -2,7 +2,7 @@
 //!
 //! A file is written under a random name in the same folder, synced to the disk and renamed. Then its folder is synced,
 //! so that the new name survives a power failure. No other module does this. Recordings in progress, which are useful
-//! before they are complete, are handled by [`super::recording_file`].
+//! before they are complete, are handled by [`crate::recording::mcap_file`].
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, OpenOptions, Permissions};

@@ -2,8 +2,8 @@
 //!
 //! # Locking
 //!
-//! One mutex ([`inlet::Running`]) guards the [`Worker`]: the session and everything that is done for it. The node's own
-//! thread takes it for a whole [`Worker::work_off`] and waits for items without it. A thread that received an input may
+//! One mutex (`inlet::Running`) guards the `Worker`: the session and everything that is done for it. The node's own
+//! thread takes it for a whole `Worker::work_off` and waits for items without it. A thread that received an input may
 //! take it in [`Inlet::input`], by `try_lock`, so it never waits. Items are put into the queue without the lock, but
 //! taken out of it only under the lock: whoever holds it and finds queue and backlog empty knows that every earlier input
 //! has been handled, and overtakes none. Publishing and recording happen under the lock and put messages into bounded

@@ -6,7 +6,7 @@
 //! being written it is named `*.mcap.active`. If the directory is moved, its files are finished at their new place. If
 //! it is removed, their messages are counted as lost. In both cases the recording continues in a new directory.
 //!
-//! The log time of a message is [`super::clock::Reading::log_ns`], which does not jump when the wall clock is set.
+//! The log time of a message is [`crate::system::clock::Reading::log_ns`], which does not jump when the wall clock is set.
 
 mod worker;
 
