@@ -39,6 +39,7 @@ mod ros2_side;
 mod scipy;
 mod sessions;
 mod sound;
+mod steady_states;
 mod stress;
 mod tribometer;
 mod upstream;
