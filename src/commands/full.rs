@@ -74,13 +74,13 @@ struct RootReport {
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let mut steps = self.progress.steps(1);
-        let full = FullModelFile::load(&self.full)?;
-        full.refuse_modal_damping()?;
+        let mut full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
         let settings = &full.settings;
         let p = self.conditions.point(&full.name, &settings.reference, &settings.limits)?;
         let band_hz = self.band_hz.or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
         let room = room(self.memory_gib, &self.full)?;
+        full.damp_modes(room, &mut |_, _| {})?;
         let mut said = |step| steps.full("full model", step);
         let mut solver = solver(&full, room, &mut said)?;
         let found = solver

@@ -73,14 +73,6 @@ pub fn basis_of(
     let Some(band_hz) = full.settings.band_max_hz else {
         bail!("{path}: `band.max_hz` is missing; expected it: a basis holds the roots of a band");
     };
-    for (part, geometry) in full.model.parts.iter().zip(&full.geometry) {
-        if let Some(ratio) = geometry.damping_ratio {
-            let name = &part.name;
-            bail!(
-                "{path}: `{name}.damping_ratio` is {ratio}; expected none: only modes of a part have one, see --modes"
-            );
-        }
-    }
     let settings = &full.settings;
     let friction = [settings.limits.friction_coefficient[0].max(0.0), settings.limits.friction_coefficient[1]];
     let default = OperatingBox {

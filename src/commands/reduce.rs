@@ -94,9 +94,11 @@ impl Options {
         let file = self.output_file()?;
         let mut steps = self.progress.steps(2);
         steps.say(&format!("reading {}", self.full.display()));
-        let full = FullModelFile::load(&self.full)?;
+        let mut full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
         let room = room(self.memory_gib, &self.full)?;
+        full.damp_modes(room, &mut |_, _| {})?;
+        let full = full;
         if self.modes.is_none() && self.cutoff_hz.is_none() {
             if full.geometry.len() == 1 {
                 bail!(
@@ -178,33 +180,29 @@ impl Options {
         let (mut files, mut rig) = make(None)?;
         let mut outcome = Outcome::Done;
         if self.points > 0 {
-            if full.geometry.iter().any(|geometry| geometry.damping_ratio.is_some_and(|ratio| ratio != 0.0)) {
-                steps.say("not compared: a damping ratio of modes has no meaning for the full model");
-            } else {
-                let against = Against { points: self.points, seed: 1, band_hz: None, windows: true };
-                let mut report = |what: &str, step| steps.full(&format!("compared with the full model, {what}"), step);
-                let compare = || -> anyhow::Result<Verified> {
-                    let mut solver = match solver {
-                        Some(solver) => solver,
-                        None => self::solver(full, room(self.memory_gib, &self.full)?, &mut |step| {
-                            report("analysis", step)
-                        })?,
-                    };
-                    verify_against(&rig, full, &mut solver, &against, &mut report).map_err(anyhow::Error::from)
-                };
-                let found = compare();
-                match found {
-                    Ok(found) => {
-                        if !found.certificate.is_complete() {
-                            outcome = Outcome::Differences;
-                        }
-                        (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?;
+            let against = Against { points: self.points, seed: 1, band_hz: None, windows: true };
+            let mut report = |what: &str, step| steps.full(&format!("compared with the full model, {what}"), step);
+            let compare = || -> anyhow::Result<Verified> {
+                let mut solver = match solver {
+                    Some(solver) => solver,
+                    None => {
+                        self::solver(full, room(self.memory_gib, &self.full)?, &mut |step| report("analysis", step))?
                     }
-                    // The rig is kept: it took long to compute, and `verify --against` can repeat the comparison.
-                    Err(error) => {
-                        steps.say(&format!("not compared with the full model: {error:#}"));
+                };
+                verify_against(&rig, full, &mut solver, &against, &mut report).map_err(anyhow::Error::from)
+            };
+            let found = compare();
+            match found {
+                Ok(found) => {
+                    if !found.certificate.is_complete() {
                         outcome = Outcome::Differences;
                     }
+                    (files, rig) = make(Some(&Certificate { method, ..found.certificate }))?;
+                }
+                // The rig is kept: it took long to compute, and `verify --against` can repeat the comparison.
+                Err(error) => {
+                    steps.say(&format!("not compared with the full model: {error:#}"));
+                    outcome = Outcome::Differences;
                 }
             }
         }

@@ -57,7 +57,7 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let mut steps = self.progress.steps(1);
         let rig = Rig::load(&self.rig)?;
-        let full = FullModelFile::load(&self.against)?;
+        let mut full = FullModelFile::load(&self.against)?;
         if let Some(known) = rig.reduction.as_ref().filter(|known| known.full_model_hash != full.content_hash) {
             steps.say(&format!(
                 "the rig was reduced from another full model: {}, this one is {}",
@@ -66,8 +66,8 @@ impl Options {
         }
         let against =
             Against { points: self.points, seed: self.seed, band_hz: self.band_hz, windows: !self.no_windows };
-        full.refuse_modal_damping()?;
         let room = room(self.memory_gib, &self.against)?;
+        full.damp_modes(room, &mut |_, _| {})?;
         let mut solver = solver(&full, room, &mut |step| steps.full("full model", step))?;
         let found = verify_against(&rig, &full, &mut solver, &against, &mut |what, step| steps.full(what, step))?;
         drop(steps);

@@ -61,7 +61,12 @@ pub fn basis_rig(
                 residual: None,
                 damping_ratio: None,
                 mass_share: (part.name == "pad").then(|| project_sparse(&part.mass, of_part, true)),
-                matrices: full.model.matrices_of_part(index, of_part),
+                matrices: {
+                    let mut matrices = full.model.matrices_of_part(index, of_part);
+                    let of_modes = full.model.modal_damping_of_part(index, of_part);
+                    matrices.damping = [matrices.damping, of_modes].into_iter().flatten().reduce(|a, b| a + b);
+                    matrices
+                },
             }
         })
         .collect();

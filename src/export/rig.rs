@@ -11,7 +11,7 @@ use npyz::zip::write::FileOptions;
 use sha2::{Digest, Sha256};
 
 use super::error::ExportError;
-use crate::full_model::{FullModelFile, PartGeometry};
+use crate::full_model::{DampedModes, FullModelFile, PartGeometry};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::{FullPart, Kept, PartMatrices, Residual};
 use crate::rig::{Certificate, RigFile};
@@ -41,8 +41,8 @@ pub struct ModalSide<'a> {
     pub phi: Mat<f64>,
     /// Residual flexibility and inertia between x, y and z of the nodes.
     pub residual: Option<&'a Residual>,
-    /// Damping ratio of all modes.
-    pub damping_ratio: Option<f64>,
+    /// Damping ratio of each mode, or a single one of all modes.
+    pub damping_ratio: Option<Vec<f64>>,
     /// This side's contribution to the unit mass matrix, if the columns of `phi` also move the other side.
     pub mass_share: Option<Mat<f64>>,
     /// Damping and rotation of this side.
@@ -72,7 +72,13 @@ pub fn modal_sides<'a>(full: &'a FullModelFile, kept: &'a [Kept]) -> Result<Vec<
             omega_rad_s: kept.modes.omega_squared.iter().map(|square| square.max(0.0).sqrt()).collect(),
             phi: Mat::from_fn(rows.len(), phi.ncols(), |i, mode| rows[i].map_or(0.0, |row| phi[(row, mode)])),
             residual: kept.residual.as_ref(),
-            damping_ratio: geometry.damping_ratio,
+            damping_ratio: match &geometry.damping_ratio {
+                DampedModes::None => None,
+                DampedModes::Every(ratio) => Some(vec![*ratio]),
+                DampedModes::Lowest(ratios) => {
+                    Some((0..phi.ncols()).map(|mode| ratios.get(mode).copied().unwrap_or(0.0)).collect())
+                }
+            },
             mass_share: None,
             matrices: full.model.matrices_of_part(index, phi),
         }
@@ -189,8 +195,10 @@ pub fn modal_rig(
             .map_err(|source| ExportError::Bytes { what: format!("archive of the modes of {}", side.name), source })?;
         let mut keys = toml::Table::new();
         keys.insert("modal".to_owned(), add(side.name, bytes));
-        if let Some(ratio) = side.damping_ratio {
-            keys.insert("damping_ratio".to_owned(), ratio.into());
+        match side.damping_ratio.as_deref() {
+            None => {}
+            Some([ratio]) => drop(keys.insert("damping_ratio".to_owned(), (*ratio).into())),
+            Some(ratios) => drop(keys.insert("damping_ratio".to_owned(), ratios.to_vec().into())),
         }
         table.insert(side.name.to_owned(), keys.into());
     }

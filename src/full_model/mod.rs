@@ -19,7 +19,7 @@ use crate::files::input_file;
 use crate::physics::ContactLaw;
 use crate::reduction::{
     FullContact, FullModel, FullPart, Kept, PartTurning, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
-    Substructure, Wanted, keep_modes,
+    Substructure, Wanted, keep_modes, normal_modes,
 };
 use crate::rig::raw::{Common, RawPatch, RawSystem, RawTerm};
 use crate::rig::settings::Settings;
@@ -27,6 +27,7 @@ use crate::rig::{Pair, RigError, patch, settings, system};
 
 use files::Files;
 use raw::{RawFullModel, RawPart};
+use verification::DEFAULT_BAND_HZ;
 
 /// A full model and everything its files contain.
 #[derive(Clone, Debug)]
@@ -68,9 +69,22 @@ pub struct PartGeometry {
     pub rows: Vec<(usize, usize)>,
     /// Node indices of the contact interface, in the order listed.
     pub interface: Vec<usize>,
-    /// Damping ratio of all modes of the part.
-    pub damping_ratio: Option<f64>,
+    /// Damping ratios of modes of the part.
+    pub damping_ratio: DampedModes,
 }
+
+/// Damping ratios of modes of a part.
+#[derive(Clone, Debug, PartialEq)]
+pub enum DampedModes {
+    None,
+    /// The same ratio for every mode.
+    Every(f64),
+    /// A ratio for each of the lowest modes.
+    Lowest(Vec<f64>),
+}
+
+/// Upper end of the modes that a single damping ratio is of, relative to the band.
+pub const DAMPED_BAND: f64 = 2.5;
 
 impl FullModelFile {
     /// Whether the TOML file at `path` is a full model, which its parts show: they refer to matrix files. A file with
@@ -138,23 +152,35 @@ impl FullModelFile {
         })
     }
 
-    /// Checks that no part has a modal damping ratio, which the matrices of the full model cannot represent.
+    /// Adds the damping of modes of the parts, `C = M Φ diag(2 ζ ω) Φᵀ M`, to the equation of motion. A list of ratios
+    /// is of the lowest modes; a single ratio is of all modes up to [`DAMPED_BAND`] times the band (that of `[band]`, else
+    /// [`DEFAULT_BAND_HZ`]). Without damping ratios this does nothing. `progress` as in [`Self::keep_modes`].
     ///
     /// # Errors
-    /// [`RigError::Kind`].
-    pub fn refuse_modal_damping(&self) -> Result<(), RigError> {
-        let damped = self.geometry.iter().zip(&self.model.parts).find_map(|(geometry, part)| {
-            geometry.damping_ratio.filter(|ratio| *ratio != 0.0).map(|ratio| (part.name.clone(), ratio))
-        });
-        match damped {
-            None => Ok(()),
-            Some((part, ratio)) => Err(RigError::Kind {
-                file: self.path.display().to_string(),
-                field: format!("{part}.damping_ratio"),
-                value: format!("is {ratio}: the matrices of a full model contain no modal damping"),
-                limit: "0, or none, to solve the full model".to_owned(),
-            }),
+    /// [`RigError::Reduction`].
+    pub fn damp_modes(
+        &mut self,
+        memory_limit_bytes: Option<usize>,
+        progress: &mut dyn FnMut(usize, Progress),
+    ) -> Result<(), RigError> {
+        let band_hz = self.settings.band_max_hz.unwrap_or(DEFAULT_BAND_HZ);
+        for part in 0..self.geometry.len() {
+            let (wanted, every) = match &self.geometry[part].damping_ratio {
+                DampedModes::None => continue,
+                DampedModes::Every(ratio) => (Wanted::Below(DAMPED_BAND * std::f64::consts::TAU * band_hz), *ratio),
+                DampedModes::Lowest(ratios) => (Wanted::Lowest(ratios.len()), 0.0),
+            };
+            let FullPart { name, mass, stiffness } = &self.model.parts[part];
+            let report = &mut |step| progress(part, step);
+            let modes = normal_modes(name, mass, stiffness, wanted, memory_limit_bytes, report)
+                .map_err(|source| RigError::Reduction { file: self.path.display().to_string(), source })?;
+            let ratios = match &self.geometry[part].damping_ratio {
+                DampedModes::Lowest(ratios) => ratios.clone(),
+                DampedModes::None | DampedModes::Every(_) => vec![every; modes.omega_squared.len()],
+            };
+            self.model.damp_modes(part, &modes, &ratios);
         }
+        Ok(())
     }
 
     /// Computes the lowest modes of pad and disc: `wanted` has an entry for each. If `with_residual`, the residual
@@ -331,6 +357,15 @@ fn read_parts(
                 part.part.name
             ));
         }
+        match &part.geometry.damping_ratio {
+            DampedModes::None => {}
+            DampedModes::Every(ratio) => {
+                contents.push(format!("damping    of the {}: {ratio} of its modes", part.part.name));
+            }
+            DampedModes::Lowest(ratios) => {
+                contents.push(format!("damping    of the {}: of its {} lowest modes", part.part.name, ratios.len()));
+            }
+        }
         let PartTurning { gyroscopic, spin, stress_stiffening } = &part.turning;
         let known = [("gyroscopic", gyroscopic), ("spin", spin), ("stress stiffening", stress_stiffening)];
         let known: Vec<&str> = known.into_iter().filter_map(|(name, matrix)| matrix.as_ref().map(|_| name)).collect();
@@ -352,7 +387,14 @@ fn read_parts(
         geometry.push(part.geometry);
         own.push((part.rayleigh, part.turning));
     }
-    let mut model = FullModel { parts, stiffness: vec![], damping: vec![], contact: Some(contact), contact_law };
+    let mut model = FullModel {
+        parts,
+        stiffness: vec![],
+        damping: vec![],
+        modal_damping: vec![],
+        contact: Some(contact),
+        contact_law,
+    };
     for (part, ([alpha_per_s, beta_s], turning)) in own.iter().enumerate() {
         let added = model.damp(part, *alpha_per_s, *beta_s).and_then(|()| model.turn(part, turning));
         added.map_err(|source| RigError::Reduction { file: toml.clone(), source })?;
@@ -413,6 +455,6 @@ fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Resul
     })?;
     let part = FullPart { name: "system".to_owned(), mass, stiffness: none };
     let contact_law = settings.contact_law;
-    let model = FullModel { parts: vec![part], stiffness, damping, contact: None, contact_law };
+    let model = FullModel { parts: vec![part], stiffness, damping, modal_damping: vec![], contact: None, contact_law };
     Ok(ReadModel { model, geometry: vec![], pairs: vec![], contents })
 }

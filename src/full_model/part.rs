@@ -9,9 +9,10 @@ use super::entries::{Entries, MOST_ROWS};
 use super::files::Files;
 use super::raw::RawPart;
 use super::tables::{self, Nodes};
-use super::{INTERNAL, PartGeometry};
+use super::{DampedModes, INTERNAL, PartGeometry};
 use crate::reduction::{FullPart, PartTurning, SYMMETRY_TOLERANCE, SparseMatrix};
-use crate::rig::settings::within;
+use crate::rig::raw::OneOrMany;
+use crate::rig::settings::{MOST_COORDINATES, at_most, within};
 use crate::rig::{RigError, lines, matrix_market};
 
 /// A part with its nodes and rows.
@@ -104,10 +105,18 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
         within(&toml, &field(key), value, value >= 0.0, "at least 0")?;
     }
     let interface = interface(&toml, &field("interface_nodes"), &raw.interface_nodes, &nodes, &raw.nodes)?;
-    let damping_ratio = raw
-        .damping_ratio
-        .map(|value| within(&toml, &field("damping_ratio"), value, value >= 0.0, "at least 0"))
-        .transpose()?;
+    let not_negative = |field: &str, value: f64| within(&toml, field, value, value >= 0.0, "at least 0");
+    let damping_ratio = match &raw.damping_ratio {
+        None => DampedModes::None,
+        Some(OneOrMany::One(ratio)) => DampedModes::Every(not_negative(&field("damping_ratio"), *ratio)?),
+        Some(OneOrMany::Many(ratios)) => {
+            at_most(&toml, &field("damping_ratio"), ratios.len(), MOST_COORDINATES.min(rows.len()))?;
+            for (mode, &ratio) in ratios.iter().enumerate() {
+                not_negative(&field(&format!("damping_ratio[{mode}]")), ratio)?;
+            }
+            DampedModes::Lowest(ratios.clone())
+        }
+    };
     Ok(Part {
         part: FullPart { name: name.to_owned(), mass, stiffness },
         geometry: PartGeometry { nodes_m: nodes.positions, rows, interface, damping_ratio },

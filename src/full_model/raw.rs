@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use crate::rig::raw::{RawPatch, RawSystem, define_file, with_common_tables};
+use crate::rig::raw::{OneOrMany, RawPatch, RawSystem, define_file, with_common_tables};
 
 with_common_tables!(define_file! {
     /// A whole full model: the common tables of a rig file, and either parts or a system.
@@ -23,7 +23,7 @@ pub struct RawPart {
     pub nodes: String,
     pub rows: Option<String>,
     pub interface_nodes: Vec<u64>,
-    pub damping_ratio: Option<f64>,
+    pub damping_ratio: Option<OneOrMany>,
     #[serde(default)]
     pub rayleigh_alpha_per_s: f64,
     #[serde(default)]

@@ -10,7 +10,7 @@ use crate::reduction::{
     CompareError, FullProgress, FullSolver, FullVectors, Judged, ReductionError, compare_roots, compare_windows,
     full_windows, reduced_roots,
 };
-use crate::rig::{Certificate, Rig, RigError};
+use crate::rig::{Certificate, Rig};
 
 /// Default upper end of the band, if neither rig nor full model gives one, Hz.
 pub const DEFAULT_BAND_HZ: f64 = 5000.0;
@@ -23,9 +23,6 @@ pub enum VerificationError {
     /// No operating points were asked for.
     #[error("--points is 0, expected at least 1")]
     NoPoints,
-    /// The full model has settings that its comparison does not support.
-    #[error(transparent)]
-    Settings(#[from] Box<RigError>),
     /// The full model could not be solved at an operating point.
     #[error("full model at {point:?}")]
     Full {
@@ -120,7 +117,6 @@ pub fn verify_against(
     if against.points == 0 {
         return Err(VerificationError::NoPoints);
     }
-    full.refuse_modal_damping().map_err(Box::new)?;
     let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
     let band_rad_s = std::f64::consts::TAU * band_hz;
     let judged = Judged { band_rad_s, instability_threshold: rig.instability_threshold, decay_per_s: DECAY_PER_S };

@@ -7,7 +7,7 @@ writes full models of a pad on a ring (Matrix Market, CSV, TOML) into DIR and pr
 program and, for every model, its file, band and cases: operating points with all roots of
 
     M q'' + C q' + K q = 0,    ω > 0
-    C = Σ_parts (α M_p + β K_p) + 2 Ω H + Bnᵀ Cc Bn + sμ Btᵀ Cc Bn
+    C = Σ_parts (α M_p + β K_p + M_p Φ diag(2 ζ ω) Φᵀ M_p) + 2 Ω H + Bnᵀ Cc Bn + sμ Btᵀ Cc Bn
     K = diag(K_p) + Ω² (S - L) + (Bn + sμ Bt)ᵀ Kc Bn
 
 Everything is assembled here from these formulas; nothing of squealcast is used.
@@ -22,6 +22,8 @@ import scipy
 from scipy.io import mmwrite
 from scipy.sparse import coo_matrix
 
+# Band of the model with a single damping ratio of a part, Hz.
+BAND_OF_RATIO = 5500.0
 RADII, AROUND, UNDER_PAD = [0.095, 0.105], 28, 6
 random = np.random.default_rng(20260)
 
@@ -66,7 +68,7 @@ def ring():
 
 
 class Model:
-    def __init__(self, folder, name, *, alpha=(0.0, 0.0), beta=(0.0, 0.0), rotation=False, contact_damping=0.0):
+    def __init__(self, folder, name, *, alpha=(0.0, 0.0), beta=(0.0, 0.0), ratios=(None, None), rotation=False, contact_damping=0.0):
         self.nodes_disc, along = ring()
         below = [r * AROUND + a for r in range(len(RADII)) for a in range(UNDER_PAD)]
         layers = [self.nodes_disc[below] + [0.0, 0.01 * layer, 0.0] for layer in range(3)]
@@ -82,6 +84,8 @@ class Model:
         self.mass, self.stiffness = scipy.linalg.block_diag(*mass), scipy.linalg.block_diag(*stiffness)
         parts = zip(mass, stiffness, alpha, beta)
         self.damping = scipy.linalg.block_diag(*[a * m + b * k for m, k, a, b in parts])
+        of_modes = [self.modal(m, k, zeta) for m, k, zeta in zip(mass, stiffness, ratios)]
+        self.damping = self.damping + scipy.linalg.block_diag(*of_modes)
         self.turning = rotation
         zero = np.zeros((self.n[0], self.n[0]))
         self.gyroscopic = scipy.linalg.block_diag(zero, gyroscopic) * rotation
@@ -89,8 +93,20 @@ class Model:
         self.contact_stiffness = 1e7 * random.uniform(0.5, 1.5, len(self.pairs))
         self.contact_damping = contact_damping
         self.rows()
-        self.band_hz = self.band()
-        self.write(folder, name, mass, stiffness, [gyroscopic, spin, stiffening], alpha, beta)
+        self.band_hz = BAND_OF_RATIO if isinstance(ratios[0], float) else self.band()
+        self.write(folder, name, mass, stiffness, [gyroscopic, spin, stiffening], alpha, beta, ratios)
+
+    def modal(self, mass, stiffness, ratios):
+        """M Φ diag(2 ζ ω) Φᵀ M of the lowest modes; a number is of all modes below 2.5 times the band."""
+        if ratios is None:
+            return np.zeros_like(mass)
+        square, phi = scipy.linalg.eigh(stiffness, mass)
+        omega = np.sqrt(square)
+        if isinstance(ratios, float):
+            ratios = ratios * (omega < 2.5 * 2 * np.pi * BAND_OF_RATIO)
+        zeta = np.zeros(len(omega))
+        zeta[: len(ratios)] = ratios
+        return mass @ phi @ np.diag(2 * zeta * omega) @ phi.T @ mass
 
     def rows(self):
         c, n = len(self.pairs), sum(self.n)
@@ -109,7 +125,7 @@ class Model:
         gap = 45 + np.argmax(np.diff(omega[45:56]))
         return (omega[gap] + omega[gap + 1]) / (4 * np.pi)
 
-    def write(self, folder, name, mass, stiffness, turning, alpha, beta):
+    def write(self, folder, name, mass, stiffness, turning, alpha, beta, ratios):
         def write(what, matrix, symmetry="symmetric"):
             mmwrite(folder / f"{name}-{what}.mtx", coo_matrix(matrix), symmetry=symmetry, precision=17)
             return f"{name}-{what}.mtx"
@@ -125,6 +141,7 @@ class Model:
             text += f'[{part}]\nmass = "{write(part + "-mass", mass[k])}"\n'
             text += f'stiffness = "{write(part + "-stiffness", stiffness[k])}"\n'
             text += f'nodes = "{name}-{part}-nodes.csv"\nrows = "{name}-{part}-rows.csv"\ninterface_nodes = {interface}\n'
+            text += "" if ratios[k] is None else f"damping_ratio = {ratios[k]}\n"
             for key, value in [("rayleigh_alpha_per_s", alpha[k]), ("rayleigh_beta_s", beta[k])]:
                 text += f"{key} = {value}\n" if value else ""
         if self.turning:
@@ -167,7 +184,11 @@ def main():
     turning = Model(folder, "turning", rotation=True)
     rayleigh = Model(folder, "rayleigh", alpha=(4.0, 7.0), beta=(3e-7, 1e-7))
     both = Model(folder, "both", alpha=(0.0, 5.0), beta=(2e-7, 0.0), rotation=True, contact_damping=3.0)
+    modal = Model(folder, "modal", ratios=(0.004, [0.0, 0.01, 0.002, 0.003, 0.008]), contact_damping=1.0)
+    modal_turning = Model(folder, "modal-turning", ratios=(None, [0.005] * 30), beta=(1e-7, 0.0), rotation=True)
     models = {
+        "modal": modal.told([(500.0, 13.0, 0.0), (500.0, 13.0, 0.4)]),
+        "modal-turning": modal_turning.told([(500.0, -20.0, 0.3)]),
         "turning": turning.told([(500.0, 0.0, 0.3), (500.0, 13.0, 0.4), (500.0, -13.0, 0.4), (0.0, 60.0, 0.4), (500.0, 60.0, 0.2)]),
         "rayleigh": rayleigh.told([(500.0, 13.0, 0.0), (500.0, 13.0, 0.4)]),
         "both": both.told([(500.0, 13.0, 0.4), (500.0, 37.0, 0.25)]),

@@ -218,6 +218,52 @@ fn the_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
     assert!(growing > 0, "no flutter among the conditions of this test");
 }
 
+/// The tribometer whose disc turns: without friction its roots are imaginary and the same for both directions, and a basis
+/// over 0.01 to 60 rad/s has the roots of the full model, at rest too.
+#[test]
+fn the_turning_tribometer_on_a_basis_has_the_roots_of_its_full_model() {
+    let temp = tempfile::tempdir().unwrap();
+    let folder = temp.path().join("full");
+    run(["tribometer", "--rotation", "--dof", "5000", "-o", &text(&folder)]).exits(0).complains("disc-gyroscopic.mtx");
+    let path = folder.join("tribometer.toml");
+    let band_hz = 2700.0;
+    let written = fs::read_to_string(&path).unwrap();
+    fs::write(&path, written.replace("max_hz = 4000.0", &format!("max_hz = {band_hz}"))).unwrap();
+    let to = temp.path().join("rig.toml");
+    let range = "mu=0:1,speed=0.01:60";
+    let message = run(["reduce", &text(&path), "--range", range, "--points", "0", "-o", &text(&to)]).exits(0);
+    eprintln!("{}{}", message.stderr, message.stdout);
+    let rig = Rig::load(&text(&to)).unwrap();
+    assert!(rig.describe().contains("rotation   gyroscopic and spin terms of the disc"), "{}", rig.describe());
+    let full = FullModelFile::load(&path).unwrap();
+    let mut solver = FullSolver::new("tribometer", &full.model, None, &mut |_| {}).unwrap();
+    let counted = Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: -20.0 };
+    let mut roots = |disc_speed_rad_s: f64, friction_coefficient: f64| -> Vec<c64> {
+        let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s, friction_coefficient };
+        let found = solver.roots(&p, 1.1 * TAU * band_hz, FullVectors::None, &mut |_| {}).unwrap();
+        let truth: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
+        if disc_speed_rad_s >= 0.0 {
+            let found = match_roots(&truth, &modes(&rig, &p), counted);
+            let (count, worst) = (found.errors.len(), found.worst());
+            eprintln!("{disc_speed_rad_s} rad/s, {friction_coefficient}: {count} roots, off by {worst:.1e}");
+            assert!(count > 8 && worst < 1e-6, "{p:?}: {count} {worst:e}");
+        }
+        truth
+    };
+    let at_rest = roots(0.0, 0.0);
+    roots(13.0, 0.35);
+    roots(60.0, 0.77);
+    let (forward, backward) = (roots(60.0, 0.0), roots(-60.0, 0.0));
+    assert_eq!(forward.len(), backward.len());
+    for (a, b) in forward.iter().zip(&backward) {
+        // Residuals of 4e-12, and a gap to the next root of more than 1e-3.
+        assert!((a - b).norm() < 1e-9 * a.norm() && a.re.abs() < 1e-9 * a.norm(), "{a} {b}");
+    }
+    // The pair nearest to a disc's own pair of one nodal diameter or more moves apart.
+    let moved = at_rest.iter().zip(&forward).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max);
+    assert!(moved > 1.0, "{moved} rad/s");
+}
+
 /// Contact that stiffens with the load: a basis made at one load is found out by `verify` at others, and only there.
 #[test]
 fn a_rig_made_at_one_load_and_used_at_another_is_caught() {

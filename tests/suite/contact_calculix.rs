@@ -90,6 +90,7 @@ fn calculix_finds_the_same_contact_forces() {
         stiffness: vec![],
         damping: vec![],
         contact: Some(contact),
+        modal_damping: vec![],
         contact_law: ContactLaw::default(),
     };
     let load: SparseRow = back.iter().map(|&node| (row(node), -share(node) / total)).collect();

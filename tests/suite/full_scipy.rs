@@ -107,12 +107,16 @@ fn all_modes_of_the_parts_keep_rotation_and_damping() {
     let Some(expected) = expected() else { return };
     let mut worst = 0.0_f64;
     for (name, model) in expected["models"].as_object().unwrap() {
+        // A single damping ratio is of every mode of such a rig, but in the full model of those up to 2.5 times the band.
+        if name == "modal" {
+            continue;
+        }
         let file = model["file"].as_str().unwrap();
         let rig = text(&folder().join(format!("{name}-all.toml")));
         run(["reduce", file, "--modes", "108+168", "--no-residual", "--points", "0", "-o", &rig]).exits(0);
         let loaded = Rig::load(&rig).unwrap();
         let told = loaded.describe().contains("rotation   gyroscopic and spin terms of the disc");
-        assert_eq!(told, name != "rayleigh", "{}", loaded.describe());
+        assert_eq!(told, name == "both" || name.contains("turning"), "{}", loaded.describe());
         for case in model["cases"].as_array().unwrap() {
             let spectrum = Solver::new(loaded.model.dimension()).solve(&loaded.model, &point(case), Vectors::Right);
             let modes: Vec<c64> = spectrum.unwrap().modes().iter().map(|root| root.lambda).collect();

@@ -46,6 +46,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         parts: vec![chain("pad", 40, 4e6)?, chain("disc", 35, 5e6)?],
         stiffness: vec![],
         damping: vec![],
+        modal_damping: vec![],
         contact: Some(FullContact {
             normal: vec![row(12, 9), row(22, 18), row(33, 30)],
             sliding: vec![row(13, 11), row(20, 19), row(35, 28)],

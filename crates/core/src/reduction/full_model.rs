@@ -19,7 +19,7 @@ use faer::{Mat, MatRef};
 
 use super::dense::symmetric_eigen;
 use super::sparse::{SparseMatrix, entries, is_symmetric, times, times_transposed, weighted_sum, worst_asymmetry};
-use super::{ReductionError, project_dense, project_sparse, whiten};
+use super::{ReductionError, SparseModes, project_dense, project_sparse, whiten};
 use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Term};
 
 /// A part of a full model: a substructure with its contact interface free, or a whole system.
@@ -71,6 +71,8 @@ pub struct FullModel {
     pub stiffness: Vec<SparseTerm>,
     /// Terms of `C` in addition to contact pairs.
     pub damping: Vec<SparseTerm>,
+    /// Damping of modes of the parts.
+    pub modal_damping: Vec<ModalDamping>,
     /// Contact pairs; `None` for a model described by terms only.
     pub contact: Option<FullContact>,
     /// How contact and friction depend on load and speed.
@@ -101,6 +103,17 @@ pub struct PartTurning {
     pub spin: Option<SparseMatrix>,
     /// `K_σ`, symmetric: the force is `Ω² K_σ u`, of the stress of the centrifugal load at 1 rad/s.
     pub stress_stiffening: Option<SparseMatrix>,
+}
+
+/// Damping of some modes of a part: `C = W diag(2 ζ ω) Wᵀ` with `W = M Φ`.
+#[derive(Clone, Debug)]
+pub struct ModalDamping {
+    /// Index of the part.
+    pub part: usize,
+    /// `W`, with a row for each of the part, kg^1/2.
+    pub mass_times_modes: Mat<f64>,
+    /// `2 ζ ω` of each mode, 1/s, above 0.
+    pub rates_per_s: Vec<f64>,
 }
 
 /// Damping and rotation of a part in mass-normalised coordinates, all `k×k`.
@@ -183,7 +196,8 @@ impl FullModel {
     pub(super) fn is_undamped(&self) -> bool {
         let rubs = self.contact_law.slope_s_per_m != 0.0 || self.contact_law.lateral_damping;
         let dampers = |contact: &FullContact| contact.damping_n_s_per_m.iter().any(|damping| *damping != 0.0);
-        self.damping.is_empty() && !self.contact.as_ref().is_some_and(|contact| rubs || dampers(contact))
+        let inside = !self.damping.is_empty() || !self.modal_damping.is_empty();
+        !inside && !self.contact.as_ref().is_some_and(|contact| rubs || dampers(contact))
     }
 
     /// Value of `law` at `p`; a model without contact pairs is always closed.
@@ -192,7 +206,8 @@ impl FullModel {
         law.value(&self.contact_law, state, p)
     }
 
-    /// Assembles `M`, `C(p)` and `K(p)`, `n×n`, both triangles stored.
+    /// Assembles `M`, `C(p)` and `K(p)`, `n×n`, both triangles stored. `C` is without the damping of modes, which would
+    /// fill it.
     ///
     /// # Errors
     /// [`ReductionError::Factorisation`] if memory is insufficient.
@@ -326,7 +341,12 @@ impl FullModel {
             let on_basis = |term: &SparseTerm| Term { matrix: on_basis(term, basis.as_ref()), law: term.law.clone() };
             terms.iter().map(on_basis).collect()
         };
-        let (stiffness, damping) = (terms(&self.stiffness), terms(&self.damping));
+        let (stiffness, mut damping) = (terms(&self.stiffness), terms(&self.damping));
+        for (part, offset) in self.offsets().into_iter().enumerate() {
+            let rows = basis.subrows(offset, self.parts[part].mass.nrows());
+            let of_modes = self.modal_damping_of_part(part, rows);
+            damping.extend(of_modes.map(|matrix| Term { matrix, law: Law::Constant }));
+        }
         let contact = self.contact.as_ref().map(|contact| contact.on(basis.as_ref()));
         Ok(Projected { basis, omega_squared, contact, stiffness, damping })
     }
@@ -409,10 +429,63 @@ impl FullModel {
 
     /// `C(p) X`, or `C(p)ᵀ X` if `transposed`, without assembling `C`.
     pub(super) fn damping_times(&self, p: &OperatingPoint, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
-        let mut product = Mat::zeros(x.nrows(), x.ncols());
+        let mut product = self.modal_damping_times(x);
         let [_, contact] = self.contact_terms(p);
         self.add_terms(&self.damping, &contact, p, x, transposed, &mut product);
         product
+    }
+
+    /// The damping of modes times `X`; it is symmetric.
+    pub(super) fn modal_damping_times(&self, x: MatRef<'_, f64>) -> Mat<f64> {
+        let (mut product, offsets) = (Mat::zeros(x.nrows(), x.ncols()), self.offsets());
+        for ModalDamping { part, mass_times_modes, rates_per_s } in &self.modal_damping {
+            let mut rows = product.subrows_mut(offsets[*part], mass_times_modes.nrows());
+            let x = x.subrows(offsets[*part], mass_times_modes.nrows());
+            let along = mass_times_modes.transpose() * x;
+            rows += mass_times_modes
+                * Mat::from_fn(along.nrows(), along.ncols(), |mode, j| rates_per_s[mode] * along[(mode, j)]);
+        }
+        product
+    }
+
+    /// The factors `W` and `2 ζ ω` of the damping of all modes, `n×j` and `j`.
+    pub(super) fn modal_factors(&self) -> (Mat<f64>, Vec<f64>) {
+        let offsets = self.offsets();
+        let rates: Vec<f64> =
+            self.modal_damping.iter().flat_map(|of_part| of_part.rates_per_s.iter().copied()).collect();
+        let (mut rows, mut first) = (Mat::zeros(self.dimension(), rates.len()), 0);
+        for ModalDamping { part, mass_times_modes, .. } in &self.modal_damping {
+            let (n, count) = mass_times_modes.shape();
+            rows.submatrix_mut(offsets[*part], first, n, count).copy_from(mass_times_modes);
+            first += count;
+        }
+        (rows, rates)
+    }
+
+    /// Damps the lowest modes of part `part`: `ratios` are `ζ` of `modes`, in the same order.
+    pub fn damp_modes(&mut self, part: usize, modes: &SparseModes, ratios: &[f64]) {
+        let rate = |mode: usize| 2.0 * ratios[mode] * modes.omega_squared[mode].max(0.0).sqrt();
+        let damped: Vec<usize> = (0..ratios.len()).filter(|&mode| rate(mode) > 0.0).collect();
+        if damped.is_empty() {
+            return;
+        }
+        let phi = Mat::from_fn(modes.phi.nrows(), damped.len(), |i, j| modes.phi[(i, damped[j])]);
+        let mass_times_modes = times(&self.parts[part].mass, phi.as_ref());
+        let rates_per_s = damped.into_iter().map(rate).collect();
+        self.modal_damping.push(ModalDamping { part, mass_times_modes, rates_per_s });
+    }
+
+    /// The damping of modes of part `part` in the coordinates `phi`, with a row for each of the part, exactly symmetric;
+    /// `None` without any.
+    pub fn modal_damping_of_part(&self, part: usize, phi: MatRef<'_, f64>) -> Option<Mat<f64>> {
+        let of_part = self.modal_damping.iter().filter(|damping| damping.part == part);
+        let on_basis = |ModalDamping { mass_times_modes, rates_per_s, .. }: &ModalDamping| {
+            let along = mass_times_modes.transpose() * phi;
+            let rated = Mat::from_fn(along.nrows(), along.ncols(), |mode, j| rates_per_s[mode] * along[(mode, j)]);
+            let product = along.transpose() * rated;
+            Mat::from_fn(product.nrows(), product.ncols(), |i, j| product[(i.max(j), i.min(j))])
+        };
+        of_part.map(on_basis).reduce(|sum, matrix| sum + matrix)
     }
 
     /// `K(p) X`, or `K(p)ᵀ X` if `transposed`, without assembling `K`.
@@ -587,6 +660,7 @@ mod tests {
             parts: vec![part("pad", 1e6), part("disc", 3e6)],
             stiffness: vec![],
             damping: vec![],
+            modal_damping: vec![],
             contact: Some(FullContact {
                 normal: vec![vec![(2, 1.0), (5, -1.0)], vec![(1, 1.0), (4, -0.5)]],
                 sliding: vec![vec![(1, 1.0), (4, -1.0)], vec![(0, 1.0), (3, -1.0)]],

@@ -78,7 +78,8 @@ impl<'a> FullSolver<'a> {
         memory_limit_bytes: Option<usize>,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Self, ReductionError> {
-        let by_parts = model.stiffness.is_empty() && model.damping.is_empty() && model.contact.is_some();
+        let has_terms = !(model.stiffness.is_empty() && model.damping.is_empty() && model.modal_damping.is_empty());
+        let by_parts = !has_terms && model.contact.is_some();
         let parts = if by_parts { Some(Parts::new(model)?) } else { None };
         let what = what.to_owned();
         let mut solver =
@@ -106,7 +107,12 @@ impl<'a> FullSolver<'a> {
             Some(parts) => parts.bytes(),
             // The fill of a sparse LU is not known in advance: 400 entries a column are assumed, at most a tenth of a
             // full matrix.
-            None => PartBytes { held: 0, factors: size_of::<c64>() * (n * n / 10).min(400 * n), factoring: 0 },
+            // For each damped mode, a real vector and two complex ones are held as well.
+            None => {
+                let modes: usize = self.model.modal_damping.iter().map(|damping| damping.rates_per_s.len()).sum();
+                let factors = size_of::<c64>() * ((n * n / 10).min(400 * n) + 5 * n * modes / 2);
+                PartBytes { held: 0, factors, factoring: 0 }
+            }
         }
     }
 
@@ -369,6 +375,7 @@ pub(super) mod tests {
             parts: vec![FullPart { name: "system".into(), mass: sparse(n, &mass), stiffness: sparse(n, &[]) }],
             stiffness: vec![term(&stiffness)],
             damping: vec![term(&damping)],
+            modal_damping: vec![],
             contact: None,
             contact_law: ContactLaw::default(),
         };
@@ -463,6 +470,7 @@ pub(super) mod tests {
             parts: vec![part("pad", 1e6, 0.4), part("disc", 1.7e6, 0.9)],
             stiffness: vec![],
             damping: vec![],
+            modal_damping: vec![],
             contact: Some(FullContact {
                 normal: rows(1),
                 sliding: rows(0),

@@ -80,7 +80,12 @@ impl<'a> Problem<'a> {
             return Ok(Self { what, model, p: *p, vectors, undamped, low_rank, matrices: None, norms, growth_per_s });
         }
         let matrices = model.matrices_at(p)?;
-        let norms = [one_norm(&matrices[0]), one_norm(&matrices[1]), one_norm(&matrices[2])];
+        // Upper bound of the 1-norm of `W diag(r) Wᵀ`: the largest sum over its columns.
+        let (modes, rates) = model.modal_factors();
+        let sizes: Vec<f64> = modes.col_iter().zip(&rates).map(|(column, rate)| rate * column.norm_l1()).collect();
+        let column = |i: usize| sizes.iter().enumerate().map(|(j, size)| size * modes[(i, j)].abs()).sum::<f64>();
+        let of_modes = (0..modes.nrows()).map(column).fold(0.0, f64::max);
+        let norms = [one_norm(&matrices[0]), one_norm(&matrices[1]) + of_modes, one_norm(&matrices[2])];
         let low_rank = LowRank::default();
         Ok(Self {
             what,
@@ -101,6 +106,15 @@ impl<'a> Problem<'a> {
         // Real matrices multiply the real and imaginary parts as separate columns.
         let parts = Mat::from_fn(x.nrows(), 2 * k, |i, j| if j < k { x[(i, j)].re } else { x[(i, j - k)].im });
         let product = |which: usize| match (&self.matrices, which) {
+            (Some(matrices), 1) => {
+                let of_terms = if transposed { times_transposed } else { times };
+                let product = of_terms(&matrices[1], parts.as_ref());
+                if self.model.modal_damping.is_empty() {
+                    product
+                } else {
+                    product + self.model.modal_damping_times(parts.as_ref())
+                }
+            }
             (Some(matrices), _) if transposed => times_transposed(&matrices[which], parts.as_ref()),
             (Some(matrices), _) => times(&matrices[which], parts.as_ref()),
             (None, 0) => self.model.mass_times(parts.as_ref()),
@@ -214,7 +228,7 @@ impl<'a> Problem<'a> {
         let factor: Lu<usize, c64> =
             sum.sp_lu().map_err(|error| failed(format!("the sparse factor at {s} failed: {error:?}")))?;
         progress(FullProgress::Factored { shift_rad_s: omega });
-        let solve = |b: MatRef<'_, c64>, transposed: bool| {
+        let sparse = |b: MatRef<'_, c64>, transposed: bool| {
             let mut x = b.to_owned();
             if transposed {
                 factor.solve_transpose_in_place(x.as_mut());
@@ -222,6 +236,26 @@ impl<'a> Problem<'a> {
                 factor.solve_in_place(x.as_mut());
             }
             x
+        };
+        if self.model.modal_damping.is_empty() {
+            return self.linearised(omega, gap, &sparse, progress);
+        }
+        // Woodbury: (A + W S Wᵀ)⁻¹ b = A⁻¹ b - Z (I + S Wᵀ Z)⁻¹ S Wᵀ A⁻¹ b,  Z = A⁻¹ W,  S = diag(2 ζ ω s).
+        let (modes, rates) = self.model.modal_factors();
+        let modes = Mat::from_fn(n, modes.ncols(), |i, j| c64::new(modes[(i, j)], 0.0));
+        let weighted =
+            |along: Mat<c64>| Mat::from_fn(along.nrows(), along.ncols(), |i, j| s * rates[i] * along[(i, j)]);
+        let corrections = [false, true].map(|transposed| {
+            let responses = sparse(modes.as_ref(), transposed);
+            let coupled = weighted(modes.transpose() * &responses) + Mat::<c64>::identity(rates.len(), rates.len());
+            (responses, coupled.partial_piv_lu())
+        });
+        let solve = |b: MatRef<'_, c64>, transposed: bool| {
+            let x = sparse(b, transposed);
+            let (responses, coupled) = &corrections[usize::from(transposed)];
+            let mut along = weighted(modes.transpose() * &x);
+            coupled.solve_in_place(along.as_mut());
+            x - responses * along
         };
         self.linearised(omega, gap, &solve, progress)
     }

@@ -56,7 +56,9 @@ pub use compare::{
 };
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::{GIB, ReductionError};
-pub use full_model::{FullContact, FullModel, FullPart, PartMatrices, PartTurning, Projected, SparseRow, SparseTerm};
+pub use full_model::{
+    FullContact, FullModel, FullPart, ModalDamping, PartMatrices, PartTurning, Projected, SparseRow, SparseTerm,
+};
 pub use full_order::FullSolver;
 pub use full_root::{CoveredDisc, FullProgress, FullRoot, FullSpectrum, FullVectors};
 pub use matching::{Counted, RootMatch, match_roots};

@@ -171,7 +171,14 @@ mod tests {
             ..FullContact::default()
         };
         let (stiffness, damping, contact_law) = (vec![], vec![], ContactLaw::default());
-        FullModel { parts: vec![pad, disc], stiffness, damping, contact: Some(contact), contact_law }
+        FullModel {
+            parts: vec![pad, disc],
+            stiffness,
+            damping,
+            contact: Some(contact),
+            contact_law,
+            modal_damping: vec![],
+        }
     }
 
     /// The state by the static response, against the sparse matrices themselves: with its contact forces and its load, and

@@ -28,6 +28,7 @@ pub fn chains(damping: f64, contact_law: ContactLaw) -> FullModel {
         parts: vec![pad, disc],
         stiffness: vec![],
         damping: vec![],
+        modal_damping: vec![],
         contact: Some(FullContact {
             normal: vec![row(12, 9), row(22, 18), row(33, 30)],
             sliding: vec![row(13, 11), row(20, 19), row(35, 28)],
