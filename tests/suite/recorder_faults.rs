@@ -380,19 +380,31 @@ fn messages_are_flushed_and_put_on_the_disk_as_time_passes() {
     };
     let recorder = Recorder::start(config).unwrap();
     let counts = || (disk.writes.load(Ordering::SeqCst), disk.syncs.load(Ordering::SeqCst));
+    let at_rest = || {
+        until("the recorder to be at rest", || {
+            let before = counts();
+            std::thread::sleep(Duration::from_millis(200));
+            (counts() == before).then_some(before)
+        })
+    };
     for seq in 0..3 {
-        let (writes, syncs) = counts();
+        let (_, syncs) = at_rest();
         recorder.record(point(seq, T0 + seq));
-        until("the message on the disk", || (counts() > (writes, syncs) && counts().1 > syncs).then_some(()));
-        let active = files_below(temp.path()).into_iter().next().unwrap();
-        let readable = sequence_numbers(&Recording::open(&active).unwrap().messages().collect::<Vec<_>>());
-        assert_eq!(readable, (0..=seq).collect::<Vec<_>>());
+        until_on_the_disk(temp.path(), &(0..=seq).collect::<Vec<_>>());
+        until("the message to be synced", || (counts().1 > syncs).then_some(()));
     }
     // With nothing to write nothing is done.
-    let before = counts();
-    std::thread::sleep(Duration::from_millis(200));
-    assert_eq!(counts(), before);
+    at_rest();
     recorder.finish(LIMIT).unwrap();
+}
+
+/// Waits until the file that is being recorded holds inputs of just these sequence numbers.
+fn until_on_the_disk(directory: &Path, expected: &[u64]) {
+    until("the messages on the disk", || {
+        let active = files_below(directory).into_iter().next()?;
+        let recording = Recording::open(&active).ok()?;
+        (sequence_numbers(&recording.messages().collect::<Vec<_>>()) == expected).then_some(())
+    });
 }
 
 #[test]
@@ -406,8 +418,7 @@ fn a_recorder_panic_is_reported_and_its_files_are_recovered() {
     };
     let recorder = Recorder::start(config).unwrap();
     recorder.record(point(0, T0));
-    let written = disk.writes.load(Ordering::SeqCst);
-    until("a flush", || (disk.writes.load(Ordering::SeqCst) > written).then_some(()));
+    until_on_the_disk(temp.path(), &[0]);
     disk.panics.store(true, Ordering::SeqCst);
     recorder.record(point(1, T0 + 1));
     until("the end of the recorder", || matches!(recorder.status().state, State::Failed(_)).then_some(()));
