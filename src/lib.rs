@@ -15,20 +15,6 @@ macro_rules! note {
     ($($text:tt)*) => { $crate::text::notes::line(format_args!($($text)*)) };
 }
 
-/// Defines an enum of unit variants with `ALL`, the list of its variants in their order.
-macro_rules! listed {
-    ($(#[$of_enum:meta])* $visible:vis enum $name:ident { $($(#[$of_variant:meta])* $variant:ident,)+ }) => {
-        $(#[$of_enum])*
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-        $visible enum $name { $($(#[$of_variant])* $variant,)+ }
-
-        impl $name {
-            /// All variants, in the order of their definition.
-            $visible const ALL: [Self; [$(stringify!($variant)),+].len()] = [$(Self::$variant),+];
-        }
-    };
-}
-
 pub use squealcast_core::{contact, fem, physics, proof, reduction};
 pub use squealcast_msgs as msgs;
 

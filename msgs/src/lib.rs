@@ -25,6 +25,7 @@
 
 #![warn(missing_docs)]
 
+mod listed;
 pub mod schema;
 pub mod shm;
 
@@ -285,7 +286,7 @@ pub struct RigInfo {
 pub struct SessionEvent {
     /// The stamp of the event.
     pub header: Header,
-    /// One of [`event_kind`].
+    /// The number of a [`SessionEventKind`].
     pub kind: u8,
     /// Of a parameter: its name.
     pub name: String,
@@ -299,18 +300,38 @@ pub struct SessionEvent {
     pub hash: String,
 }
 
-/// The values of [`SessionEvent::kind`].
-pub mod event_kind {
-    /// A setting changed.
-    pub const PARAMETER: u8 = 0;
-    /// No input arrived in time.
-    pub const SILENCE: u8 = 1;
-    /// A stability map was computed.
-    pub const STABILITY_MAP: u8 = 2;
-    /// A chart was completed.
-    pub const CHART: u8 = 3;
-    /// Ends of windows were computed.
-    pub const WINDOW_ENDS: u8 = 4;
+listed! {
+    /// What a [`SessionEvent`] records.
+    pub enum SessionEventKind {
+        /// A setting changed.
+        Parameter,
+        /// No input arrived in time.
+        Silence,
+        /// A stability map was computed.
+        StabilityMap,
+        /// A chart was completed.
+        Chart,
+        /// Ends of windows were computed.
+        WindowEnds,
+    }
+}
+
+impl SessionEventKind {
+    /// Its number in [`SessionEvent::kind`], as in `SessionEvent.msg`. Numbers are never reused.
+    pub fn number(self) -> u8 {
+        match self {
+            Self::Parameter => 0,
+            Self::Silence => 1,
+            Self::StabilityMap => 2,
+            Self::Chart => 3,
+            Self::WindowEnds => 4,
+        }
+    }
+
+    /// The kind of `event`; `None` if its number is unknown, as of a recording by a later version.
+    pub fn of(event: &SessionEvent) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.number() == event.kind)
+    }
 }
 
 /// `diagnostic_msgs/DiagnosticArray`.
@@ -417,5 +438,37 @@ pub fn from_cdr<M: for<'de> Deserialize<'de>>(bytes: &[u8]) -> Result<M, CdrErro
         [0, 0, _, _, payload @ ..] => Ok(cdr_encoding::from_bytes::<M, byteorder::BigEndian>(payload)?.0),
         [0, 1, _, _, payload @ ..] => Ok(cdr_encoding::from_bytes::<M, byteorder::LittleEndian>(payload)?.0),
         _ => Err(CdrError::Message("no plain CDR encapsulation header".to_owned())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `STABILITY_MAP` of `StabilityMap`.
+    fn constant_name(variant: &str) -> String {
+        let mut name = String::new();
+        for letter in variant.chars() {
+            if letter.is_uppercase() && !name.is_empty() {
+                name.push('_');
+            }
+            name.extend(letter.to_uppercase());
+        }
+        name
+    }
+
+    #[test]
+    fn session_events_have_the_kinds_of_their_message_file() {
+        let file = include_str!("../msg/SessionEvent.msg");
+        let defined: Vec<&str> = file.lines().filter_map(|line| line.strip_prefix("uint8 ")).collect();
+        let kinds =
+            SessionEventKind::ALL.map(|kind| format!("{}={}", constant_name(&format!("{kind:?}")), kind.number()));
+        // The last line is the field itself.
+        assert_eq!(defined, [&kinds.each_ref().map(String::as_str)[..], &["kind"]].concat());
+        for kind in SessionEventKind::ALL {
+            let event = SessionEvent { kind: kind.number(), ..Default::default() };
+            assert_eq!(SessionEventKind::of(&event), Some(kind));
+        }
+        assert_eq!(SessionEventKind::of(&SessionEvent { kind: u8::MAX, ..Default::default() }), None);
     }
 }

@@ -3,25 +3,27 @@
 //! As `ros2 bag record` writes it, a schema is the text of the `.msg` file followed by every message it refers to. Each
 //! of those is preceded by a line of 80 `=` and a line `MSG: package/Type`.
 
-use crate::topic;
+use crate::{listed, topic};
 
-/// A topic that the node records, with its type, schema and quality of service.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Topic {
-    /// [`topic::OPERATING_POINT`]
-    OperatingPoint,
-    /// [`topic::PREDICTION`]
-    Prediction,
-    /// [`topic::SESSION_EVENT`]
-    SessionEvent,
-    /// [`topic::RIG`]
-    RigInfo,
-    /// [`topic::SENSITIVITY`]
-    Sensitivity,
-    /// [`topic::DIAGNOSTICS`]
-    Diagnostics,
-    /// [`topic::VIBRATION`]
-    Vibration,
+listed! {
+    /// A topic that the node records, with its type, schema and quality of service. Recordings list them in this order.
+    #[derive(PartialOrd, Ord)]
+    pub enum Topic {
+        /// [`topic::OPERATING_POINT`]
+        OperatingPoint,
+        /// [`topic::PREDICTION`]
+        Prediction,
+        /// [`topic::SESSION_EVENT`]
+        SessionEvent,
+        /// [`topic::RIG`]
+        RigInfo,
+        /// [`topic::SENSITIVITY`]
+        Sensitivity,
+        /// [`topic::DIAGNOSTICS`]
+        Diagnostics,
+        /// [`topic::VIBRATION`]
+        Vibration,
+    }
 }
 
 const HEADER: (&str, &str) = (
@@ -42,17 +44,6 @@ const KEY_VALUE: (&str, &str) = ("diagnostic_msgs/KeyValue", "string key\nstring
 const DIAGNOSTIC_ARRAY: &str = "std_msgs/Header header\nDiagnosticStatus[] status\n";
 
 impl Topic {
-    /// All topics, in the order in which recordings list them.
-    pub const ALL: [Self; 7] = [
-        Self::OperatingPoint,
-        Self::Prediction,
-        Self::SessionEvent,
-        Self::RigInfo,
-        Self::Sensitivity,
-        Self::Diagnostics,
-        Self::Vibration,
-    ];
-
     /// The topic's name on ROS 2 and in recordings.
     pub fn name(self) -> &'static str {
         match self {

@@ -16,6 +16,8 @@ pub use connection::{BusError, Connection, Outgoing, Report, Sink};
 pub use received::{Counts, Received};
 pub use shm_connection::ShmConnection;
 
+use crate::msgs::listed;
+
 listed! {
     /// The bus over which a message was received. Buses are joined and published to in this order.
     pub enum Bus {

@@ -13,7 +13,7 @@ use super::recordings::{Recordings, without_predictions};
 use super::{Outcome, failure, live, not_negative, positive, print, signals};
 use crate::bus::ros_args::RosArgs;
 use crate::msgs::schema::Topic;
-use crate::msgs::{Time, event_kind};
+use crate::msgs::{SessionEventKind, Time};
 use crate::node::Watch;
 use crate::offline::verify::{Charts, Verification, verify};
 use crate::recording::message::Payload;
@@ -213,12 +213,18 @@ impl Options {
                 match payload {
                     Payload::OperatingPoint(input) => watch.input(&input),
                     Payload::Prediction(prediction) => watch.prediction(&prediction),
-                    Payload::SessionEvent(event) if event.kind == event_kind::SILENCE => watch.silence(),
-                    Payload::SessionEvent(_)
-                    | Payload::RigInfo(_)
-                    | Payload::Sensitivity(_)
-                    | Payload::Diagnostics(_)
-                    | Payload::Vibration(_) => {}
+                    Payload::SessionEvent(event) => match SessionEventKind::of(&event) {
+                        Some(SessionEventKind::Silence) => watch.silence(),
+                        Some(
+                            SessionEventKind::Parameter
+                            | SessionEventKind::StabilityMap
+                            | SessionEventKind::Chart
+                            | SessionEventKind::WindowEnds,
+                        )
+                        | None => {}
+                    },
+                    Payload::RigInfo(_) | Payload::Sensitivity(_) | Payload::Diagnostics(_) | Payload::Vibration(_) => {
+                    }
                 }
             }
             let nothing = played.load(Ordering::Relaxed) == 0;

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use serde::Serialize;
 
-use crate::msgs::Time;
+use crate::msgs::{Time, listed};
 use crate::node::status::Status;
 use crate::node::{Sample, UnstableMode};
 

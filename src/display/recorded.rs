@@ -11,7 +11,7 @@ use super::server::{About, Note, Source};
 use super::shape::shape;
 use super::state::{Shown, State, spread, trend_per_s};
 use super::time_line::TimeLine;
-use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, event_kind, level};
+use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, SessionEventKind, level};
 use crate::node::status::{Assessment, Inputs, Status};
 use crate::node::{Sample, VibrationSample};
 use crate::physics::{Solver, StabilityMap};
@@ -137,7 +137,7 @@ impl Recorded {
                 }
                 Content::Known(Payload::Diagnostics(counted)) => recorded.counted = Some(counted),
                 Content::Known(Payload::SessionEvent(event)) => {
-                    if event.kind == event_kind::SILENCE {
+                    if SessionEventKind::of(&event) == Some(SessionEventKind::Silence) {
                         recorded.flow.silence();
                     }
                     recorded.session_events.push((line.unstamped(log_ns), event));
@@ -218,8 +218,13 @@ impl Recorded {
         self.vibration.compare(&self.events, self.span_s()?.1)
     }
 
+    /// The session events of one kind.
+    pub(super) fn events_of(&self, kind: SessionEventKind) -> impl Iterator<Item = &(i64, SessionEvent)> {
+        self.session_events.iter().filter(move |(_, event)| SessionEventKind::of(event) == Some(kind))
+    }
+
     fn map_events(&self) -> impl Iterator<Item = &(i64, SessionEvent)> {
-        self.session_events.iter().filter(|(_, event)| event.kind == event_kind::STABILITY_MAP)
+        self.events_of(SessionEventKind::StabilityMap)
     }
 
     /// Number of the map in force at a time, from 1; 0 before the first.
@@ -229,9 +234,9 @@ impl Recorded {
 
     /// The margin below which the node warned at a time; `None` if not recorded.
     pub fn warn_margin(&self, at_s: f64) -> Option<f64> {
-        let named = |event: &&SessionEvent| event.kind == event_kind::PARAMETER && event.name == "warn_margin";
-        let before = self.session_events.iter().take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7);
-        before.map(|(_, event)| event).filter(named).last().map(|event| event.value)
+        let settings = self.events_of(SessionEventKind::Parameter);
+        let before = settings.take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7);
+        before.map(|(_, event)| event).filter(|event| event.name == "warn_margin").last().map(|event| event.value)
     }
 
     /// The map with that number, computed again; `None` if there is none or the computation fails.
@@ -268,14 +273,14 @@ impl Source for Recorded {
         let notes = self.session_events.iter().filter_map(|(time_ns, event)| {
             let onset_s = seconds(*time_ns);
             let note = Note { onset_s, what: "chart ready", normal_load_n: None, disc_speed_rad_s: None };
-            match event.kind {
-                event_kind::CHART => Some(note),
-                event_kind::STABILITY_MAP => {
+            match SessionEventKind::of(event)? {
+                SessionEventKind::Chart => Some(note),
+                SessionEventKind::StabilityMap => {
                     let (load, speed) = (event.normal_load_n, event.disc_speed_rad_s);
                     let what = "stability map ready";
                     Some(Note { what, normal_load_n: Some(load), disc_speed_rad_s: Some(speed), ..note })
                 }
-                _ => None,
+                SessionEventKind::Parameter | SessionEventKind::Silence | SessionEventKind::WindowEnds => None,
             }
         });
         About {

@@ -8,7 +8,7 @@ use super::events::{Event, EventKind, EventMoment, Events, MomentColumn, iso, se
 use super::recorded::Recorded;
 use crate::figures::html::{escaped, facts, figure, page, section};
 use crate::figures::plot;
-use crate::msgs::{SessionEvent, event_kind};
+use crate::msgs::{SessionEvent, SessionEventKind};
 use crate::node::status::Status;
 
 /// Number of stability maps drawn.
@@ -159,7 +159,7 @@ fn session(recorded: &Recorded, origin: &Origin, from_s: f64, to_s: f64) -> Stri
         ("inputs", recorded.inputs.to_string()),
         ("predictions", format!("{} ({})", recorded.predictions(), counted.join(", "))),
     ];
-    let settings = recorded.session_events.iter().filter(|(_, event)| event.kind == event_kind::PARAMETER);
+    let settings = recorded.events_of(SessionEventKind::Parameter);
     let listed: Vec<String> = settings
         .map(|(time_ns, event)| match seconds(*time_ns) - from_s {
             late if late > STARTING_S => format!("{} = {} after {late:.2} s", event.name, event.value),
@@ -314,15 +314,19 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
 fn session_events(recorded: &Recorded, from_s: f64) -> String {
     let row = |(time_ns, event): &(i64, SessionEvent)| {
         let after_s = seconds(*time_ns) - from_s;
-        let (what, of) = match event.kind {
-            event_kind::STABILITY_MAP => {
+        let (what, of) = match SessionEventKind::of(event)? {
+            SessionEventKind::StabilityMap => {
                 ("stability map ready", format!("{:.1} N, {:.3} rad/s", event.normal_load_n, event.disc_speed_rad_s))
             }
-            event_kind::CHART => ("chart ready", "later predictions are evaluated from it".to_owned()),
-            event_kind::SILENCE => ("silence", "no input came for too long".to_owned()),
+            SessionEventKind::Chart => ("chart ready", "later predictions are evaluated from it".to_owned()),
+            SessionEventKind::Silence => ("silence", "no input came for too long".to_owned()),
+            SessionEventKind::Parameter if after_s > STARTING_S => {
+                ("setting", format!("{} = {}", event.name, event.value))
+            }
             // The initial settings are in the table at the top.
-            event_kind::PARAMETER if after_s > STARTING_S => ("setting", format!("{} = {}", event.name, event.value)),
-            _ => return None,
+            SessionEventKind::Parameter => return None,
+            // Up to ten a second.
+            SessionEventKind::WindowEnds => return None,
         };
         let hash = event.hash.get(..12).unwrap_or_default();
         let cells = [format!("{after_s:.3}"), what.to_owned(), escaped(&of), escaped(hash)];

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::*;
-use crate::msgs::event_kind;
+use crate::msgs::SessionEventKind;
 use crate::recording::reader::{Recorded, Recording};
 use crate::recording::recorder::{QUEUE_MESSAGES, Recorder, RecorderConfig};
 
@@ -110,8 +110,9 @@ fn silence_is_a_fault_once_and_the_next_input_ends_it() {
     node.until("a prediction", |node| !fault(node));
     node.until("another fault", fault);
     let recorded = node.recorded();
-    let silences =
-        recorded.iter().filter(|p| matches!(p, Payload::SessionEvent(event) if event.kind == event_kind::SILENCE));
+    let silences = recorded.iter().filter(
+        |p| matches!(p, Payload::SessionEvent(event) if SessionEventKind::of(event) == Some(SessionEventKind::Silence)),
+    );
     assert_eq!(silences.count(), 2);
     assert_eq!(predicted(&recorded), [(0, false), (0, true), (1, false), (1, true)]);
 }

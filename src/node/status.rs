@@ -6,23 +6,25 @@ use std::fmt::Write;
 use serde::Serialize;
 
 use super::watch::{UnstableMode, fastest_modes};
-use crate::msgs::{OperatingPoint, Prediction, level};
+use crate::msgs::{OperatingPoint, Prediction, level, listed};
 use crate::physics::{Ends, OperatingPoint as Point, StabilityMap};
 use crate::session::conditions;
 use crate::text::number::significant;
 
-/// The status of a node.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Status {
-    /// No input has been received yet.
-    Waiting,
-    Ok,
-    Warn,
-    Squeal,
-    Fault,
-    /// Inputs were received and have stopped.
-    NoData,
+listed! {
+    /// The status of a node.
+    #[derive(Serialize)]
+    #[serde(rename_all = "snake_case")]
+    pub enum Status {
+        /// No input has been received yet.
+        Waiting,
+        Ok,
+        Warn,
+        Squeal,
+        Fault,
+        /// Inputs were received and have stopped.
+        NoData,
+    }
 }
 
 /// Whether inputs arrive.
@@ -50,9 +52,6 @@ impl Inputs {
 }
 
 impl Status {
-    /// Every status.
-    pub const ALL: [Self; 6] = [Self::Waiting, Self::Ok, Self::Warn, Self::Squeal, Self::Fault, Self::NoData];
-
     /// The status for the latest prediction's `level`; `None` before the first prediction.
     pub fn new(level: Option<u8>, inputs: Inputs) -> Self {
         match (level, inputs) {

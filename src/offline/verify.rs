@@ -12,7 +12,7 @@ use bytes::Bytes;
 
 use super::ahead::Ahead;
 use crate::files::chart_file::ChartFile;
-use crate::msgs::{self, Prediction, SessionEvent, Time, event_kind};
+use crate::msgs::{self, Prediction, SessionEvent, SessionEventKind, Time};
 use crate::physics::{Chart, OperatingPoint, Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded, Recording};
@@ -195,17 +195,19 @@ fn session_event(
         let event = compute(rig, solver, map, &request).map_err(failed)?;
         event.ok_or_else(|| failed("the ends of its windows are not found again".to_owned()))
     };
-    let (event, what) = match recorded.kind {
-        event_kind::PARAMETER => return Ok(Event::Parameter { name: recorded.name, value: recorded.value }),
-        event_kind::SILENCE => return Ok(Event::Silence { stamp: recorded.header.stamp }),
-        event_kind::STABILITY_MAP => {
+    let kind = SessionEventKind::of(&recorded).ok_or(VerifyError::EventKind { kind: recorded.kind })?;
+    let (event, what) = match kind {
+        SessionEventKind::Parameter => return Ok(Event::Parameter { name: recorded.name, value: recorded.value }),
+        SessionEventKind::Silence => return Ok(Event::Silence { stamp: recorded.header.stamp }),
+        SessionEventKind::StabilityMap => {
             (computed(Request::Map(point))?, format!("stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s"))
         }
-        event_kind::WINDOW_ENDS => {
+        SessionEventKind::WindowEnds => {
             (computed(Request::Ends(point))?, format!("window ends at {normal_load_n} N, {disc_speed_rad_s} rad/s"))
         }
-        event_kind::CHART => (Event::ChartReady(Arc::new(chart(rig, charts, &recorded.hash)?)), "chart".to_owned()),
-        kind => return Err(VerifyError::EventKind { kind }),
+        SessionEventKind::Chart => {
+            (Event::ChartReady(Arc::new(chart(rig, charts, &recorded.hash)?)), "chart".to_owned())
+        }
     };
     let again = record_of(&event, recorded.header).map(|record| record.hash);
     if again != Some(recorded.hash) {

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use sha2::{Digest, Sha256};
 
 use super::{Event, chart_options, map_options};
-use crate::msgs::{Header, SessionEvent, event_kind};
+use crate::msgs::{Header, SessionEvent, SessionEventKind};
 use crate::physics::chart::build::{ChartOptions, build};
 use crate::physics::{Chart, Ends, OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
@@ -52,8 +52,8 @@ pub fn compute(
 
 /// The session event that records `event`; `None` for an input, which is recorded itself.
 pub fn record_of(event: &Event, header: Header) -> Option<SessionEvent> {
-    let at = |kind: u8, point: &OperatingPoint, hash: String| SessionEvent {
-        kind,
+    let at = |kind: SessionEventKind, point: &OperatingPoint, hash: String| SessionEvent {
+        kind: kind.number(),
         normal_load_n: point.normal_load_n,
         disc_speed_rad_s: point.disc_speed_rad_s,
         hash,
@@ -62,11 +62,11 @@ pub fn record_of(event: &Event, header: Header) -> Option<SessionEvent> {
     let record = match event {
         Event::Input(_) => return None,
         Event::Parameter { name, value } => return Some(parameter_record(header, name, *value)),
-        Event::Silence { .. } => SessionEvent { kind: event_kind::SILENCE, ..Default::default() },
-        Event::MapReady(map) => at(event_kind::STABILITY_MAP, &map.point, hash(map.words().into_iter())),
-        Event::EndsReady(ends) => at(event_kind::WINDOW_ENDS, &ends.point, hash(ends.words())),
+        Event::Silence { .. } => SessionEvent { kind: SessionEventKind::Silence.number(), ..Default::default() },
+        Event::MapReady(map) => at(SessionEventKind::StabilityMap, &map.point, hash(map.words().into_iter())),
+        Event::EndsReady(ends) => at(SessionEventKind::WindowEnds, &ends.point, hash(ends.words())),
         Event::ChartReady(chart) => {
-            SessionEvent { kind: event_kind::CHART, hash: chart_hash(chart), ..Default::default() }
+            SessionEvent { kind: SessionEventKind::Chart.number(), hash: chart_hash(chart), ..Default::default() }
         }
     };
     Some(SessionEvent { header, ..record })
@@ -74,7 +74,8 @@ pub fn record_of(event: &Event, header: Header) -> Option<SessionEvent> {
 
 /// The session event that records the value of a setting.
 pub fn parameter_record(header: Header, name: &str, value: f64) -> SessionEvent {
-    SessionEvent { header, kind: event_kind::PARAMETER, name: name.to_owned(), value, ..Default::default() }
+    let kind = SessionEventKind::Parameter.number();
+    SessionEvent { header, kind, name: name.to_owned(), value, ..Default::default() }
 }
 
 /// The stability map that a session uses at the load and speed of `point`.

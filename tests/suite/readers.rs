@@ -12,7 +12,7 @@ use squealcast::bus::received::Received;
 use squealcast::bus::shm::{ShmOptions, ShmReader};
 use squealcast::msgs::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
 use squealcast::msgs::shm::{OperatingPointForm, SensitivityForm};
-use squealcast::msgs::{Header, OperatingPoint, Sensitivity, Time, Vibration, event_kind};
+use squealcast::msgs::{Header, OperatingPoint, Sensitivity, SessionEventKind, Time, Vibration};
 use squealcast::offline::verify::{Charts, verify};
 use squealcast::recording::mcap_file::{FileSystem, RecordingFile};
 use squealcast::recording::message::Payload;
@@ -389,21 +389,21 @@ fn a_hash_that_differs_is_a_difference() {
     let check =
         |path: &Path| verify(&Recording::open(path).expect("a recording"), &rig, Charts::Kept).expect("verified");
     assert!(check(&session).agrees());
-    for kind in [event_kind::STABILITY_MAP, event_kind::WINDOW_ENDS, event_kind::CHART] {
-        let changed = folder.path().join(format!("{kind}.mcap"));
+    for kind in [SessionEventKind::StabilityMap, SessionEventKind::WindowEnds, SessionEventKind::Chart] {
+        let changed = folder.path().join(format!("{kind:?}.mcap"));
         let mut count = 0;
         copy(&session, &changed, |entry| {
             if let Recorded::Known(Payload::SessionEvent(event)) = &mut entry.message
-                && event.kind == kind
+                && event.kind == kind.number()
                 && count == 0
             {
                 count = 1;
                 event.hash = format!("{}0", &event.hash[1..]);
             }
         });
-        assert_eq!(count, 1, "the session has no event of kind {kind}");
+        assert_eq!(count, 1, "the session has no event of kind {kind:?}");
         let found = check(&changed);
-        assert_eq!((found.different_maps, found.different, found.agrees()), (1, 0, false), "kind {kind}: {found:?}");
+        assert_eq!((found.different_maps, found.different, found.agrees()), (1, 0, false), "kind {kind:?}: {found:?}");
     }
 }
 

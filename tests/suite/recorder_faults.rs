@@ -15,7 +15,7 @@ use std::{
 
 use crate::program::{self, Running, command, files_below, folder, run, text};
 use crate::records::*;
-use squealcast::msgs::{Header, SessionEvent, Time, event_kind};
+use squealcast::msgs::{Header, SessionEvent, SessionEventKind, Time};
 use squealcast::recording::mcap_file::{Disk, FileSystem};
 use squealcast::recording::message::{Message, Payload};
 use squealcast::recording::reader::Recording;
@@ -649,7 +649,9 @@ fn each_file_of_a_session_verifies_by_itself() {
     let settings = |file: &Path| -> BTreeSet<String> {
         let recording = Recording::open(file).unwrap();
         let name = |payload: &Payload| match payload {
-            Payload::SessionEvent(event) if event.kind == event_kind::PARAMETER => Some(event.name.clone()),
+            Payload::SessionEvent(event) if event.kind == SessionEventKind::Parameter.number() => {
+                Some(event.name.clone())
+            }
             _ => None,
         };
         recording.messages().filter_map(|entry| name(known(&entry)?)).collect()

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use crate::program::{Running, command, files_below, folder, launch, promised, run, text, until, write};
-use squealcast::msgs::event_kind;
+use squealcast::msgs::SessionEventKind;
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
 use tempfile::TempDir;
@@ -65,15 +65,15 @@ fn a_moving_load_carries_the_windows_along() {
     run(["simulate", "--profile", &profile, "--rig", &rig, "--rate", "50", "--duration", "2", "--record", &out])
         .exits(0);
     let file = mcap(folder.path());
-    let events = |kind: u8| {
+    let events = |kind: SessionEventKind| {
         let recording = Recording::open(&file).expect("a recording");
         let of_kind = recording.messages().filter(|entry| match &entry.message {
-            Recorded::Known(Payload::SessionEvent(event)) => event.kind == kind,
+            Recorded::Known(Payload::SessionEvent(event)) => event.kind == kind.number(),
             _ => false,
         });
         of_kind.count()
     };
-    assert!(events(event_kind::STABILITY_MAP) >= 2 && events(event_kind::WINDOW_ENDS) >= 5);
+    assert!(events(SessionEventKind::StabilityMap) >= 2 && events(SessionEventKind::WindowEnds) >= 5);
     run(["replay", "--verify", &text(&file)]).exits(0).says("0 different, 0 missing, 0 extra");
 }
 
@@ -255,14 +255,16 @@ fn a_node_predicts_inputs_of_shared_memory_until_it_is_stopped() {
         check_finished(&session);
         let recording = Recording::open(&session).expect("a recording");
         // The rig was charted while it ran, and sensitivities were published.
-        let kinds: Vec<u8> = recording
+        let kinds: Vec<SessionEventKind> = recording
             .messages()
             .filter_map(|entry| match entry.message {
-                Recorded::Known(Payload::SessionEvent(event)) => Some(event.kind),
+                Recorded::Known(Payload::SessionEvent(event)) => SessionEventKind::of(&event),
                 _ => None,
             })
             .collect();
-        assert!(kinds.contains(&event_kind::CHART) && kinds.contains(&event_kind::STABILITY_MAP), "{kinds:?}");
+        for kind in [SessionEventKind::Chart, SessionEventKind::StabilityMap] {
+            assert!(kinds.contains(&kind), "{kinds:?}");
+        }
         let sensitivity = sensitivity_with_an_end(&session).expect("it was waited for");
         assert!((sensitivity.nearest_window_end - 0.82001495938185).abs() < 1e-10, "{sensitivity:?}");
         assert_eq!((sensitivity.modes.len(), sensitivity.nearest_window_end_derivatives.by_normal_load_n), (9, 0.0));

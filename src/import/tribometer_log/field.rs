@@ -2,23 +2,22 @@
 
 use std::{f64::consts::TAU, fmt};
 
-/// A quantity in a column; the name contains the unit in which it is stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Field {
-    /// Time of measurement.
-    Time,
-    NormalLoadN,
-    DiscSpeedRadS,
-    FrictionCoefficient,
-    /// Alternative to the friction coefficient, which is then this force over the normal load.
-    FrictionForceN,
+use crate::msgs::listed;
+
+listed! {
+    /// A quantity in a column; the name contains the unit in which it is stored.
+    pub enum Field {
+        /// Time of measurement.
+        Time,
+        NormalLoadN,
+        DiscSpeedRadS,
+        FrictionCoefficient,
+        /// Alternative to the friction coefficient, which is then this force over the normal load.
+        FrictionForceN,
+    }
 }
 
 impl Field {
-    /// All quantities.
-    pub const ALL: [Self; 5] =
-        [Self::Time, Self::NormalLoadN, Self::DiscSpeedRadS, Self::FrictionCoefficient, Self::FrictionForceN];
-
     /// Name in options and messages.
     pub fn name(self) -> &'static str {
         match self {

@@ -12,7 +12,7 @@ use crossbeam_channel::{Receiver, RecvTimeoutError};
 use mcap::records::Metadata;
 
 use super::{Command, FORMAT, METADATA_NAME, RecorderConfig, RecorderError, Shared, State, chain, make_directory};
-use crate::msgs::{event_kind, schema::Topic};
+use crate::msgs::{SessionEventKind, schema::Topic};
 use crate::recording::bag::{self, FileSummary};
 use crate::recording::mcap_file::{RecordingFile, Whereabouts, WriteError};
 use crate::recording::message::{Message, Payload};
@@ -46,13 +46,13 @@ impl InForce {
     fn of(payload: &Payload) -> Option<Self> {
         match payload {
             Payload::RigInfo(_) => Some(Self::Rig),
-            Payload::SessionEvent(event) => match event.kind {
-                event_kind::PARAMETER => Some(Self::Setting(event.name.clone())),
-                event_kind::STABILITY_MAP => Some(Self::StabilityMap),
-                event_kind::WINDOW_ENDS => Some(Self::WindowEnds),
-                event_kind::CHART => Some(Self::Chart),
+            Payload::SessionEvent(event) => match SessionEventKind::of(event)? {
+                SessionEventKind::Parameter => Some(Self::Setting(event.name.clone())),
+                SessionEventKind::StabilityMap => Some(Self::StabilityMap),
+                SessionEventKind::WindowEnds => Some(Self::WindowEnds),
+                SessionEventKind::Chart => Some(Self::Chart),
                 // A silence ends with the next input.
-                _ => None,
+                SessionEventKind::Silence => None,
             },
             Payload::OperatingPoint(_)
             | Payload::Prediction(_)

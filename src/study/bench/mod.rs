@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use faer::{Mat, c64};
 use serde::Serialize;
 
+use crate::msgs::listed;
 use crate::physics::chart::Scratch;
 use crate::physics::chart::build::{ChartError, ChartOptions, Progress, resume};
 use crate::physics::{
@@ -161,28 +162,19 @@ pub enum BenchError {
     },
 }
 
-/// A way to the roots at an operating point.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Way {
-    DenseValues,
-    DenseVectors,
-    ChartValues,
-    ChartBounds,
-    LapackValues,
-    LapackVectors,
+listed! {
+    /// A way to the roots at an operating point. Results list them in this order.
+    enum Way {
+        DenseValues,
+        DenseVectors,
+        ChartValues,
+        ChartBounds,
+        LapackValues,
+        LapackVectors,
+    }
 }
 
 impl Way {
-    /// All ways, in the order in which they are listed.
-    const ALL: [Self; 6] = [
-        Self::DenseValues,
-        Self::DenseVectors,
-        Self::ChartValues,
-        Self::ChartBounds,
-        Self::LapackValues,
-        Self::LapackVectors,
-    ];
-
     fn name(self) -> &'static str {
         match self {
             Self::DenseValues => "dense values",
@@ -356,7 +348,7 @@ struct Routes<'a> {
     /// Roots of the chart at the present operating point: values only, and with bounds.
     bare: Vec<c64>,
     charted: Vec<Root>,
-    samples: [Samples; 6],
+    samples: [Samples; Way::ALL.len()],
     pairs_compared: usize,
     not_refined: usize,
 }
