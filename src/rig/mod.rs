@@ -28,6 +28,7 @@ pub(crate) mod settings;
 mod source;
 pub(crate) mod system;
 pub mod uff;
+mod warning;
 
 use faer::Mat;
 
@@ -41,6 +42,7 @@ pub use modal_data::{ModalData, Residual};
 pub use patch::Pair;
 pub use residual::{SideResidual, between_patches};
 pub use settings::Settings;
+pub use warning::Warning;
 
 use source::Source;
 
@@ -182,19 +184,6 @@ pub struct ChartRange {
     pub disc_speed_rad_s: [f64; 2],
     /// Largest relative error of `λ²` on the chart.
     pub tolerance: f64,
-}
-
-/// Thresholds of warnings.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Warning {
-    /// WARN if the margin to the critical friction coefficient is below this.
-    pub margin: f64,
-    /// SQUEAL if a mode's damping ratio falls below this (negative: growing).
-    pub damping_ratio: f64,
-    /// SQUEAL ends when every damping ratio exceeds `damping_ratio` by at least this.
-    pub hysteresis: f64,
-    /// FAULT after this much silence, s.
-    pub silence_s: f64,
 }
 
 impl MadeFor {

@@ -4,6 +4,7 @@ use serde::Deserialize;
 
 use super::RigError;
 use super::certificate::Certificate;
+pub use super::warning::Warning;
 use crate::files::input_file;
 
 /// The format of rig files and full models that this program reads. A file without the key `format` has format 1.
@@ -20,7 +21,7 @@ macro_rules! with_common_tables {
                 friction: RawFriction,
                 load: RawLoad,
                 limits: RawLimits,
-                warning: RawWarning,
+                warning: Warning,
                 chart: RawChart,
             ]
             $($rest)*
@@ -127,11 +128,6 @@ table_with_defaults! {
         friction_coefficient: [f64; 2] = [0.0, 2.0],
     }
 }
-table_with_defaults! {
-    /// `[warning]`.
-    RawWarning { margin: f64 = 0.05, damping_ratio: f64 = -1e-3, hysteresis: f64 = 5e-4, silence_s: f64 = 1.0, }
-}
-
 table_with_defaults! {
     /// `[chart]`: the box of conditions that the chart covers.
     RawChart {

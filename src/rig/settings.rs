@@ -103,12 +103,7 @@ pub fn check(file: &str, raw: &Common) -> Result<Settings, RigError> {
             disc_speed_rad_s: range("limits.disc_speed_rad_s", raw.limits.disc_speed_rad_s)?,
             friction_coefficient: range("limits.friction_coefficient", raw.limits.friction_coefficient)?,
         },
-        warning: Warning {
-            margin: not_negative("warning.margin", raw.warning.margin)?,
-            damping_ratio: number("warning.damping_ratio", raw.warning.damping_ratio)?,
-            hysteresis: not_negative("warning.hysteresis", raw.warning.hysteresis)?,
-            silence_s: positive("warning.silence_s", raw.warning.silence_s)?,
-        },
+        warning: raw.warning.check(file)?,
         chart: ChartRange {
             normal_load_n: positive_range("chart.normal_load_n", raw.chart.normal_load_n)?,
             disc_speed_rad_s: positive_range("chart.disc_speed_rad_s", raw.chart.disc_speed_rad_s)?,

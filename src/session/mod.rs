@@ -456,7 +456,17 @@ impl Session {
         let mut because = |text: std::fmt::Arguments<'_>| {
             let _ = reason.write_fmt(text); // writing to a String cannot fail
         };
-        let Settings { squeal_damping_ratio: begins, squeal_hysteresis, warn_margin, .. } = self.settings;
+        let Settings {
+            squeal_damping_ratio: begins,
+            squeal_hysteresis,
+            warn_margin,
+            // These affect when a prediction is made, not its level.
+            silence_timeout_s: _,
+            dead_band_load_n: _,
+            dead_band_speed_rad_s: _,
+            dead_band_friction: _,
+            map_tolerance: _,
+        } = self.settings;
         let ends = begins + squeal_hysteresis;
         let fastest_below = |limit: f64| {
             let below = summary.modes.iter().filter(|mode| mode.root.damping_ratio() < limit);

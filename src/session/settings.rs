@@ -1,27 +1,6 @@
 //! The settings of a session, which can be changed while the node runs, with their validation.
 
-use crate::rig::Rig;
-
-/// Thresholds of levels, dead-bands for reuse, and the silence timeout.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Settings {
-    /// WARN if the margin to the nearest end of a window is below this.
-    pub warn_margin: f64,
-    /// SQUEAL if a mode's damping ratio falls below this.
-    pub squeal_damping_ratio: f64,
-    /// SQUEAL ends when every damping ratio exceeds the limit by at least this.
-    pub squeal_hysteresis: f64,
-    /// FAULT after this much silence, s.
-    pub silence_timeout_s: f64,
-    /// Dead-band of load: the previous prediction is reused for changes up to this, N.
-    pub dead_band_load_n: f64,
-    /// Dead-band of speed: the previous prediction is reused for changes up to this, rad/s.
-    pub dead_band_speed_rad_s: f64,
-    /// Dead-band of the friction coefficient: the previous prediction is reused for changes up to this.
-    pub dead_band_friction: f64,
-    /// Largest relative change of load or speed from those of the stability map for which its windows are still used.
-    pub map_tolerance: f64,
-}
+use crate::rig::{Rig, Warning};
 
 /// Why a setting was refused.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -41,65 +20,52 @@ pub struct Parameter {
     field: fn(&mut Settings) -> &mut f64,
 }
 
-/// All parameters of a session. Names carry units.
-pub const PARAMETERS: [Parameter; 8] = [
-    Parameter {
-        name: "warn_margin",
-        description: "WARN when the margin to the critical friction coefficient is below this",
-        low: 0.0,
-        high: 100.0,
-        field: |s| &mut s.warn_margin,
-    },
-    Parameter {
-        name: "squeal_damping_ratio",
-        description: "SQUEAL when a mode's damping ratio falls below this (negative: growing)",
-        low: -1.0,
-        high: 1.0,
-        field: |s| &mut s.squeal_damping_ratio,
-    },
-    Parameter {
-        name: "squeal_hysteresis",
-        description: "SQUEAL ends when every damping ratio is above its limit by this much",
-        low: 0.0,
-        high: 1.0,
-        field: |s| &mut s.squeal_hysteresis,
-    },
-    Parameter {
-        name: "silence_timeout_s",
-        description: "FAULT after this much silence, in seconds",
-        low: 1e-3,
-        high: 1e6,
-        field: |s| &mut s.silence_timeout_s,
-    },
-    Parameter {
-        name: "dead_band_load_n",
-        description: "changes of load up to this reuse the previous prediction, in N",
-        low: 0.0,
-        high: 1e6,
-        field: |s| &mut s.dead_band_load_n,
-    },
-    Parameter {
-        name: "dead_band_speed_rad_s",
-        description: "changes of disc speed up to this reuse the previous prediction, in rad/s",
-        low: 0.0,
-        high: 1e4,
-        field: |s| &mut s.dead_band_speed_rad_s,
-    },
-    Parameter {
-        name: "dead_band_friction",
-        description: "changes of friction coefficient up to this reuse the previous prediction",
-        low: 0.0,
-        high: 10.0,
-        field: |s| &mut s.dead_band_friction,
-    },
-    Parameter {
-        name: "map_tolerance",
-        description: "relative change of load or speed after which windows of instability no longer count",
-        low: 0.0,
-        high: 1.0,
-        field: |s| &mut s.map_tolerance,
-    },
-];
+/// Declares the settings: name, initial value, closed range and description. Initial values may use the thresholds of
+/// the rig, all of which are named first.
+macro_rules! settings {
+    (of $rig:pat, $($name:ident = $initial:expr, from $low:expr, to $high:expr, $description:literal;)*) => {
+        /// Thresholds of levels, dead-bands for reuse, and the silence timeout.
+        #[derive(Clone, Copy, Debug, PartialEq)]
+        pub struct Settings { $(#[doc = $description] pub $name: f64,)* }
+
+        /// All parameters of a session, one for each of its [`Settings`]. Names carry units.
+        pub const PARAMETERS: [Parameter; [$(stringify!($name)),*].len()] = [$(Parameter {
+            name: stringify!($name),
+            description: $description,
+            low: $low,
+            high: $high,
+            field: |settings| &mut settings.$name,
+        },)*];
+
+        impl Settings {
+            /// The initial settings of a session with `rig`.
+            pub fn for_rig(rig: &Rig) -> Self {
+                let $rig = rig.warning;
+                Self { $($name: $initial,)* }
+            }
+        }
+    };
+}
+
+settings! {
+    of Warning { margin, damping_ratio, hysteresis, silence_s },
+    warn_margin = margin, from Warning::LEAST.margin, to Warning::MOST.margin,
+        "WARN when the margin to the critical friction coefficient is below this";
+    squeal_damping_ratio = damping_ratio, from Warning::LEAST.damping_ratio, to Warning::MOST.damping_ratio,
+        "SQUEAL when a mode's damping ratio falls below this (negative: growing)";
+    squeal_hysteresis = hysteresis, from Warning::LEAST.hysteresis, to Warning::MOST.hysteresis,
+        "SQUEAL ends when every damping ratio is above its limit by this much";
+    silence_timeout_s = silence_s, from Warning::LEAST.silence_s, to Warning::MOST.silence_s,
+        "FAULT after this much silence, in seconds";
+    dead_band_load_n = 0.0, from 0.0, to 1e6,
+        "changes of load up to this reuse the previous prediction, in N";
+    dead_band_speed_rad_s = 0.0, from 0.0, to 1e4,
+        "changes of disc speed up to this reuse the previous prediction, in rad/s";
+    dead_band_friction = 0.0, from 0.0, to 10.0,
+        "changes of friction coefficient up to this reuse the previous prediction";
+    map_tolerance = 0.01, from 0.0, to 1.0,
+        "relative change of load or speed after which windows of instability no longer count";
+}
 
 /// Looks up a parameter and checks `value` against its range.
 ///
@@ -119,20 +85,6 @@ pub fn validate(name: &str, value: f64) -> Result<&'static Parameter, SettingErr
 }
 
 impl Settings {
-    /// The initial settings of a session with `rig`.
-    pub fn for_rig(rig: &Rig) -> Self {
-        Self {
-            warn_margin: rig.warning.margin,
-            squeal_damping_ratio: rig.warning.damping_ratio,
-            squeal_hysteresis: rig.warning.hysteresis,
-            silence_timeout_s: rig.warning.silence_s,
-            dead_band_load_n: 0.0,
-            dead_band_speed_rad_s: 0.0,
-            dead_band_friction: 0.0,
-            map_tolerance: 0.01,
-        }
-    }
-
     /// Changes one setting.
     ///
     /// # Errors

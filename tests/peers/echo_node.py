@@ -10,16 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-DEFAULTS = {
-    "warn_margin": 0.05,
-    "squeal_damping_ratio": -0.001,
-    "squeal_hysteresis": 0.0005,
-    "silence_timeout_s": 1.0,
-    "dead_band_load_n": 0.0,
-    "dead_band_speed_rad_s": 0.0,
-    "dead_band_friction": 0.0,
-    "map_tolerance": 0.01,
-}
+from exchange import parameters
+
 DEFECTS = [
     *("none", "drop", "duplicate", "swap", "stamp", "seq", "fault"),  # of the answers
     *("accept-all", "no-reason", "no-rig", "no-diagnostics", "no-silence", "chatty-silence"),
@@ -104,7 +96,7 @@ def main() -> int:
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
-    for name, value in DEFAULTS.items():
+    for name, value in parameters().items():
         node.declare_parameter(name, value)
     node.add_on_set_parameters_callback(validate)
     node.create_subscription(OperatingPoint, "/rig/operating_point", on_point, qos)

@@ -8,10 +8,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 LEVELS = ("OK", "WARN", "SQUEAL", "FAULT")
 FAULT = 3
 DEPTH = 64  # of every queue: reliable, keep last 64, by default
+PARAMETERS = Path(__file__).parents[2] / "launch" / "params.yaml"
+
+
+def parameters() -> dict[str, float]:
+    """The node's parameters with their defaults, as the file that users are given lists them."""
+    import yaml  # rclpy needs it too; other peers need no parameters
+
+    return yaml.safe_load(PARAMETERS.read_text())["/**/squealcast"]["ros__parameters"]
 
 
 def arguments(description: str) -> argparse.ArgumentParser:

@@ -12,19 +12,10 @@ import sys
 import threading
 import time
 
-from exchange import Answer, Exchange, arguments, bound_run_time, run_time_limit, wait_until
+from exchange import Answer, Exchange, arguments, bound_run_time, parameters, run_time_limit, wait_until
 
 # The node's parameters, all doubles.
-PARAMETERS = (
-    "warn_margin",
-    "squeal_damping_ratio",
-    "squeal_hysteresis",
-    "silence_timeout_s",
-    "dead_band_load_n",
-    "dead_band_speed_rad_s",
-    "dead_band_friction",
-    "map_tolerance",
-)
+PARAMETERS = tuple(parameters())
 CALL_TIMEOUT_S = 5.0
 
 

@@ -17,6 +17,8 @@ use squealcast::bus::shm::{
 use squealcast::bus::{Bus, Received};
 use squealcast::msgs::shm::{Form, OperatingPointForm};
 use squealcast::msgs::{OperatingPoint, Prediction, RigInfo, Vibration};
+use squealcast::rig::Rig;
+use squealcast::session::settings::{PARAMETERS, Settings};
 
 /// A node receives its inputs with two readers: a reliable one and a best-effort one.
 const READERS: usize = 2;
@@ -35,6 +37,19 @@ fn no_two_tests_share_a_domain_or_a_name() {
         assert!((1..102).contains(&domain.id) && Domain::take(domain.id).is_none(), "{}", domain.id);
     }
     assert_ne!(shm("name").service_prefix, shm("name").service_prefix);
+}
+
+/// Users copy `launch/params.yaml`, and the peers in Python take the parameters from it.
+#[test]
+fn the_parameter_file_has_every_setting_with_its_default() {
+    let rig = Rig::load("nine-dof-case-2").expect("an embedded rig, without [warning]");
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/launch/params.yaml");
+    let (args, _) = RosArgs::split(["--ros-args", "--params-file", file].map(String::from)).expect("ROS arguments");
+    let unset = PARAMETERS.map(|parameter| (parameter.name, f64::NAN));
+    let (values, ignored) = args.parameters(&unset, "/", "squealcast").expect("a parameter file");
+    let defaults: Vec<(String, f64)> =
+        Settings::for_rig(&rig).values().map(|(name, value)| (name.to_owned(), value)).collect();
+    assert_eq!((values, ignored), (defaults, vec![]));
 }
 
 /// This test binary once more, running one `#[ignore]`d test as another process.
