@@ -99,6 +99,21 @@ impl EventMoment {
 }
 
 listed! {
+    /// A column of the event lists with what an event has once. The CSV file has all, in this order: the columns for
+    /// onset and peak are before the reason.
+    pub enum EventColumn {
+        Number,
+        Kind,
+        Onset,
+        End,
+        Duration,
+        Interruptions,
+        InputSeq,
+        Reason,
+    }
+}
+
+listed! {
     /// A column of the event lists for a moment of an event. The CSV file has all, in this order.
     pub enum MomentColumn {
         Time,
@@ -109,6 +124,90 @@ listed! {
         DiscSpeed,
         Friction,
         CriticalFriction,
+    }
+}
+
+/// A column of the events on the page.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct PageColumn {
+    /// Its name in the CSV file; of a moment also the field of [`EventMoment`].
+    pub name: &'static str,
+    pub heading: &'static str,
+    /// Unit or remark, in small letters below the heading.
+    pub unit: &'static str,
+    /// How a value of a moment is written; `null` for what an event has once.
+    pub moment: Option<MomentFormat>,
+}
+
+/// How the page writes a value of a moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct MomentFormat {
+    /// Decimals of values from 100 on, and of values below.
+    pub decimals: [u8; 2],
+    /// Whether the value at the onset precedes that at the peak.
+    pub from_onset: bool,
+}
+
+/// The columns of the events on the page, in their order.
+pub fn page_columns() -> Vec<PageColumn> {
+    let [once @ .., last] = EventColumn::ALL;
+    let once = once.into_iter().filter_map(EventColumn::on_page);
+    once.chain(MomentColumn::ALL.into_iter().filter_map(MomentColumn::on_page)).chain(last.on_page()).collect()
+}
+
+impl EventColumn {
+    /// Its name in the CSV file, with unit.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Number => "number",
+            Self::Kind => "kind",
+            Self::Onset => "onset_utc",
+            Self::End => "end_utc",
+            Self::Duration => "duration_s",
+            Self::Interruptions => "interruptions",
+            Self::InputSeq => "input_seq",
+            Self::Reason => "reason",
+        }
+    }
+
+    /// Its heading in a report; `None` if reports omit it. The onset is in the columns of its moment.
+    pub fn heading(self) -> Option<&'static str> {
+        match self {
+            Self::Number => Some("no."),
+            Self::Kind => Some("event"),
+            Self::End => Some("end, s"),
+            Self::Duration => Some("duration, s"),
+            Self::Reason => Some("reason"),
+            Self::Onset | Self::Interruptions | Self::InputSeq => None,
+        }
+    }
+
+    /// The column on the page, which `CELLS` in `events.js` fills; `None` if the page omits it.
+    fn on_page(self) -> Option<PageColumn> {
+        let (heading, unit) = match self {
+            Self::Number => ("no.", ""),
+            Self::Kind => ("event", ""),
+            Self::Onset => ("onset", ""),
+            Self::End => ("end", ""),
+            Self::Duration => ("duration", "s"),
+            Self::Reason => ("reason", ""),
+            Self::Interruptions | Self::InputSeq => return None,
+        };
+        Some(PageColumn { name: self.name(), heading, unit, moment: None })
+    }
+
+    /// Its cell in the CSV file, empty if unknown.
+    fn cell(self, event: &Event) -> String {
+        match self {
+            Self::Number => event.number.to_string(),
+            Self::Kind => event.kind.name().to_owned(),
+            Self::Onset => iso(event.onset_s),
+            Self::End => event.end_s.map_or_else(String::new, iso),
+            Self::Duration => event.end_s.map_or_else(String::new, |end_s| format!("{:.6}", end_s - event.onset_s)),
+            Self::Interruptions => event.interruptions.to_string(),
+            Self::InputSeq => event.input_seq.to_string(),
+            Self::Reason => event.reason.as_deref().map_or_else(String::new, quoted),
+        }
     }
 }
 
@@ -139,6 +238,20 @@ impl MomentColumn {
             Self::Friction => Some("μ"),
             Self::CriticalFriction => None,
         }
+    }
+
+    /// The column on the page; `None` if the page omits it.
+    fn on_page(self) -> Option<PageColumn> {
+        let (heading, unit, decimals, from_onset) = match self {
+            Self::Mode => ("mode", "fastest", [0, 0], false),
+            Self::Frequency => ("frequency", "Hz", [1, 5], false),
+            Self::NormalLoad => ("load", "N", [1, 1], false),
+            Self::DiscSpeed => ("speed", "rad/s", [2, 2], false),
+            Self::Friction => ("μ", "onset → fastest", [4, 4], true),
+            // The onset has a column of its own.
+            Self::Time | Self::GrowthRate | Self::CriticalFriction => return None,
+        };
+        Some(PageColumn { name: self.name(), heading, unit, moment: Some(MomentFormat { decimals, from_onset }) })
     }
 
     /// Its cell in the CSV file, empty if unknown.
@@ -240,32 +353,22 @@ impl Events {
     /// The events as CSV. The header contains the units, times are ISO 8601, onset and peak have separate columns, and
     /// the last column is the reason of a fault.
     pub fn to_csv(&self) -> String {
-        let mut header: Vec<String> =
-            ["number", "kind", "onset_utc", "end_utc", "duration_s", "interruptions", "input_seq"]
-                .map(String::from)
-                .into();
+        let [once @ .., last] = EventColumn::ALL;
+        let mut header: Vec<String> = once.map(|column| column.name().to_owned()).into();
         for when in ["onset", "peak"] {
             // The time of the onset already has a column.
             let columns = MomentColumn::ALL.into_iter().skip(usize::from(when == "onset"));
             header.extend(columns.map(|column| format!("{when}_{}", column.name())));
         }
-        header.push("reason".to_owned());
+        header.push(last.name().to_owned());
         let mut text = header.join(",") + "\r\n";
         for event in &self.events {
-            let [onset_utc, onset @ ..] = MomentColumn::ALL.map(|column| column.cell(&event.onset));
-            let mut cells = vec![
-                event.number.to_string(),
-                event.kind.name().to_owned(),
-                onset_utc,
-                event.end_s.map_or_else(String::new, iso),
-                event.end_s.map_or_else(String::new, |end_s| format!("{:.6}", end_s - event.onset_s)),
-                event.interruptions.to_string(),
-                event.input_seq.to_string(),
-            ];
+            let mut cells: Vec<String> = once.map(|column| column.cell(event)).into();
+            let [_, onset @ ..] = MomentColumn::ALL.map(|column| column.cell(&event.onset));
             cells.extend(onset);
             let peak = |column: MomentColumn| event.peak.map_or_else(String::new, |peak| column.cell(&peak));
             cells.extend(MomentColumn::ALL.map(peak));
-            cells.push(event.reason.as_deref().map_or_else(String::new, quoted));
+            cells.push(last.cell(event));
             text += &cells.join(",");
             text += "\r\n";
         }
@@ -429,6 +532,21 @@ pub(super) mod tests {
         {
             let named: Vec<&&str> = columns.iter().filter(|name| name.contains(column)).collect();
             assert!(!named.is_empty() && named.iter().all(|name| name.ends_with(unit)), "{columns:?}");
+        }
+    }
+
+    /// The page finds a value of a moment by the name of its column, and anything else in `CELLS` of `events.js`.
+    #[test]
+    fn the_page_has_a_value_for_each_of_its_columns() {
+        let moment = serde_json::to_value(EventMoment::new(&sample(0, 0.5, Status::Squeal))).unwrap();
+        let script = include_str!("assets/events.js");
+        let columns = page_columns();
+        assert_eq!(columns.last().map(|column| column.name), Some("reason"));
+        for column in columns {
+            match column.moment {
+                Some(_) => assert!(moment.get(column.name).is_some(), "{column:?}"),
+                None => assert!(script.contains(&format!("\n  {}: (", column.name)), "{column:?}"),
+            }
         }
     }
 

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
-use super::events::{Event, EventKind, EventMoment, Events, MomentColumn, iso, seconds};
+use super::events::{Event, EventColumn, EventKind, EventMoment, Events, MomentColumn, iso, seconds};
 use super::recorded::Recorded;
 use crate::figures::html::{escaped, facts, figure, page, section};
 use crate::figures::plot;
@@ -175,25 +175,21 @@ fn events(events: &Events, from_s: f64) -> String {
     if count == 0 {
         return "<p>None.</p>\n".to_owned();
     }
+    let [once @ .., last] = EventColumn::ALL;
+    let heading = |column: EventColumn| column.heading().map(|text| format!("<th rowspan=\"2\">{text}</th>"));
+    let before: String = once.into_iter().filter_map(heading).collect();
+    let after = heading(last).unwrap_or_default();
     let headings: Vec<&str> = MomentColumn::ALL.into_iter().filter_map(MomentColumn::heading).collect();
     let (columns, of_moment) = (headings.len(), format!("<th>{}</th>", headings.join("</th><th>")));
     let mut html = format!(
-        "<table><thead><tr><th rowspan=\"2\">no.</th><th rowspan=\"2\">event</th><th rowspan=\"2\">end, s</th>\
-         <th rowspan=\"2\">duration, s</th><th colspan=\"{columns}\">onset</th>\
-         <th colspan=\"{columns}\">fastest growth</th>\
-         <th rowspan=\"2\">reason</th></tr>\n<tr>{of_moment}{of_moment}</tr></thead><tbody>\n"
+        "<table><thead><tr>{before}<th colspan=\"{columns}\">onset</th><th colspan=\"{columns}\">fastest growth</th>\
+         {after}</tr>\n<tr>{of_moment}{of_moment}</tr></thead><tbody>\n"
     );
     for event in events.iter().take(LISTED) {
-        let cells = [
-            event.number.to_string(),
-            event.kind.name().to_owned(),
-            event.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - from_s)),
-            event.end_s.map_or_else(|| "–".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s)),
-        ];
+        let cell = |column: EventColumn| event_cell(column, event, from_s);
         let peak = event.peak.map_or_else(|| vec!["–".to_owned(); columns], |peak| event_moment(&peak, from_s));
-        let reason = event.reason.as_deref().map_or_else(|| "–".to_owned(), escaped);
-        let cells = cells.into_iter().chain(event_moment(&event.onset, from_s)).chain(peak).chain([reason]);
-        let cells: String = cells.map(|cell| format!("<td>{cell}</td>")).collect();
+        let cells = once.into_iter().filter_map(cell).chain(event_moment(&event.onset, from_s)).chain(peak);
+        let cells: String = cells.chain(cell(last)).map(|cell| format!("<td>{cell}</td>")).collect();
         let class = match event.kind {
             EventKind::Squeal => "squeal",
             EventKind::Fault | EventKind::NoData => "fault",
@@ -205,6 +201,23 @@ fn events(events: &Events, from_s: f64) -> String {
         let _ = writeln!(html, "<p>{} more in events.csv.</p>", count - LISTED);
     }
     html
+}
+
+/// The cell for what an event has once; `None` if the column has no heading.
+fn event_cell(column: EventColumn, event: &Event, from_s: f64) -> Option<String> {
+    column.heading()?;
+    Some(match column {
+        EventColumn::Number => event.number.to_string(),
+        EventColumn::Kind => event.kind.name().to_owned(),
+        EventColumn::Onset => format!("{:.3}", event.onset_s - from_s),
+        EventColumn::End => event.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - from_s)),
+        EventColumn::Duration => {
+            event.end_s.map_or_else(|| "–".to_owned(), |end_s| format!("{:.3}", end_s - event.onset_s))
+        }
+        EventColumn::Interruptions => event.interruptions.to_string(),
+        EventColumn::InputSeq => event.input_seq.to_string(),
+        EventColumn::Reason => event.reason.as_deref().map_or_else(|| "–".to_owned(), escaped),
+    })
 }
 
 /// Cells for a moment of an event, one for every column with a heading.

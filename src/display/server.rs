@@ -28,7 +28,7 @@ use tokio_stream::wrappers::WatchStream;
 use super::assets;
 use super::comparison::Comparison;
 use super::connections::{self, Bounds};
-use super::events::Events;
+use super::events::{Events, PageColumn, page_columns};
 use crate::node::status::InputSources;
 use crate::rig::Rig;
 
@@ -85,6 +85,8 @@ pub struct About {
     pub span_s: Option<(f64, f64)>,
     /// When maps and charts of a recording became available.
     pub notes: Vec<Note>,
+    /// The columns of the table of events.
+    pub event_columns: Vec<PageColumn>,
 }
 
 /// Something that happened in a recording.
@@ -113,6 +115,7 @@ impl About {
             inputs: None,
             span_s: None,
             notes: vec![],
+            event_columns: page_columns(),
         }
     }
 }

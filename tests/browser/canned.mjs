@@ -125,7 +125,15 @@ const moment = (time_s, mu) => {
 const nothing = (time_s) => ({ time_s, mode_id: null, frequency_hz: null, growth_rate_per_s: null, normal_load_n: null, disc_speed_rad_s: null, friction_coefficient: null, critical_friction: null });
 const events = () => [{ number: 1, kind: "SQUEAL", onset_s: NOW - 80, end_s: NOW - 60, interruptions: 0, input_seq: 1200, modes: [{ id: 1, low_hz: 739, high_hz: 741 }], reason: null, onset: moment(NOW - 80, 0.664), peak: moment(NOW - 71, 0.75) }, { number: 2, kind: "FAULT", onset_s: NOW - 40, end_s: NOW - 39, interruptions: 0, input_seq: 9200, modes: [], reason: FAULT, onset: { ...nothing(NOW - 40), normal_load_n: -5, disc_speed_rad_s: 13.04, friction_coefficient: 0.42 }, peak: null }];
 
-const about = { kind: "live", rig: "tribometer", content_hash: "0".repeat(64), version: "0.1.0", band_max_hz: 4000, mu_max: 1, warn_margin: 0.05, instability_threshold: 1e-6, vibration_threshold_db: 70, span_s: null, notes: [], simulated: false, inputs: { topic: "/rig/operating_point", domain: 0, service: "rig/operating_point", start: "squealcast simulate" } };
+const once = (name, heading, unit = "") => ({ name, heading, unit, moment: null });
+const ofMoment = (name, heading, unit, decimals, from_onset = false) => ({ name, heading, unit, moment: { decimals, from_onset } });
+const event_columns = [
+  once("number", "no."), once("kind", "event"), once("onset_utc", "onset"), once("end_utc", "end"), once("duration_s", "duration", "s"),
+  ofMoment("mode_id", "mode", "fastest", [0, 0]), ofMoment("frequency_hz", "frequency", "Hz", [1, 5]), ofMoment("normal_load_n", "load", "N", [1, 1]),
+  ofMoment("disc_speed_rad_s", "speed", "rad/s", [2, 2]), ofMoment("friction_coefficient", "μ", "onset → fastest", [4, 4], true), once("reason", "reason"),
+];
+
+const about = { kind: "live", rig: "tribometer", content_hash: "0".repeat(64), version: "0.1.0", band_max_hz: 4000, mu_max: 1, warn_margin: 0.05, instability_threshold: 1e-6, vibration_threshold_db: 70, span_s: null, notes: [], event_columns, simulated: false, inputs: { topic: "/rig/operating_point", domain: 0, service: "rig/operating_point", start: "squealcast simulate" } };
 
 /** Serves the page of `assets` in a situation, which `turn` changes. */
 export function serve(assets, situation, more = {}) {
@@ -170,10 +178,10 @@ export function serve(assets, situation, more = {}) {
   })));
 }
 
-/** The fields of every answer, to be compared with those of a node. */
+/** The fields of every answer, and the columns of the events, to be compared with those of a node. */
 export function fields() {
   const of = (answer) => Object.keys(answer).sort();
   const curves = map();
   const mode = shape(1);
-  return { state: of(SITUATIONS.squeal), fastest: of(SITUATIONS.squeal.fastest), next: of(SITUATIONS.squeal.next), about: of(about), map: of(curves), curve: of(curves.modes[0]), window: of(curves.windows[0]), shape: of(mode), part: of(mode.parts[0]), growth_change: of(mode.growth_change), disc: of(mode.disc), event: of(events()[0]), moment: of(events()[0].onset) };
+  return { state: of(SITUATIONS.squeal), fastest: of(SITUATIONS.squeal.fastest), next: of(SITUATIONS.squeal.next), about: of(about), map: of(curves), curve: of(curves.modes[0]), window: of(curves.windows[0]), shape: of(mode), part: of(mode.parts[0]), growth_change: of(mode.growth_change), disc: of(mode.disc), event: of(events()[0]), moment: of(events()[0].onset), event_columns };
 }

@@ -370,6 +370,7 @@ fn the_page_shows_every_status_and_the_next_squeal() {
         let known: Vec<&str> = made_up[name].as_array().unwrap().iter().map(|field| field.as_str().unwrap()).collect();
         assert_eq!(fields(answer), known, "{name}");
     }
+    assert_eq!(about["event_columns"], made_up["event_columns"]);
     let disc = serde_json::to_value(tribometer_axis()).unwrap();
     assert_eq!(serde_json::json!(fields(&disc)), made_up["disc"]);
 }

@@ -5,7 +5,33 @@ import { NONE, fixed, known, time } from "./format.js";
 const MOST = 200;
 /** More notes than this would hide the events. */
 const MOST_NOTES = 50;
+/** What an event has once, by the name of its column. */
+const CELLS = {
+  number: (event) => event.number ?? "",
+  kind: (event) => (event.note ? `${event.kind}, ${event.note}` : event.kind),
+  onset_utc: (event, moment) => moment(event.onset_s),
+  end_utc: (event, moment) => (known(event.end_s) ? moment(event.end_s) : event.end_s === null ? "lasts" : NONE),
+  duration_s: (event) => (known(event.end_s) ? fixed(event.end_s - event.onset_s, 2) : NONE),
+  reason: (event) => event.reason ?? "",
+};
 const VERDICTS = { hit: "measured: hit", not_predicted: "measured: miss", other_frequency: "measured: miss" };
+
+function heading({ heading, unit }) {
+  const cell = document.createElement("th");
+  cell.scope = "col";
+  cell.textContent = heading;
+  if (unit) cell.append(Object.assign(document.createElement("i"), { textContent: unit }));
+  return cell;
+}
+
+/** A value at the fastest growth, of a fault at its onset; if the column asks for it, the value at the onset before. */
+function ofMoment(event, { name, moment: { decimals, from_onset } }) {
+  const text = (value) => fixed(value, decimals[value >= 100 ? 0 : 1]);
+  // Notes and measurements have separate values.
+  const value = (event.peak ?? event.onset ?? event)[name];
+  const from = event.onset?.[name];
+  return from_onset && event.peak && known(from) && known(value) ? `${text(from)} → ${text(value)}` : text(value ?? from);
+}
 
 export class Events {
   constructor(about, jump) {
@@ -13,6 +39,8 @@ export class Events {
     this.note = document.getElementById("events-note");
     this.jump = jump;
     this.start = about.span_s?.[0];
+    this.columns = about.event_columns;
+    document.querySelector("#events thead tr").replaceChildren(...this.columns.map(heading));
     this.notes = (about.notes ?? []).slice(0, MOST_NOTES).map((note) => ({ ...note, kind: note.what, class: "aside" }));
   }
 
@@ -34,17 +62,10 @@ export class Events {
     const row = document.createElement("tr");
     row.className = event.class ?? (event.kind === "SQUEAL" ? "squeal" : "fault");
     const moment = (at_s) => (this.start === undefined ? time(at_s) : `${fixed(at_s - this.start, 2)} s`);
-    const ends = known(event.end_s);
-    // The moment of fastest growth; for a fault its onset. Notes and measurements have separate values.
-    const shown = event.peak ?? event.onset ?? event;
-    const values = [
-      event.number ?? "", event.note ? `${event.kind}, ${event.note}` : event.kind, moment(event.onset_s),
-      ends ? moment(event.end_s) : event.end_s === null ? "lasts" : NONE, ends ? fixed(event.end_s - event.onset_s, 2) : NONE, shown.mode_id ?? NONE, this.#frequency(shown.frequency_hz),
-      this.#friction(event), fixed(shown.normal_load_n, 1), fixed(shown.disc_speed_rad_s, 2), event.reason ?? "",
-    ];
-    values.forEach((value, k) => {
+    this.columns.forEach((column) => {
+      const value = column.moment ? ofMoment(event, column) : CELLS[column.name](event, moment);
       const cell = document.createElement("td");
-      if (k === 2 && this.jump) {
+      if (column.name === "onset_utc" && this.jump) {
         const button = document.createElement("button");
         button.type = "button";
         button.className = "jump";
@@ -58,15 +79,5 @@ export class Events {
       row.append(cell);
     });
     return row;
-  }
-
-  /** Friction coefficient at the onset and at the fastest growth. */
-  #friction({ onset, peak, friction_coefficient: measured }) {
-    const [from, to] = [onset, peak].map((moment) => moment?.friction_coefficient);
-    return known(from) && known(to) ? `${fixed(from, 4)} → ${fixed(to, 4)}` : fixed(from ?? to ?? measured, 4);
-  }
-
-  #frequency(hz) {
-    return known(hz) ? fixed(hz, hz >= 100 ? 1 : 5) : NONE;
   }
 }
