@@ -80,7 +80,7 @@ impl Options {
             Step::Said(text) => steps.say(text),
             Step::Solving(what, step) => steps.full(what, step),
         };
-        Study { full: &full, modes: &modes, basis: &basis }.items(&mut solver, &mut report)
+        Ok(Study { full: &full, modes: &modes, basis: &basis }.items(&mut solver, &mut report)?)
     }
 
     fn write(&self, item: &Item) -> anyhow::Result<()> {

@@ -3,7 +3,13 @@
 mod nine_dof;
 mod tribometer;
 
+use crate::export::ExportError;
 use crate::figures::html::{figure, page, section};
+use crate::figures::plot::PlotError;
+use crate::physics::identification::IdentificationError;
+use crate::physics::{MapError, ModelError, SolveError};
+use crate::reduction::{CompareError, ReductionError};
+use crate::rig::RigError;
 
 pub use nine_dof::nine_dof;
 pub use tribometer::{MODES, PartModes, Step, Study};
@@ -21,6 +27,43 @@ pub struct Item {
     pub csv: String,
     /// The figure as SVG; `None` for a table.
     pub svg: Option<String>,
+}
+
+/// Why a table or figure was not reproduced.
+#[derive(Debug, thiserror::Error)]
+pub enum ReproduceError {
+    #[error(transparent)]
+    Rig(Box<RigError>),
+    #[error(transparent)]
+    Export(#[from] ExportError),
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    #[error(transparent)]
+    Solve(#[from] SolveError),
+    #[error(transparent)]
+    Map(#[from] MapError),
+    #[error(transparent)]
+    FullModel(#[from] ReductionError),
+    #[error(transparent)]
+    Windows(#[from] CompareError),
+    #[error(transparent)]
+    Identification(#[from] IdentificationError<ReductionError>),
+    #[error(transparent)]
+    Plot(#[from] PlotError),
+    #[error("{full_model}: has no `band.max_hz`, which limits the frequencies compared")]
+    NoBand { full_model: String },
+    #[error("{model}: {found} natural frequencies at rest, expected {expected}")]
+    Frequencies { model: String, found: usize, expected: usize },
+    #[error("{file}: cannot select the modes of pad and disc: {reason}")]
+    Modes { file: String, reason: String },
+    #[error("{model}")]
+    Reduced { model: String, source: Box<ReproduceError> },
+}
+
+impl From<RigError> for ReproduceError {
+    fn from(error: RigError) -> Self {
+        Self::Rig(error.into())
+    }
 }
 
 /// A page with all items, as HTML.

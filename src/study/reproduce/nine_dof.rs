@@ -1,6 +1,6 @@
 //! Section 3 of the paper: a slider on a belt with nine degrees of freedom, full and reduced.
 
-use super::{Item, table};
+use super::{Item, ReproduceError, table};
 use crate::display::curves::Curves;
 use crate::figures::plot::{self, Point, Unit};
 use crate::physics::{MapOptions, Solver, StabilityMap, Vectors, Window};
@@ -77,8 +77,8 @@ const DOTS: usize = 160;
 /// Reproduces Table 1 and Figs. 4 to 8.
 ///
 /// # Errors
-/// An embedded rig that cannot be solved, a figure that cannot be drawn.
-pub fn nine_dof() -> anyhow::Result<Vec<Item>> {
+/// [`ReproduceError`]: an embedded rig that cannot be solved, a figure that cannot be drawn.
+pub fn nine_dof() -> Result<Vec<Item>, ReproduceError> {
     let mut items = vec![table_1()?];
     for figure in &FIGURES {
         items.push(figure.make()?);
@@ -86,7 +86,7 @@ pub fn nine_dof() -> anyhow::Result<Vec<Item>> {
     Ok(items)
 }
 
-fn table_1() -> anyhow::Result<Item> {
+fn table_1() -> Result<Item, ReproduceError> {
     let mut found = vec![];
     for name in ["nine-dof", "nine-dof-3+2", "nine-dof-4+2"] {
         let rig = Rig::load(name)?;
@@ -120,7 +120,7 @@ fn table_1() -> anyhow::Result<Item> {
 }
 
 impl Figure {
-    fn make(&self) -> anyhow::Result<Item> {
+    fn make(&self) -> Result<Item, ReproduceError> {
         let full = Rig::load(self.full)?;
         let full_map = self.map(&full)?;
         let (lines, windows, dots) = match self.reduced {
@@ -155,13 +155,13 @@ impl Figure {
         Ok(Item { name: self.name, title: self.title.to_owned(), text, csv, svg: Some(svg) })
     }
 
-    fn map(&self, rig: &Rig) -> anyhow::Result<StabilityMap> {
+    fn map(&self, rig: &Rig) -> Result<StabilityMap, ReproduceError> {
         let options = MapOptions { mu_max: self.mu_max, ..map_options(rig) };
         Ok(StabilityMap::build(&rig.model, &mut Solver::new(rig.model.dimension()), &rig.reference, &options)?)
     }
 
     /// The modes of the full model at `DOTS + 1` equidistant friction coefficients.
-    fn dots(&self, rig: &Rig) -> anyhow::Result<Vec<Point>> {
+    fn dots(&self, rig: &Rig) -> Result<Vec<Point>, ReproduceError> {
         let mut solver = Solver::new(rig.model.dimension());
         let mut dots = vec![];
         for k in 0..=DOTS {

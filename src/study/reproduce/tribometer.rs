@@ -2,10 +2,9 @@
 
 use std::f64::consts::TAU;
 
-use anyhow::{Context, ensure};
 use faer::{Mat, Side};
 
-use super::{Item, table};
+use super::{Item, ReproduceError, table};
 use crate::display::curves::Curves;
 use crate::export::{modal_rig, modal_sides};
 use crate::figures::plot::{self, Point, Unit};
@@ -68,8 +67,8 @@ impl PartModes {
     /// The interface data of the modes in `kept`.
     ///
     /// # Errors
-    /// Modes that cannot be exported as a rig.
-    pub fn new(full: &FullModelFile, kept: &[Kept]) -> anyhow::Result<Self> {
+    /// [`ReproduceError`]: modes that cannot be exported as a rig.
+    pub fn new(full: &FullModelFile, kept: &[Kept]) -> Result<Self, ReproduceError> {
         let files = |residual: bool| {
             let mut sides = modal_sides(full, kept)?;
             if !residual {
@@ -127,8 +126,12 @@ impl Study<'_> {
     /// model; `report` receives progress reports.
     ///
     /// # Errors
-    /// A model that cannot be solved, a figure that cannot be drawn.
-    pub fn items(&self, solver: &mut FullSolver<'_>, report: &mut dyn FnMut(Step<'_>)) -> anyhow::Result<Vec<Item>> {
+    /// [`ReproduceError`]: a model that cannot be solved, a figure that cannot be drawn.
+    pub fn items(
+        &self,
+        solver: &mut FullSolver<'_>,
+        report: &mut dyn FnMut(Step<'_>),
+    ) -> Result<Vec<Item>, ReproduceError> {
         let truth = self.truth(solver, report)?;
         let mut say = |text: &str| report(Step::Said(text));
         say("identifying contact stiffnesses");
@@ -174,21 +177,17 @@ impl Study<'_> {
 
     /// Results of the full model: natural frequencies at rest, windows of instability, and modes at `DOTS + 1` friction
     /// coefficients.
-    fn truth(&self, solver: &mut FullSolver<'_>, report: &mut dyn FnMut(Step<'_>)) -> anyhow::Result<Truth> {
+    fn truth(&self, solver: &mut FullSolver<'_>, report: &mut dyn FnMut(Step<'_>)) -> Result<Truth, ReproduceError> {
         let (full, reference) = (self.full, self.full.settings.reference);
-        let band_hz = full.settings.band_max_hz.context("the full model has no band")?;
+        let no_band = || ReproduceError::NoBand { full_model: full.name.clone() };
+        let band_hz = full.settings.band_max_hz.ok_or_else(no_band)?;
         let mut roots = |what: &str, p: &OperatingPoint, report: &mut dyn FnMut(Step<'_>)| {
             solver.roots(p, TAU * band_hz, FullVectors::None, &mut |step| report(Step::Solving(what, step)))
         };
         let at_rest = roots("at rest", &self.at_rest(), report)?;
         let at_rest_hz: Vec<f64> =
             at_rest.roots.iter().map(|root| root.lambda.im / TAU).filter(|hz| *hz > 0.0).take(FREQUENCIES).collect();
-        let count = at_rest_hz.len();
-        ensure!(
-            count == FREQUENCIES,
-            "{}: {count} frequencies below {band_hz} Hz, {FREQUENCIES} are compared",
-            full.name
-        );
+        check_count(&format!("{} below {band_hz} Hz", full.name), at_rest_hz.len())?;
         let mut dots = vec![];
         for k in 0..=DOTS {
             let mu = MU_MAX * k as f64 / DOTS as f64;
@@ -208,7 +207,7 @@ impl Study<'_> {
 
     /// A reduced model with `modes` modes of each part, and the contact stiffness that best fits the natural
     /// frequencies of the full model at rest.
-    fn identified(&self, modes: usize, truth: &Truth) -> anyhow::Result<(Reduced, Identified)> {
+    fn identified(&self, modes: usize, truth: &Truth) -> Result<(Reduced, Identified), ReproduceError> {
         let files = &self.modes.plain;
         let rig = with_modes(files, modes, 1.0)?;
         // K = K_open + factor (K_closed - K_open): the difference is the contact springs.
@@ -235,18 +234,24 @@ impl Study<'_> {
         Ok((reduced, found))
     }
 
-    fn reduced(&self, name: String, model: Model, band_hz: Option<f64>, factor: f64) -> anyhow::Result<Reduced> {
+    fn reduced(
+        &self,
+        name: String,
+        model: Model,
+        band_hz: Option<f64>,
+        factor: f64,
+    ) -> Result<Reduced, ReproduceError> {
         let spectrum = Solver::new(model.dimension()).solve(&model, &self.at_rest(), Vectors::Right)?;
         let at_rest_hz: Vec<f64> = spectrum.modes().iter().map(|root| root.frequency_hz()).take(FREQUENCIES).collect();
-        ensure!(at_rest_hz.len() == FREQUENCIES, "{name}: {} modes at rest, expected {FREQUENCIES}", at_rest_hz.len());
+        check_count(&name, at_rest_hz.len())?;
         let band_hz = band_hz.or(self.full.settings.band_max_hz).unwrap_or(f64::INFINITY);
         Ok(Reduced { name, stiffness_n_per_m: factor * self.stiffness_n_per_m(), at_rest_hz, model, band_hz })
     }
 
     /// Follows the modes of every model over the friction coefficient, one thread per model.
-    fn maps(&self, models: &[&Reduced]) -> anyhow::Result<Vec<Mapped>> {
+    fn maps(&self, models: &[&Reduced]) -> Result<Vec<Mapped>, ReproduceError> {
         let settings = &self.full.settings;
-        let map = |reduced: &Reduced| -> anyhow::Result<Mapped> {
+        let map = |reduced: &Reduced| -> Result<Mapped, ReproduceError> {
             let options = map_options(settings.instability_threshold, reduced.band_hz);
             let mut solver = Solver::new(reduced.model.dimension());
             let map = StabilityMap::build(&reduced.model, &mut solver, &settings.reference, &options)?;
@@ -258,7 +263,7 @@ impl Study<'_> {
             let threads: Vec<_> = models.iter().map(|&reduced| scope.spawn(move || map(reduced))).collect();
             let joined = threads.into_iter().zip(models).map(|(thread, reduced)| {
                 let mapped = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-                mapped.with_context(|| reduced.name.clone())
+                mapped.map_err(|error| ReproduceError::Reduced { model: reduced.name.clone(), source: error.into() })
             });
             joined.collect()
         })
@@ -290,7 +295,7 @@ impl Study<'_> {
         Item { name: "table-3", title, text, csv, svg: None }
     }
 
-    fn figure_14(&self, truth: &Truth, models: &[Reduced], maps: &[Mapped]) -> anyhow::Result<Item> {
+    fn figure_14(&self, truth: &Truth, models: &[Reduced], maps: &[Mapped]) -> Result<Item, ReproduceError> {
         let lines: Vec<(String, Vec<Point>)> =
             models.iter().zip(maps).map(|(model, map)| (model.name.clone(), map.curves.clone())).collect();
         let title = "lines: modes of the parts, each with its own contact stiffness; dots: full model";
@@ -310,7 +315,7 @@ impl Study<'_> {
         Ok(Item { name: "figure-14", title, text, csv, svg: Some(svg) })
     }
 
-    fn figure_15(&self, truth: &Truth, basis: &Reduced, map: &Mapped) -> anyhow::Result<Item> {
+    fn figure_15(&self, truth: &Truth, basis: &Reduced, map: &Mapped) -> Result<Item, ReproduceError> {
         let title = format!("lines: {}; dots: full model", basis.name);
         let svg = plot::against_full(&title, &map.curves, &truth.dots, &map.windows, MU_MAX, Unit::Hz)?;
         let csv = CURVES_HEADER.to_owned() + &rows_of(&basis.name, &map.curves) + &rows_of("full model", &truth.dots);
@@ -339,14 +344,25 @@ fn map_options(instability_threshold: f64, band_hz: f64) -> MapOptions {
     MapOptions { mu_min: 0.0, mu_max: MU_MAX, band_max_hz: Some(band_hz), instability_threshold, windows: true }
 }
 
-/// A rig of kind 2 with the lowest `modes` modes of each part and its contact stiffness multiplied by `factor`.
-fn with_modes(files: &[RigFile], modes: usize, factor: f64) -> anyhow::Result<Rig> {
-    let mut files = files.to_vec();
-    let mut table: toml::Table = std::str::from_utf8(&files[0].bytes)?.parse()?;
-    for part in ["pad", "disc"] {
-        let part = table.get_mut(part).and_then(toml::Value::as_table_mut).context("a rig without pad or disc")?;
-        part.insert("modes".to_owned(), (modes as i64).into());
+/// Checks that as many natural frequencies are known as are compared.
+fn check_count(model: &str, found: usize) -> Result<(), ReproduceError> {
+    if found == FREQUENCIES {
+        return Ok(());
     }
+    Err(ReproduceError::Frequencies { model: model.to_owned(), found, expected: FREQUENCIES })
+}
+
+/// A rig of kind 2 with the lowest `modes` modes of each part and its contact stiffness multiplied by `factor`.
+fn with_modes(files: &[RigFile], modes: usize, factor: f64) -> Result<Rig, ReproduceError> {
+    let failed = |reason: String| ReproduceError::Modes { file: files[0].name.clone(), reason };
+    let text = std::str::from_utf8(&files[0].bytes).map_err(|error| failed(error.to_string()))?;
+    let mut table: toml::Table = text.parse().map_err(|error: toml::de::Error| failed(error.to_string()))?;
+    for part in ["pad", "disc"] {
+        let found = table.get_mut(part).and_then(toml::Value::as_table_mut);
+        let found = found.ok_or_else(|| failed(format!("there is no table [{part}]")))?;
+        found.insert("modes".to_owned(), (modes as i64).into());
+    }
+    let mut files = files.to_vec();
     files[0].bytes = table.to_string().into_bytes();
     Ok(Rig::from_files(&files)?.with_contact_stiffness_times(factor)?)
 }
@@ -361,7 +377,7 @@ fn rows_of(model: &str, points: &[Point]) -> String {
     points.iter().map(row).collect()
 }
 
-fn figure_13(found: &Identified, reduced: &Reduced) -> anyhow::Result<Item> {
+fn figure_13(found: &Identified, reduced: &Reduced) -> Result<Item, ReproduceError> {
     let at_one = reduced.stiffness_n_per_m / found.best.factor;
     let svg = plot::identification(
         &format!("{}: first {FREQUENCIES} natural frequencies", reduced.name),
