@@ -2,7 +2,7 @@
 //!
 //! Frames of about 40 ms (28 to 57 ms, the power of two nearest to 40 ms), a quarter of that apart, are searched for
 //! tones. A tone that lasts `min_duration_s` is a [`Squeal`]. Its onset, end and growth are then measured in the samples
-//! with windows of 2 to 32 ms ([`Envelope`]).
+//! with windows of 2 to 32 ms ([`Envelope`](super::envelope::Envelope)).
 //!
 //! - Time resolution: of a stationary tone's frequency and level, a frame; of onset, end and growth, the shortest window
 //!   that is free of noise. Two tones closer than 2.5 bins of a frame (62 Hz at 51.2 kHz) are one.
@@ -11,45 +11,35 @@
 //!
 //! The result depends on the samples and their stamps alone, not on the blocks in which they arrive.
 
-use std::collections::{BTreeMap, VecDeque};
+mod measure;
+mod results;
+mod track;
 
-use super::envelope::{Envelope, Growth, noise_density};
+use std::collections::VecDeque;
+
 use super::spectrum::{HOPS_PER_FRAME, Spectra, Tone, frame_length, is_masked};
 use super::waveform::stamp_ns;
 use super::weighting::power_weight;
 use super::{Calibration, Channel, ChannelError, Quantity};
+pub use results::{Counts, Detection, Harmonic, Interruption, MOST_NAMED, Squeal};
+use track::{Ended, Found, Track};
 
 /// Samples that are kept to measure onsets and ends in, s.
 const HISTORY_S: f64 = 2.0;
-/// Growth is looked for up to this long before a tone exceeds the threshold, s.
-const BEFORE_ONSET_S: f64 = 1.0;
-/// A tone has saturated if its level has not risen by [`RISE`] for this long, s.
+/// A tone has saturated if its level has not risen by 0.5 dB for this long, s.
 const SETTLED_S: f64 = 0.1;
-/// Factor of power (0.5 dB).
-const RISE: f64 = 1.122;
 /// A tone that goes on rising is measured as if it had saturated after this time, s.
 const SATURATES_WITHIN_S: f64 = 1.5;
 /// Largest distance of a tone from where it was in the frame before, in bins.
 const DRIFT_BINS: f64 = 1.5;
 /// Most tones of a frame, and most tones followed at a time.
 const MOST_TONES: usize = 64;
-/// A squeal is a harmonic if its frequency is this near to a multiple, relative.
-const HARMONIC_TOLERANCE: f64 = 0.002;
-/// Highest harmonic that is recognised.
-const HIGHEST_HARMONIC: u32 = 10;
-/// Frames that tell the frequency at the onset.
-const EARLY_FRAMES: u64 = 8;
-/// The steady part of a squeal: within 3 dB of its highest level, in steps of 0.25 dB.
-const STEPS_PER_DB: f64 = 4.0;
-const STEADY_STEPS: i32 = 12;
 /// A tone in the band between bins is at most 1.42 dB higher than its highest bin.
 const SCALLOPING: f64 = 0.72;
 /// A stamp further back than this begins a new stream; s.
 const LONGEST_OVERLAP_S: f64 = 1.0;
 /// Part of the difference between stamp and sample count by which the time of the stream is corrected with each block.
 const CLOCK_CORRECTION: f64 = 1.0 / 16.0;
-/// Most interruptions that are named; later ones are counted.
-pub const MOST_NAMED: usize = 100;
 
 /// Definition of squeal. The defaults are those of SAE J2521: at least 70 dB(A) between 1.25 and 16 kHz.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -95,88 +85,6 @@ pub enum DetectorError {
     Band { name: String, sample_rate_hz: f64, band_hz: [f64; 2] },
 }
 
-/// A squeal: a tone above the threshold from `onset_ns` to `end_ns`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Squeal {
-    /// Counts the squeals of a detector in the order in which they are announced.
-    pub number: u64,
-    /// When the level of the tone passes the threshold.
-    pub onset_ns: i64,
-    /// When it falls below; the latest frame, while it lasts.
-    pub end_ns: i64,
-    /// Whether samples are missing at the onset or the end: at the ends of the stream and at gaps.
-    pub cut: [bool; 2],
-    /// Mean over the steady part: the frames within 3 dB of the highest level.
-    pub frequency_hz: f64,
-    /// Level of the mean square of the steady part, dB(A) re 20 µPa or dB re 1 µm/s².
-    pub level_db: f64,
-    /// Highest level of a frame.
-    pub peak_level_db: f64,
-    /// Ratio of the tone to the noise in its bin at the onset, dB.
-    pub prominence_db: f64,
-    /// Growth at the onset; `None` if it cannot be measured.
-    pub growth: Option<Growth>,
-    /// The squeal of which it is a harmonic.
-    pub harmonic: Option<Harmonic>,
-}
-
-/// A squeal at a multiple of the frequency of another.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Harmonic {
-    /// At least 2.
-    pub order: u32,
-    /// Number of the squeal that is the fundamental.
-    pub of: u64,
-}
-
-/// A finding of a detector.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Detection {
-    /// A tone has lasted long enough. Its values are those so far.
-    Began(Squeal),
-    /// A squeal is over.
-    Ended(Squeal),
-}
-
-impl Detection {
-    /// The squeal, if it is over.
-    pub fn ended(self) -> Option<Squeal> {
-        match self {
-            Self::Ended(squeal) => Some(squeal),
-            Self::Began(_) => None,
-        }
-    }
-}
-
-/// An interruption of a stream.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Interruption {
-    /// Samples are missing; squeals end there.
-    Gap { after_ns: i64, samples: u64 },
-    /// Samples came twice; the later ones are ignored.
-    Overlap { at_ns: i64, samples: u64 },
-    /// The stamps went back by more than a second; squeals end there.
-    Restart { after_ns: i64, at_ns: i64 },
-}
-
-/// Counts of what a detector received.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Counts {
-    /// Samples searched for squeal.
-    pub samples: u64,
-    /// Missing samples, at gaps.
-    pub missing: u64,
-    /// Ignored samples, at overlaps.
-    pub repeated: u64,
-    /// Samples that are not finite; replaced by 0.
-    pub not_finite: u64,
-    pub interruptions: u64,
-    /// The first [`MOST_NAMED`] interruptions.
-    pub named: Vec<Interruption>,
-    /// Tones that were not followed because there were more than 64 at a time.
-    pub tones_not_followed: u64,
-}
-
 /// Finds squeal in the samples of one channel.
 pub struct Detector {
     settings: Settings,
@@ -206,62 +114,6 @@ struct Stream {
     samples: Vec<f32>,
     /// Index of the next frame.
     frame: u64,
-}
-
-/// A tone of a frame that is above the threshold.
-#[derive(Clone, Copy)]
-struct Found {
-    tone: Tone,
-    frequency_hz: f64,
-    /// Mean square with the frequency weighting.
-    weighted: f64,
-    /// Noise in its bin.
-    noise: f64,
-}
-
-/// A tone followed from frame to frame.
-struct Track {
-    first_frame: u64,
-    last_frame: u64,
-    /// Frames in which it was found.
-    hits: u64,
-    frequency_hz: f64,
-    /// Weighted and plain mean square of the loudest frame.
-    highest: f64,
-    highest_plain: f64,
-    /// Latest frame in which the level rose, and its mean square.
-    rose_frame: u64,
-    rose_to: f64,
-    /// Tone and noise when first found.
-    first: Found,
-    /// The first frames: the frequency may drift later.
-    early: Level,
-    /// Frames by level, in steps of 0.25 dB.
-    levels: BTreeMap<i32, Level>,
-    /// Set when it is announced.
-    number: Option<u64>,
-    /// Set when it has saturated.
-    onset: Option<Onset>,
-}
-
-#[derive(Clone, Copy, Default)]
-struct Level {
-    frames: u64,
-    power: f64,
-    power_times_hz: f64,
-}
-
-#[derive(Clone, Copy)]
-struct Onset {
-    stamp_ns: i64,
-    cut: bool,
-    growth: Option<Growth>,
-}
-
-struct Ended {
-    number: u64,
-    frames: [u64; 2],
-    frequency_hz: f64,
 }
 
 impl Settings {
@@ -573,129 +425,6 @@ impl Detector {
         self.ended.push_back(Ended { number, frames, frequency_hz: squeal.frequency_hz });
         found.push(Detection::Ended(squeal));
     }
-
-    /// The squeal of a track that is announced, up to now or to its end.
-    fn squeal(&self, index: usize, end: Option<(i64, bool)>) -> Option<Squeal> {
-        let track = &self.tracks[index];
-        let number = track.number?;
-        let middle_ns = |frame: u64| self.stamp_ns(self.first_sample(frame) + self.spectra.length() as u64 / 2);
-        let onset = track.onset.unwrap_or(Onset { stamp_ns: middle_ns(track.first_frame), cut: false, growth: None });
-        let (end_ns, end_cut) = end.unwrap_or((middle_ns(track.last_frame), false));
-        let (frequency_hz, power) = track.steady();
-        Some(Squeal {
-            number,
-            onset_ns: onset.stamp_ns,
-            end_ns: end_ns.max(onset.stamp_ns),
-            cut: [onset.cut, end_cut],
-            frequency_hz,
-            level_db: self.level_db(power),
-            peak_level_db: self.level_db(track.highest),
-            prominence_db: 10.0 * (track.first.tone.power / track.first.noise.max(f64::MIN_POSITIVE)).log10(),
-            growth: onset.growth,
-            harmonic: None,
-        })
-    }
-
-    fn stamp_ns(&self, sample: u64) -> i64 {
-        let start_ns = self.stream.as_ref().map_or(0, |stream| stream.start_ns);
-        stamp_ns(start_ns, sample, self.sample_rate_hz)
-    }
-
-    /// Time of the middle of a frame after sample `first`, s.
-    fn middle_s(&self, frame: u64, first: u64) -> f64 {
-        let middle = self.first_sample(frame) as f64 + 0.5 * self.spectra.length() as f64;
-        (middle - first as f64) / self.sample_rate_hz
-    }
-
-    /// The samples from `seconds` before frame `from` up to the end of the latest frame, demodulated at `frequency_hz`,
-    /// with the index of the first.
-    fn envelope(&self, track: &Track, frequency_hz: f64, from: u64, seconds: f64) -> Option<(Envelope, u64)> {
-        let stream = self.stream.as_ref()?;
-        let end = self.first_sample(stream.frame.checked_sub(1)?) + self.spectra.length() as u64;
-        let oldest = end.saturating_sub((HISTORY_S * self.sample_rate_hz) as u64);
-        let first = self.first_sample(from).saturating_sub((seconds * self.sample_rate_hz) as u64).max(oldest);
-        let samples = &stream.samples[stream.position(first)..stream.position(end)];
-        let factor = self.calibration.factor;
-        let samples = samples.iter().map(|&sample| factor * f64::from(sample));
-        let noise = noise_density(track.first.noise, self.frame_s());
-        Some((Envelope::new(samples, self.sample_rate_hz, frequency_hz, noise), first))
-    }
-
-    fn measure_onset(&self, index: usize) -> Onset {
-        let track = &self.tracks[index];
-        let first_frame_ns = self.stamp_ns(self.first_sample(track.first_frame) + self.spectra.length() as u64 / 2);
-        let none = Onset { stamp_ns: first_frame_ns, cut: true, growth: None };
-        let frequency_hz = track.early.power_times_hz / track.early.power;
-        let Some((envelope, first)) = self.envelope(track, frequency_hz, track.first_frame, BEFORE_ONSET_S) else {
-            return none;
-        };
-        let threshold = self.plain_threshold(frequency_hz);
-        let near_s = self.middle_s(track.first_frame, first);
-        let fitted = envelope.growth(track.highest_plain, near_s, threshold);
-        let in_the_fit = |&(growth, at_s): &(Growth, f64)| {
-            // The line holds up to 10 dB below saturation, and is trusted as far below its range as that is wide.
-            let range_s = growth.span_db / (20.0 * std::f64::consts::LOG10_E * growth.rate_per_s);
-            threshold <= 0.1 * track.highest_plain && (at_s - near_s).abs() <= self.frame_s() + range_s
-        };
-        let rises = || envelope.rises_above(threshold, near_s).map(|at_s| (at_s, false));
-        let passes = fitted.as_ref().filter(|fit| in_the_fit(fit)).map(|&(_, at_s)| (at_s, false)).or_else(rises);
-        let (at_s, cut) = passes.unwrap_or((0.0, true));
-        let growth = fitted.map(|(growth, _)| growth);
-        if cut && first > 0 {
-            return Onset { cut: false, growth, ..none };
-        }
-        Onset { stamp_ns: self.stamp_ns(first) + (at_s * 1e9).round() as i64, cut, growth }
-    }
-
-    fn measure_end(&self, index: usize) -> (i64, bool) {
-        let track = &self.tracks[index];
-        let (first_sample, length) = (self.first_sample(track.last_frame), self.spectra.length() as u64);
-        let latest_frame = self.stream.as_ref().map_or(0, |stream| stream.frame.saturating_sub(1));
-        let falls =
-            self.envelope(track, track.frequency_hz, track.last_frame, self.frame_s()).and_then(|(envelope, first)| {
-                let near_s = self.middle_s(track.last_frame, first);
-                let at_s = envelope.falls_below(self.plain_threshold(track.frequency_hz), near_s)?;
-                Some(self.stamp_ns(first) + (at_s * 1e9).round() as i64)
-            });
-        match falls {
-            Some(end_ns) => (end_ns, false),
-            None if latest_frame - track.last_frame <= 1 => (self.stamp_ns(first_sample + length), true),
-            None => (self.stamp_ns(first_sample + length / 2), false),
-        }
-    }
-
-    /// Mean square without frequency weighting of a tone at the threshold.
-    fn plain_threshold(&self, frequency_hz: f64) -> f64 {
-        self.threshold() / power_weight(self.calibration.quantity, frequency_hz)
-    }
-
-    /// The squeal of which the one of a track is a harmonic: that with the lowest order, whose time covers at least half
-    /// of its own.
-    fn harmonic(&self, index: usize, frequency_hz: f64) -> Option<Harmonic> {
-        let own = &self.tracks[index];
-        let followed = self
-            .tracks
-            .iter()
-            .filter_map(|track| Some((track.number?, [track.first_frame, track.last_frame], track.steady().0)));
-        let ended = self.ended.iter().map(|ended| (ended.number, ended.frames, ended.frequency_hz));
-        let candidates = followed.chain(ended).filter_map(|(of, [first, last], fundamental_hz)| {
-            let order = (frequency_hz / fundamental_hz).round();
-            let is_multiple = (frequency_hz / fundamental_hz / order - 1.0).abs() <= HARMONIC_TOLERANCE;
-            let common = (last.min(own.last_frame) + 1).saturating_sub(first.max(own.first_frame));
-            let together = 2 * common >= own.last_frame - own.first_frame;
-            let harmonic = Harmonic { order: order as u32, of };
-            (is_multiple && together && (2..=HIGHEST_HARMONIC).contains(&harmonic.order)).then_some(harmonic)
-        });
-        candidates.min_by_key(|harmonic| (harmonic.order, harmonic.of))
-    }
-}
-
-impl Level {
-    fn add(&mut self, tone: &Found) {
-        self.frames += 1;
-        self.power += tone.weighted;
-        self.power_times_hz += tone.weighted * tone.frequency_hz;
-    }
 }
 
 impl Stream {
@@ -707,245 +436,5 @@ impl Stream {
     }
 }
 
-impl Track {
-    fn new(frame: u64, tone: Found) -> Self {
-        let mut track = Self {
-            first_frame: frame,
-            last_frame: frame,
-            hits: 0,
-            frequency_hz: tone.frequency_hz,
-            highest: 0.0,
-            highest_plain: 0.0,
-            rose_frame: frame,
-            rose_to: 0.0,
-            first: tone,
-            early: Level::default(),
-            levels: BTreeMap::new(),
-            number: None,
-            onset: None,
-        };
-        track.continue_with(frame, &tone);
-        track
-    }
-
-    fn continue_with(&mut self, frame: u64, tone: &Found) {
-        self.last_frame = frame;
-        self.hits += 1;
-        self.frequency_hz = tone.frequency_hz;
-        if tone.weighted > self.highest {
-            (self.highest, self.highest_plain) = (tone.weighted, tone.tone.power);
-        }
-        if tone.weighted > RISE * self.rose_to {
-            (self.rose_frame, self.rose_to) = (frame, tone.weighted);
-        }
-        if self.hits <= EARLY_FRAMES {
-            self.early.add(tone);
-        }
-        let step = (STEPS_PER_DB * 10.0 * tone.weighted.log10()).floor() as i32;
-        self.levels.entry(step).or_default().add(tone);
-    }
-
-    /// Mean frequency, Hz, and mean weighted square of the steady part.
-    fn steady(&self) -> (f64, f64) {
-        let highest = self.levels.keys().next_back().copied().unwrap_or_default();
-        let mut sum = Level::default();
-        for level in self.levels.range(highest - STEADY_STEPS..).map(|(_, level)| level) {
-            sum.frames += level.frames;
-            sum.power += level.power;
-            sum.power_times_hz += level.power_times_hz;
-        }
-        (sum.power_times_hz / sum.power, sum.power / sum.frames as f64)
-    }
-}
-
 #[cfg(test)]
-mod tests {
-    use super::super::simulated::{Drive, Planted, SimulatedSound, SoundSettings};
-    use super::*;
-    use crate::sound::Unit;
-
-    const RATE_HZ: f64 = 51_200.0;
-    const START_NS: i64 = 1_000_000_000;
-
-    fn channel(sample_rate_hz: f64) -> Channel {
-        Channel { name: "microphone".to_owned(), sample_rate_hz, unit: Unit::Pascal, sensitivity: None }
-    }
-
-    /// The squeals that ended, in the order of their onsets, from blocks of `size` samples.
-    fn squeals(samples: &[f32], size: usize) -> Vec<Squeal> {
-        let mut detector = Detector::new(&channel(RATE_HZ), Settings::default()).unwrap();
-        let mut found = vec![];
-        for (k, block) in samples.chunks(size).enumerate() {
-            detector.push(stamp_ns(START_NS, (k * size) as u64, RATE_HZ), block, &mut found);
-        }
-        detector.finish(&mut found);
-        assert_eq!(detector.counts().interruptions, 0);
-        ended(&found)
-    }
-
-    fn ended(found: &[Detection]) -> Vec<Squeal> {
-        let mut ended: Vec<Squeal> = found.iter().copied().filter_map(Detection::ended).collect();
-        ended.sort_by_key(|squeal| squeal.onset_ns);
-        ended
-    }
-
-    /// Modes that grow from 0.3 s to 1.3 s of 2 s, over noise of `noise_db`.
-    fn sound(noise_db: f64, harmonics_db: &[f64], modes: &[(f64, f64)]) -> (Vec<f32>, Vec<Planted>) {
-        let harmonics_db = harmonics_db.to_vec();
-        let mut sound = SimulatedSound::new(SoundSettings { noise_db, harmonics_db, ..Default::default() });
-        let drives: Vec<Drive> = (0..)
-            .zip(modes)
-            .map(|(mode_id, &(frequency_hz, growth_rate_per_s))| Drive { mode_id, frequency_hz, growth_rate_per_s })
-            .collect();
-        let mut samples = vec![];
-        sound.advance(&[], 60.0, 15_360, &mut samples);
-        sound.advance(&drives, 60.0, 51_200, &mut samples);
-        sound.advance(&[], 60.0, 35_840, &mut samples);
-        (samples, sound.planted())
-    }
-
-    fn check(squeal: &Squeal, planted: &Planted) {
-        let after_s = |stamp_ns: i64| (stamp_ns - START_NS) as f64 * 1e-9;
-        let hz = squeal.frequency_hz - planted.frequency_hz;
-        assert!(hz.abs() <= f64::max(1.0, 5e-4 * planted.frequency_hz), "{squeal:?}, planted {planted:?}");
-        assert!((squeal.level_db - planted.level_db).abs() <= 0.5, "{squeal:?}, planted {planted:?}");
-        assert!((after_s(squeal.onset_ns) - planted.onset_s).abs() <= 0.01, "{squeal:?}, planted {planted:?}");
-        assert!((after_s(squeal.end_ns) - planted.end_s.unwrap()).abs() <= 0.01, "{squeal:?}, planted {planted:?}");
-        let growth = squeal.growth.unwrap_or_else(|| panic!("{squeal:?}, planted {planted:?}"));
-        let rate = growth.rate_per_s / planted.growth_rate_per_s;
-        assert!((rate - 1.0).abs() <= 0.1, "{squeal:?}, planted {planted:?}");
-        assert_eq!(squeal.cut, [false; 2]);
-    }
-
-    /// 95 dB(A) over 65 dB(A) of noise, from slow to fast growth, at both ends of the band and between.
-    #[test]
-    fn planted_squeals_are_found_with_their_values() {
-        for (frequency_hz, rate) in [(1300.0, 30.0), (2512.3, 80.0), (6789.0, 200.0), (15_500.0, 400.0)] {
-            let (samples, planted) = sound(65.0, &[], &[(frequency_hz, rate)]);
-            let found = squeals(&samples, 1024);
-            let [squeal] = found[..] else { panic!("{found:?}") };
-            check(&squeal, &planted[0]);
-            assert_eq!(squeal.harmonic, None);
-        }
-    }
-
-    #[test]
-    fn simultaneous_squeals_are_distinguished() {
-        let (samples, planted) = sound(60.0, &[], &[(1900.0, 60.0), (2000.0, 90.0), (5432.1, 150.0)]);
-        let found = squeals(&samples, 1024);
-        assert_eq!(found.len(), 3, "{found:?}");
-        for planted in &planted {
-            let near = |squeal: &&Squeal| (squeal.frequency_hz - planted.frequency_hz).abs() < 20.0;
-            check(found.iter().find(near).unwrap_or_else(|| panic!("{planted:?} is not among {found:?}")), planted);
-        }
-    }
-
-    #[test]
-    fn harmonics_are_recognised_and_other_tones_are_not() {
-        let (samples, _) = sound(60.0, &[-15.0, -20.0], &[(2345.6, 80.0), (6000.0, 80.0)]);
-        let mut found = squeals(&samples, 1024);
-        found.sort_by(|a, b| a.frequency_hz.total_cmp(&b.frequency_hz));
-        let orders: Vec<(f64, Option<u32>)> =
-            found.iter().map(|s| (s.frequency_hz.round(), s.harmonic.map(|harmonic| harmonic.order))).collect();
-        let expected = [(2346.0, None), (4691.0, Some(2)), (6000.0, None), (7037.0, Some(3)), (12_000.0, Some(2))];
-        assert_eq!(orders, expected);
-        assert!(found[1].harmonic.unwrap().of == found[0].number && found[4].harmonic.unwrap().of == found[2].number);
-    }
-
-    #[test]
-    fn results_do_not_depend_on_the_blocks() {
-        let (samples, _) = sound(75.0, &[-20.0], &[(3000.0, 80.0), (4100.0, 20.0)]);
-        let whole = squeals(&samples, samples.len());
-        assert!(whole.len() >= 2, "{whole:?}");
-        for size in [1, 17, 512, 1000, 4096] {
-            assert_eq!(squeals(&samples, size), whole, "blocks of {size}");
-        }
-    }
-
-    #[test]
-    fn noise_alone_and_tones_below_the_threshold_are_no_squeal() {
-        // In a bin of 25 Hz, 75 dB of noise in the band are 49 dB: a tone of 66 dB has a standard deviation of 1.2 dB.
-        for (saturated_db, noise_db) in [(66.0, 75.0), (31.0, 90.0)] {
-            let mut quiet = SimulatedSound::new(SoundSettings { saturated_db, noise_db, ..Default::default() });
-            let mut samples = vec![];
-            let drive = Drive { mode_id: 0, frequency_hz: 3000.0, growth_rate_per_s: 100.0 };
-            quiet.advance(&[drive], 60.0, 5 * 51_200, &mut samples);
-            assert_eq!(squeals(&samples, 1024), []);
-        }
-    }
-
-    #[test]
-    fn squeals_at_the_ends_of_a_stream_are_cut_there() {
-        let samples: Vec<f32> =
-            (0..51_200).map(|i| (std::f64::consts::TAU * 3000.0 * f64::from(i) / RATE_HZ).sin() as f32).collect();
-        let found = squeals(&samples, 1024);
-        let [squeal] = found[..] else { panic!("{found:?}") };
-        assert_eq!((squeal.cut, squeal.growth, squeal.onset_ns), ([true; 2], None, START_NS));
-        // Amplitude 1 Pa: 90.97 dB. IEC 61672-1 weights 2.5 kHz by 1.3 dB and 3.15 kHz by 1.2 dB, both rounded.
-        assert!(
-            (squeal.level_db - 90.97 - 1.22).abs() < 0.08 && (squeal.frequency_hz - 3000.0).abs() < 0.01,
-            "{squeal:?}"
-        );
-        assert!((squeal.end_ns - START_NS - 1_000_000_000).abs() < 20_000_000, "{squeal:?}");
-    }
-
-    /// Missing, repeated and invalid samples are counted and named; a squeal ends at a gap and another begins after it.
-    #[test]
-    fn interruptions_are_counted_and_named() {
-        let tone = |i: usize| (std::f64::consts::TAU * 3000.0 * i as f64 / RATE_HZ).sin() as f32;
-        let mut detector = Detector::new(&channel(RATE_HZ), Settings::default()).unwrap();
-        let mut found = vec![];
-        let mut push = |detector: &mut Detector, from: usize, to: usize| {
-            let block: Vec<f32> = (from..to).map(|i| if i == 100 { f32::NAN } else { tone(i) }).collect();
-            detector.push(stamp_ns(START_NS, from as u64, RATE_HZ), &block, &mut found);
-        };
-        push(&mut detector, 0, 20_480);
-        push(&mut detector, 25_600, 51_200); // 0.1 s missing
-        push(&mut detector, 50_688, 61_440); // 512 samples again
-        detector.finish(&mut found);
-        let at = |index: u64| stamp_ns(START_NS, index, RATE_HZ);
-        let counts = detector.counts();
-        assert_eq!((counts.missing, counts.repeated, counts.not_finite, counts.interruptions), (5120, 512, 1, 2));
-        assert_eq!(counts.samples, 20_480 + 25_600 + 10_752 - 512);
-        let gap = Interruption::Gap { after_ns: at(20_480), samples: 5120 };
-        assert_eq!(counts.named, [gap, Interruption::Overlap { at_ns: at(50_688), samples: 512 }]);
-        let squeals = ended(&found);
-        assert_eq!(squeals.len(), 2, "{squeals:?}");
-        assert_eq!(squeals.iter().map(|squeal| squeal.cut).collect::<Vec<_>>(), [[true; 2]; 2]);
-        assert_eq!(squeals[1].onset_ns, at(25_600));
-    }
-
-    /// An announcement comes within the stated latency of the onset.
-    #[test]
-    fn squeals_are_announced_within_the_latency() {
-        let (samples, planted) = sound(65.0, &[], &[(2500.0, 100.0)]);
-        let mut detector = Detector::new(&channel(RATE_HZ), Settings::default()).unwrap();
-        let mut found = vec![];
-        let pushed = samples.chunks(64).enumerate().position(|(k, block)| {
-            detector.push(stamp_ns(START_NS, 64 * k as u64, RATE_HZ), block, &mut found);
-            !found.is_empty()
-        });
-        let announced_s = 64.0 * (pushed.unwrap() + 1) as f64 / RATE_HZ;
-        let latency_s = announced_s - planted[0].onset_s;
-        assert!(
-            latency_s > 0.1 && latency_s <= detector.latency_s(),
-            "{latency_s} s, stated {} s",
-            detector.latency_s()
-        );
-        assert!(matches!(found[0], Detection::Began(squeal) if (squeal.frequency_hz - 2500.0).abs() < 5.0));
-    }
-
-    #[test]
-    fn settings_outside_their_limits_are_refused() {
-        let error = |settings, rate| Detector::new(&channel(rate), settings).err().expect("refused").to_string();
-        let settings = Settings { threshold_db: f64::NAN, ..Default::default() };
-        assert_eq!(error(settings, RATE_HZ), "`threshold_db` is NaN, expected a finite number of -100 to 300");
-        let settings = Settings { band_hz: [5000.0, 2000.0], ..Default::default() };
-        assert_eq!(error(settings, RATE_HZ), "`band_hz` is 2000, expected a finite number of 5000 to 1000000");
-        let settings = Settings { band_hz: [5000.0, 6000.0], ..Default::default() };
-        let refused = "channel `microphone`: sampled at 8000 Hz it contains no frequency of the band 5000 to 6000 Hz";
-        assert_eq!(error(settings, 8000.0), refused);
-        let slow = Detector::new(&channel(8000.0), Settings::default()).unwrap();
-        assert_eq!(slow.band_hz(), [1250.0, 3937.5]);
-    }
-}
+mod tests;
