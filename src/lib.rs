@@ -28,6 +28,7 @@ pub mod full_model;
 pub mod import;
 pub mod node;
 pub mod offline;
+mod random;
 pub mod recording;
 pub mod rig;
 pub mod session;

@@ -1,11 +1,10 @@
 //! The rig simulator: load, speed and friction coefficient over time and the resulting vibration, with seeded noise.
 
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
 
 use crate::files::input_file;
 use crate::physics::OperatingPoint;
+use crate::random::Random;
 
 /// The `frame_id` of simulated measurements, by which recordings and displays recognise them.
 pub const FRAME_ID: &str = "simulated";
@@ -192,18 +191,15 @@ const LEVEL_NOISE_DB: f64 = 2.0;
 #[derive(Clone, Debug)]
 pub struct Simulator {
     profile: Profile,
-    noise: ChaCha8Rng,
+    noise: Random,
     /// A separate random stream, so that measuring vibration does not change the conditions.
-    vibration_noise: ChaCha8Rng,
+    vibration_noise: Random,
 }
 
 impl Simulator {
     /// A rig that repeats `profile` periodically.
     pub fn new(profile: Profile, seed: u64) -> Self {
-        let noise = ChaCha8Rng::seed_from_u64(seed);
-        let mut vibration_noise = noise.clone();
-        vibration_noise.set_stream(1);
-        Self { profile, noise, vibration_noise }
+        Self { profile, noise: Random::new(seed), vibration_noise: Random::stream(seed, 1) }
     }
 
     /// The conditions at a time since the start, without noise.
@@ -218,8 +214,8 @@ impl Simulator {
     /// frequency; otherwise uniformly distributed up to twice that frequency.
     pub fn measure_vibration(&mut self, tone: Tone, time_s: f64) -> Peak {
         let sounds = self.truth(time_s).friction_coefficient > tone.above_mu;
-        let place: f64 = self.vibration_noise.random();
-        let level_noise_db = LEVEL_NOISE_DB * normal(&mut self.vibration_noise);
+        let place = self.vibration_noise.uniform();
+        let level_noise_db = LEVEL_NOISE_DB * self.vibration_noise.normal();
         if sounds {
             let frequency_hz = tone.frequency_hz * (1.0 + 0.004 * (place - 0.5));
             Peak { frequency_hz, level_db: TONE_DB + level_noise_db }
@@ -233,18 +229,11 @@ impl Simulator {
         let point = self.truth(time_s);
         let Noise { normal_load_n, disc_speed_rad_s, friction_coefficient } = self.profile.noise;
         OperatingPoint {
-            normal_load_n: (point.normal_load_n + normal_load_n * normal(&mut self.noise)).max(0.0),
-            disc_speed_rad_s: point.disc_speed_rad_s + disc_speed_rad_s * normal(&mut self.noise),
-            friction_coefficient: (point.friction_coefficient + friction_coefficient * normal(&mut self.noise))
-                .max(0.0),
+            normal_load_n: (point.normal_load_n + normal_load_n * self.noise.normal()).max(0.0),
+            disc_speed_rad_s: point.disc_speed_rad_s + disc_speed_rad_s * self.noise.normal(),
+            friction_coefficient: (point.friction_coefficient + friction_coefficient * self.noise.normal()).max(0.0),
         }
     }
-}
-
-/// A standard normal random number (Box and Muller, 1958).
-fn normal(noise: &mut ChaCha8Rng) -> f64 {
-    let (u, v): (f64, f64) = (noise.random(), noise.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 #[cfg(test)]

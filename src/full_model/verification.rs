@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::full_model::FullModelFile;
 use crate::physics::{MapError, MapOptions, OperatingPoint, SolveError, Solver, StabilityMap, Window};
+use crate::random::Random;
 use crate::reduction::{
     CompareError, FullProgress, FullSolver, FullVectors, Judged, ReductionError, compare_roots, compare_windows,
     full_windows, reduced_roots,
@@ -203,9 +204,8 @@ fn ends(window: &Window) -> WindowEnds {
 
 /// Random operating points: load and speed from the range of the chart, friction coefficient from the range searched.
 fn held_out(rig: &Rig, against: &Against) -> Vec<OperatingPoint> {
-    use rand::{RngExt, SeedableRng};
-    let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(against.seed);
-    let mut within = |[low, high]: [f64; 2]| low + (high - low) * random.random::<f64>();
+    let mut random = Random::new(against.seed);
+    let mut within = |[low, high]: [f64; 2]| low + (high - low) * random.uniform();
     let [mu_low, mu_high] = rig.limits.friction_coefficient;
     (0..against.points)
         .map(|_| OperatingPoint {

@@ -4,12 +4,11 @@
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
 use super::Quantity;
 use super::weighting::power_weight;
+use crate::random::Random;
 
 /// Steps of the integral of the frequency weighting over the band.
 const INTEGRAL_STEPS: u32 = 2000;
@@ -76,7 +75,7 @@ pub struct Planted {
 #[derive(Clone, Debug)]
 pub struct SimulatedSound {
     settings: SoundSettings,
-    random: ChaCha8Rng,
+    random: Random,
     noise_deviation: f64,
     voices: BTreeMap<u32, Voice>,
     /// Index of the next sample.
@@ -113,7 +112,7 @@ impl SimulatedSound {
         let weights = (0..INTEGRAL_STEPS).map(|k| weight(low + (f64::from(k) + 0.5) * step));
         let integral: f64 = step * weights.sum::<f64>();
         let variance = mean_square(settings.noise_db) * settings.sample_rate_hz / (2.0 * integral);
-        let random = ChaCha8Rng::seed_from_u64(settings.seed);
+        let random = Random::new(settings.seed);
         let noise_deviation = variance.sqrt();
         Self { settings, random, noise_deviation, voices: BTreeMap::new(), index: 0, planted: vec![] }
     }
@@ -129,7 +128,7 @@ impl SimulatedSound {
             let new = Voice { amplitude: initial, phase: 0.0, sounding: None };
             self.voices.entry(drive.mode_id).or_insert(new);
         }
-        let mut sum: Vec<f64> = (0..count).map(|_| self.noise_deviation * normal(&mut self.random)).collect();
+        let mut sum: Vec<f64> = (0..count).map(|_| self.noise_deviation * self.random.normal()).collect();
         let from_s = self.index as f64 / self.settings.sample_rate_hz;
         for (&mode_id, voice) in &mut self.voices {
             let driven = drives.iter().find(|drive| drive.mode_id == mode_id);
@@ -229,12 +228,6 @@ fn amplitude(level_db: f64, frequency_hz: f64) -> f64 {
 
 fn level_db(amplitude: f64, frequency_hz: f64) -> f64 {
     Quantity::SoundPressure.level_db((0.5 * amplitude * amplitude * weight(frequency_hz)).sqrt())
-}
-
-/// A standard normal random number (Box and Muller, 1958).
-fn normal(random: &mut ChaCha8Rng) -> f64 {
-    let (u, v): (f64, f64) = (random.random(), random.random());
-    (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
 }
 
 #[cfg(test)]

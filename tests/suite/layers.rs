@@ -19,6 +19,7 @@ const PROGRAM: &[&str] = &[
     "text",
     "system",
     "files",
+    "random",
     "sound",
     "rig",
     "full_model",
