@@ -1,4 +1,4 @@
-//! Reduction of a full model on a parametric basis: options and progress messages.
+//! Reduction of a full model on a parametric basis: options.
 
 use std::f64::consts::TAU;
 
@@ -7,9 +7,7 @@ use anyhow::bail;
 use super::steps::Steps;
 use crate::full_model::FullModelFile;
 use crate::full_model::verification::DECAY_PER_S;
-use crate::reduction::{
-    Counted, FullSolver, GIB, OperatingBox, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis,
-};
+use crate::reduction::{Counted, FullSolver, OperatingBox, ParametricBasis, ParametricRequest, parametric_basis};
 
 /// Default tolerance: largest `|Δλ|/|λ|`.
 pub const TOLERANCE: f64 = 1e-6;
@@ -108,44 +106,11 @@ pub fn basis_of(
         most_samples: MOST_SAMPLES,
         most_vectors: MOST_VECTORS,
     };
-    let basis = parametric_basis(&full.model, solver, &request, &mut |step| report(steps, step))?;
+    let basis = parametric_basis(&full.model, solver, &request, &mut |step| steps.basis(step))?;
     let vectors = &basis.projected.basis;
     solver.held_elsewhere(size_of::<f64>() * vectors.nrows() * vectors.ncols());
     // For conditions on which the model does not depend, the basis is valid over the whole given range.
     Ok((ParametricRequest { range: asked, ..request }, basis))
-}
-
-fn report(steps: &mut Steps, step: ParametricStep) {
-    let at = |point: crate::physics::OperatingPoint| {
-        format!(
-            "{:.4} N, {:.4} rad/s, friction coefficient {:.4}",
-            point.normal_load_n, point.disc_speed_rad_s, point.friction_coefficient
-        )
-    };
-    match step {
-        ParametricStep::Planned { bytes } => {
-            steps.say(&format!(
-                "{:.2} GiB needed in addition to the matrices, for two operating points",
-                bytes as f64 / GIB
-            ));
-        }
-        ParametricStep::Sampling { point, sample } => {
-            steps.say(&format!("sample {sample}: solving the full model at {}", at(point)));
-        }
-        ParametricStep::Solving(step) => steps.full("full model", step),
-        ParametricStep::Sampled { roots, vectors, .. } => {
-            steps.say(&format!("{roots} roots there, {vectors} vectors in all"));
-        }
-        ParametricStep::Estimating { done, of } => steps.at(0, "estimating errors at operating points", done, of),
-        ParametricStep::Estimated { worst, vectors } => {
-            steps.done(0);
-            steps.say(&format!("worst estimate of |dlambda|/|lambda| with {vectors} vectors: {worst:.1e}"));
-        }
-        ParametricStep::Cut { vectors, worst } => steps.say(&format!("cut to {vectors} vectors: {worst:.1e}")),
-        ParametricStep::HeldOut { point, worst, done, of } => {
-            steps.say(&format!("held out, {done} of {of}, {}: {worst:.1e}", at(point)));
-        }
-    }
 }
 
 #[cfg(test)]

@@ -15,7 +15,7 @@ use crate::files::whole_file::{remove_begun, write_together};
 use crate::full_model::FullModelFile;
 use crate::full_model::verification::{Against, Verified, verify_against};
 use crate::physics::ResidualFlexibility;
-use crate::reduction::{FullSolver, GIB, Kept, Progress, Residual, Wanted};
+use crate::reduction::{FullSolver, Kept, Residual, Wanted};
 use crate::rig::{Certificate, Rig, RigFile, SideResidual, between_patches};
 
 /// Makes the files of the rig, with the certificate if the rig has been compared.
@@ -127,9 +127,8 @@ impl Options {
         }
         let wanted = self.wanted(&full)?;
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
-        let kept = full.keep_modes(&wanted, !self.no_residual, room, &mut |part, what| {
-            report(&mut steps, part, names[part], what)
-        })?;
+        let kept =
+            full.keep_modes(&wanted, !self.no_residual, room, &mut |part, what| steps.modes(part, names[part], what))?;
         for (name, Kept { modes, .. }) in names.iter().zip(&kept) {
             let worst = modes.residuals.iter().copied().fold(0.0, f64::max);
             steps.say(&format!(
@@ -272,28 +271,6 @@ fn remarks(names: &[&str], kept: &[Kept]) -> Vec<String> {
         ));
     }
     lines
-}
-
-/// Reports the progress of one part.
-pub fn report(steps: &mut Steps, part: usize, name: &str, what: Progress) {
-    match what {
-        Progress::Analysing => steps.say(&format!("{name}: ordering and analysing")),
-        Progress::Analysed { factor_entries, bytes } => steps.say(&format!(
-            "{name}: {:.1} million numbers in the factor, {:.2} GiB needed for this part in addition to the matrices",
-            factor_entries as f64 / 1e6,
-            bytes as f64 / GIB
-        )),
-        Progress::Factored { .. } => steps.say(&format!("{name}: factored")),
-        Progress::Iterated { converged, wanted, .. } => {
-            steps.at(part, &format!("{name}: modes"), converged.min(wanted), wanted);
-        }
-        Progress::Counted { modes, below } => {
-            steps.done(part);
-            let below_hz = below.max(0.0).sqrt() / TAU;
-            steps.say(&format!("{name}: {modes} modes below {below_hz:.1} Hz, counted by the inertia of K - shift M"));
-        }
-        Progress::Loaded { solved, loads } => steps.at(part, &format!("{name}: residual"), solved, loads),
-    }
 }
 
 /// Files named by the existing rig file at `path` that this command created and that are no longer needed: neither

@@ -5,7 +5,6 @@ use clap::Args;
 
 use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of};
-use super::reduce::report;
 use super::signals::on_stop;
 use super::steps::ProgressOptions;
 use super::{Outcome, positive, write_file};
@@ -68,7 +67,7 @@ impl Options {
         let most = Wanted::Lowest(MODES.into_iter().max().unwrap_or(0));
         let kept =
             full.keep_modes(&vec![most; names.len()], true, room(self.memory_gib, &toml)?, &mut |part, what| {
-                report(&mut steps, part, names[part], what);
+                steps.modes(part, names[part], what);
             })?;
         // The modes on all coordinates of the parts are no longer needed.
         let modes = PartModes::new(&full, &kept)?;

@@ -1,12 +1,14 @@
 //! Progress of long computations on standard error: bars with the remaining time on a terminal, plain lines elsewhere,
 //! nothing with `--quiet`.
 
+use std::f64::consts::TAU;
 use std::io::{IsTerminal, Write};
 
 use clap::Args;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::reduction::{FullProgress, GIB};
+use crate::physics::OperatingPoint;
+use crate::reduction::{FullProgress, GIB, ParametricStep, Progress};
 use crate::system::clock::monotonic_ns;
 use crate::system::memory::resident_bytes;
 use crate::text::terminal::printable;
@@ -102,7 +104,7 @@ impl Steps {
 
     /// Reports the progress of solving a full model for the purpose `what`, as the first task.
     pub fn full(&mut self, what: &str, step: FullProgress) {
-        let hz = |omega: f64| omega / std::f64::consts::TAU;
+        let hz = |omega: f64| omega / TAU;
         match step {
             FullProgress::Analysed { bytes } => {
                 self.say(&format!("{what}: ordered and analysed, needs {:.2} GiB at least", bytes as f64 / GIB));
@@ -117,6 +119,62 @@ impl Steps {
                 let [from, to] = disc.stretch_rad_s();
                 self.done(0);
                 self.say(&format!("{what}: {roots} roots cover {:.1} to {:.1} Hz", hz(from), hz(to)));
+            }
+        }
+    }
+
+    /// Reports the progress of the modes of the part `name`, as the task `part`.
+    pub fn modes(&mut self, part: usize, name: &str, what: Progress) {
+        match what {
+            Progress::Analysing => self.say(&format!("{name}: ordering and analysing")),
+            Progress::Analysed { factor_entries, bytes } => self.say(&format!(
+                "{name}: {:.1} million numbers in the factor, {:.2} GiB needed for this part in addition to the matrices",
+                factor_entries as f64 / 1e6,
+                bytes as f64 / GIB
+            )),
+            Progress::Factored { .. } => self.say(&format!("{name}: factored")),
+            Progress::Iterated { converged, wanted, .. } => {
+                self.at(part, &format!("{name}: modes"), converged.min(wanted), wanted);
+            }
+            Progress::Counted { modes, below } => {
+                self.done(part);
+                let below_hz = below.max(0.0).sqrt() / TAU;
+                self.say(&format!("{name}: {modes} modes below {below_hz:.1} Hz, counted by the inertia of K - shift M"));
+            }
+            Progress::Loaded { solved, loads } => self.at(part, &format!("{name}: residual"), solved, loads),
+        }
+    }
+
+    /// Reports the progress of a parametric basis, as the first task.
+    pub fn basis(&mut self, step: ParametricStep) {
+        let at = |point: OperatingPoint| {
+            format!(
+                "{:.4} N, {:.4} rad/s, friction coefficient {:.4}",
+                point.normal_load_n, point.disc_speed_rad_s, point.friction_coefficient
+            )
+        };
+        match step {
+            ParametricStep::Planned { bytes } => {
+                self.say(&format!(
+                    "{:.2} GiB needed in addition to the matrices, for two operating points",
+                    bytes as f64 / GIB
+                ));
+            }
+            ParametricStep::Sampling { point, sample } => {
+                self.say(&format!("sample {sample}: solving the full model at {}", at(point)));
+            }
+            ParametricStep::Solving(step) => self.full("full model", step),
+            ParametricStep::Sampled { roots, vectors, .. } => {
+                self.say(&format!("{roots} roots there, {vectors} vectors in all"));
+            }
+            ParametricStep::Estimating { done, of } => self.at(0, "estimating errors at operating points", done, of),
+            ParametricStep::Estimated { worst, vectors } => {
+                self.done(0);
+                self.say(&format!("worst estimate of |dlambda|/|lambda| with {vectors} vectors: {worst:.1e}"));
+            }
+            ParametricStep::Cut { vectors, worst } => self.say(&format!("cut to {vectors} vectors: {worst:.1e}")),
+            ParametricStep::HeldOut { point, worst, done, of } => {
+                self.say(&format!("held out, {done} of {of}, {}: {worst:.1e}", at(point)));
             }
         }
     }
