@@ -77,7 +77,15 @@ impl Topic {
 
     /// Whether late subscribers get the last message (`TRANSIENT_LOCAL`).
     pub fn is_latched(self) -> bool {
-        self == Self::RigInfo
+        match self {
+            Self::RigInfo => true,
+            Self::OperatingPoint
+            | Self::Prediction
+            | Self::SessionEvent
+            | Self::Sensitivity
+            | Self::Diagnostics
+            | Self::Vibration => false,
+        }
     }
 
     /// The text of the `.msg` file of the topic's type.

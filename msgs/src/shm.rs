@@ -290,37 +290,52 @@ impl Form for PredictionForm {
     const WAITING_SAMPLES: usize = 1024;
 
     fn from_message(message: &Prediction) -> Result<Self, FormError> {
-        if message.modes.len() > MAX_MODES {
-            return Err(FormError::ModeCount { found: message.modes.len() });
+        let Prediction {
+            header,
+            input_seq,
+            level,
+            reused,
+            unstable_modes,
+            max_growth_rate_per_s,
+            worst_frequency_hz,
+            critical_friction,
+            friction_margin,
+            friction_margin_error,
+            reason,
+            modes,
+        } = message;
+        if modes.len() > MAX_MODES {
+            return Err(FormError::ModeCount { found: modes.len() });
         }
-        if message.level > level::FAULT {
-            return Err(FormError::Level(message.level));
+        if *level > level::FAULT {
+            return Err(FormError::Level(*level));
         }
-        let mut modes = [ModeForm::default(); MAX_MODES];
-        for (form, mode) in modes.iter_mut().zip(&message.modes) {
+        let mode_count = modes.len() as u32;
+        let mut forms = [ModeForm::default(); MAX_MODES];
+        for (form, mode) in forms.iter_mut().zip(modes) {
             *form = ModeForm::from(mode);
         }
-        let cut = cut_at_char(&message.reason, REASON_BYTES).as_bytes();
+        let cut = cut_at_char(reason, REASON_BYTES).as_bytes();
         let mut reason = [0; REASON_BYTES];
         for (to, from) in reason.iter_mut().zip(cut) {
             *to = *from;
         }
         Ok(Self {
-            stamp_ns: message.header.stamp.as_ns(),
-            input_seq: message.input_seq,
-            max_growth_rate_per_s: message.max_growth_rate_per_s,
-            worst_frequency_hz: message.worst_frequency_hz,
-            critical_friction: message.critical_friction,
-            friction_margin: message.friction_margin,
-            friction_margin_error: message.friction_margin_error,
-            unstable_modes: message.unstable_modes,
-            mode_count: message.modes.len() as u32,
-            level: message.level,
-            reused: message.reused.into(),
+            stamp_ns: header.stamp.as_ns(),
+            input_seq: *input_seq,
+            max_growth_rate_per_s: *max_growth_rate_per_s,
+            worst_frequency_hz: *worst_frequency_hz,
+            critical_friction: *critical_friction,
+            friction_margin: *friction_margin,
+            friction_margin_error: *friction_margin_error,
+            unstable_modes: *unstable_modes,
+            mode_count,
+            level: *level,
+            reused: (*reused).into(),
             reason_len: cut.len() as u8,
             zero: [0; 5],
             reason,
-            modes,
+            modes: forms,
         })
     }
 

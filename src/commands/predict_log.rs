@@ -69,7 +69,16 @@ impl Options {
             let quantity = match entry.message {
                 Recorded::Known(Payload::OperatingPoint(input)) => Quantity::Conditions(input),
                 Recorded::Known(Payload::Vibration(vibration)) => Quantity::Vibration(vibration),
-                _ => return None,
+                // Of the rig's messages only these are predicted or recorded again; the node's own are made anew.
+                Recorded::Known(
+                    Payload::Prediction(_)
+                    | Payload::SessionEvent(_)
+                    | Payload::RigInfo(_)
+                    | Payload::Sensitivity(_)
+                    | Payload::Diagnostics(_),
+                )
+                | Recorded::Unreadable(_)
+                | Recorded::Other => return None,
             };
             Some(Measured { log_time_ns: entry.log_time_ns, publish_time_ns: entry.publish_time_ns, quantity })
         });

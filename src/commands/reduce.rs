@@ -14,7 +14,7 @@ use crate::files::input_file;
 use crate::files::whole_file::{remove_begun, write_together};
 use crate::full_model::FullModelFile;
 use crate::full_model::verification::{Against, Verified, verify_against};
-use crate::physics::ResidualFlexibility;
+use crate::physics::{ContactLaw, ResidualFlexibility};
 use crate::reduction::{FullSolver, Kept, Residual, Wanted};
 use crate::rig::{Certificate, Rig, RigFile, SideResidual, between_patches};
 
@@ -117,7 +117,8 @@ impl Options {
         if full.geometry.is_empty() {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
         }
-        let exponent = full.settings.contact_law.exponent;
+        // Residual flexibility admits every law but stiffness that varies with the load.
+        let ContactLaw { exponent, reference_n: _, slope_s_per_m: _, lateral_damping: _ } = full.settings.contact_law;
         if exponent != 0.0 && !self.no_residual {
             bail!(
                 "{}: `load.exponent` is {exponent}: residual flexibility requires contact stiffness independent of the load; \

@@ -227,7 +227,7 @@ impl Comparison {
     pub fn leads_s(&self) -> Vec<f64> {
         let leads = self.measured.iter().filter_map(|judged| match judged.verdict {
             Verdict::Hit { lead_s, .. } => Some(lead_s),
-            _ => None,
+            Verdict::NotPredicted | Verdict::OtherFrequency => None,
         });
         let mut leads: Vec<f64> = leads.collect();
         leads.sort_by(f64::total_cmp);

@@ -100,7 +100,7 @@ impl RecoveryReport {
     fn restored(&self) -> impl Iterator<Item = &Restored> {
         self.recoveries.iter().filter_map(|recovery| match &recovery.outcome {
             Outcome::Restored(restored) => Some(restored),
-            _ => None,
+            Outcome::Complete { .. } | Outcome::Empty | Outcome::SetAside { .. } | Outcome::InUse => None,
         })
     }
 }

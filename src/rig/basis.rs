@@ -2,7 +2,7 @@
 
 use faer::Mat;
 
-use super::inline::free_frequencies;
+use super::inline::{describe_contact, free_frequencies};
 use super::modal::Part;
 use super::patch::Pair;
 use super::raw::RawBasis;
@@ -98,17 +98,8 @@ pub(super) fn build(
     let mut contents = vec![
         "kind       pad and disc on a shared basis (kind 2)".to_owned(),
         format!("vectors    {k}, of the full model"),
-        format!(
-            "contact    {} pairs, in all {:.6e} N/m, {:.6e} N s/m",
-            pairs.len(),
-            contact.stiffness_n_per_m.iter().sum::<f64>(),
-            contact.damping_n_s_per_m.iter().sum::<f64>()
-        ),
-        match law.exponent {
-            0.0 => "stiffness  of the contact, independent of the load".to_owned(),
-            exponent => format!("stiffness  of the contact times (load / {} N)^{exponent}", law.reference_n),
-        },
     ];
+    contents.extend(describe_contact(&contact, &law));
     contents.extend(free_frequencies("vectors", omega_rad_s));
     contents.extend(terms.contents);
     let shapes = ["pad", "disc"]

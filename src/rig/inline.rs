@@ -5,7 +5,7 @@ use faer::Mat;
 use super::raw::{RawContact, RawSubstructure};
 use super::settings::{Settings, finite, spread, within};
 use super::{Built, Contact, RigError, SideShapes};
-use crate::physics::{ContactPairs, Law, Model, ResidualFlexibility, Term};
+use crate::physics::{ContactLaw, ContactPairs, Law, Model, ResidualFlexibility, Term};
 use crate::reduction::{Modes, free_interface_modes};
 
 /// Modes of one side with their damping ratios.
@@ -38,6 +38,24 @@ pub(super) struct Terms {
     pub damping: Vec<Term>,
     /// A line for [`super::Rig::describe`] each.
     pub contents: Vec<String>,
+}
+
+/// The contact in two lines of text: its pairs and the law of their stiffness.
+pub(super) fn describe_contact(pairs: &ContactPairs, law: &ContactLaw) -> [String; 2] {
+    // Friction is described with the damping, if at all.
+    let ContactLaw { exponent, reference_n, slope_s_per_m: _, lateral_damping: _ } = *law;
+    [
+        format!(
+            "contact    {} pairs, in all {:.6e} N/m, {:.6e} N s/m",
+            pairs.stiffness_n_per_m.len(),
+            pairs.stiffness_n_per_m.iter().sum::<f64>(),
+            pairs.damping_n_s_per_m.iter().sum::<f64>()
+        ),
+        match exponent {
+            0.0 => "stiffness  of the contact, independent of the load".to_owned(),
+            exponent => format!("stiffness  of the contact times (load / {reference_n} N)^{exponent}"),
+        },
+    ]
 }
 
 /// Builds the model of both sides: `K = diag(ω²)` and `C = diag(2 ζ ω)`, with `terms`, joined by the contact pairs. If
@@ -84,17 +102,8 @@ pub(super) fn assemble(
                 None => "the disc rigid".to_owned(),
             }
         ),
-        format!(
-            "contact    {} pairs, in all {:.6e} N/m, {:.6e} N s/m",
-            pairs.stiffness_n_per_m.len(),
-            pairs.stiffness_n_per_m.iter().sum::<f64>(),
-            pairs.damping_n_s_per_m.iter().sum::<f64>()
-        ),
-        match contact_law.exponent {
-            0.0 => "stiffness  of the contact, independent of the load".to_owned(),
-            exponent => format!("stiffness  of the contact times (load / {} N)^{exponent}", contact_law.reference_n),
-        },
     ];
+    contents.extend(describe_contact(&pairs, &contact_law));
     for (name, side) in ["pad", "disc"].into_iter().zip(&sides) {
         contents.extend(free_frequencies(name, &side.modes.omega_rad_s));
     }

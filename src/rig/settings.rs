@@ -1,6 +1,8 @@
 //! The tables common to all kinds of rig, and how the kind of a rig is determined.
 
-use super::raw::{Common, OneOrMany, RawContact, RawModes, RawPatch, RawRig, RawSubstructure, RawSystem};
+use super::raw::{
+    Common, OneOrMany, RawContact, RawFriction, RawLoad, RawModes, RawPatch, RawRig, RawSubstructure, RawSystem,
+};
 use super::{ChartRange, Limits, RigError, Warning};
 use crate::physics::{ContactLaw, OperatingPoint};
 use crate::reduction::ModeSelection;
@@ -139,10 +141,12 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
         if let Some((field, _)) = other.iter().find(|(_, present)| *present) {
             return mixed(field, "cannot be combined with [system]", "either [system] or [pad] with its contact");
         }
+        let RawFriction { slope_s_per_m, lateral_damping } = raw.friction;
+        let RawLoad { exponent, reference_n: _ } = raw.load;
         let friction_or_load = [
-            ("friction.slope_s_per_m", raw.friction.slope_s_per_m != 0.0),
-            ("friction.lateral_damping", raw.friction.lateral_damping),
-            ("load.exponent", raw.load.exponent != 0.0),
+            ("friction.slope_s_per_m", slope_s_per_m != 0.0),
+            ("friction.lateral_damping", lateral_damping),
+            ("load.exponent", exponent != 0.0),
         ];
         if let Some((field, _)) = friction_or_load.iter().find(|(_, set)| *set) {
             return mixed(field, "has nothing to act on in a rig with [system]", "a scale of a matrix instead");

@@ -6,7 +6,7 @@ use super::raw::{RawSystem, RawTerm};
 use super::settings::{MOST_COORDINATES, MOST_TERMS, Settings, at_most};
 use super::source::Source;
 use super::{Built, RigError, matrix_market, scale};
-use crate::physics::{Law, Model, OperatingPoint, Term};
+use crate::physics::{ContactState, Law, Model, OperatingPoint, Term};
 use crate::reduction::{
     ReductionError, SparseMatrix, is_symmetric, lowest_modes, project_sparse, weighted_sum, whiten,
 };
@@ -180,11 +180,22 @@ fn value_at(law: &Law, reference: &OperatingPoint) -> f64 {
         Law::Custom(custom) => {
             // The contact of a system never opens, but it may not slide.
             let mu = match reference.state_closed() {
-                crate::physics::ContactState::Sliding => reference.friction_coefficient,
-                _ => 0.0,
+                ContactState::Sliding => reference.friction_coefficient,
+                ContactState::NotSliding | ContactState::Open => 0.0,
             };
             (custom.evaluate)(&reference.with_friction(mu))
         }
-        _ => 1.0,
+        // The terms of a system have scales or none. These laws belong to contact pairs and projected full models.
+        Law::Constant
+        | Law::ContactStiffness
+        | Law::FrictionStiffness
+        | Law::ContactDamping
+        | Law::FrictionDamping
+        | Law::FrictionSlope
+        | Law::LateralFriction
+        | Law::FrictionChebyshev { .. }
+        | Law::DiscSpeed { .. }
+        | Law::DiscSpeedInContact { .. }
+        | Law::DiscSpeedChebyshev { .. } => 1.0,
     }
 }

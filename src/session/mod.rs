@@ -77,7 +77,9 @@ pub struct Counters {
 impl Counters {
     /// Predictions that were computed: solved or charted, not reused.
     pub fn worked(&self) -> u64 {
-        self.solved + self.charted
+        let Self { solved, charted, reused: _, faults: _, zero_terms: _, decoupled_modes: _, roots_beyond_band: _ } =
+            *self;
+        solved + charted
     }
 }
 
@@ -373,17 +375,22 @@ impl Session {
             prediction.reason.push_str(note);
         }
         let known = |of: fn(&NearestEnd) -> f64| nearest.as_ref().map_or(f64::NAN, of);
-        prediction.critical_friction = known(|end| end.mu);
-        prediction.friction_margin = known(|end| end.margin);
-        prediction.friction_margin_error = known(|end| end.error);
-        prediction.header = header;
-        prediction.input_seq = input_seq;
-        prediction.level = level;
-        prediction.reused = false;
-        prediction.unstable_modes = summary.unstable_modes;
-        prediction.max_growth_rate_per_s = summary.max_growth_rate_per_s.unwrap_or(f64::NAN);
-        prediction.worst_frequency_hz = summary.worst_frequency_hz.unwrap_or(f64::NAN);
         publish_modes(&summary.modes, order, &mut prediction.modes);
+        *prediction = Prediction {
+            header,
+            input_seq,
+            level,
+            reused: false,
+            unstable_modes: summary.unstable_modes,
+            max_growth_rate_per_s: summary.max_growth_rate_per_s.unwrap_or(f64::NAN),
+            worst_frequency_hz: summary.worst_frequency_hz.unwrap_or(f64::NAN),
+            critical_friction: known(|end| end.mu),
+            friction_margin: known(|end| end.margin),
+            friction_margin_error: known(|end| end.error),
+            // Their memory is used again.
+            reason: std::mem::take(&mut prediction.reason),
+            modes: std::mem::take(&mut prediction.modes),
+        };
         Ok(())
     }
 
@@ -509,13 +516,15 @@ impl Session {
             header,
             input_seq,
             level: level::FAULT,
-            reason: reason.to_string(),
+            reused: false,
+            unstable_modes: 0,
             max_growth_rate_per_s: f64::NAN,
             worst_frequency_hz: f64::NAN,
             critical_friction: f64::NAN,
             friction_margin: f64::NAN,
             friction_margin_error: f64::NAN,
-            ..Default::default()
+            reason: reason.to_string(),
+            modes: vec![],
         };
     }
 }
