@@ -153,8 +153,17 @@ impl Buses {
             let name = ros2.args.node_name(NODE_NAME);
             ros2.args.topic(topic::relative(topic::OPERATING_POINT), &ros2.args.namespace(&name, "/"), &name)
         });
-        let service = shm.as_ref().map(|shm| format!("{}{}", shm.service_prefix, OperatingPointForm::SERVICE));
-        let start = (topic.is_some() || service.is_some()).then(|| {
+        // The bus of most rigs first.
+        let places = Bus::ALL.into_iter().rev().filter_map(|bus| match bus {
+            Bus::Shm => {
+                let shm = shm.as_ref()?;
+                Some(format!("{}{} (shared memory)", shm.service_prefix, OperatingPointForm::SERVICE))
+            }
+            Bus::Ros2 => Some(format!("{} (ROS 2, domain {})", topic.as_ref()?, ros2?.domain_id)),
+            Bus::Simulator => None,
+        });
+        let places: Vec<String> = places.collect();
+        let start = (!places.is_empty()).then(|| {
             let mut command = "squealcast simulate".to_owned();
             for (given, option) in
                 [(options.no_ros, "--no-ros"), (options.no_shm, "--no-shm"), (options.loopback, "--loopback")]
@@ -174,7 +183,7 @@ impl Buses {
             }
             command
         });
-        InputSources { topic, domain: ros2.map(|ros2| ros2.domain_id), service, start }
+        InputSources { places, start }
     }
 }
 
@@ -200,8 +209,7 @@ mod tests {
         let arguments = ["--ros-args", "-r", "/rig/operating_point:=/brake1/point"].map(str::to_owned);
         let (args, _) = RosArgs::split(arguments).expect("rules");
         let sources = options().resolve(args).expect("a domain").sources();
-        assert_eq!((sources.topic.as_deref(), sources.domain), (Some("/brake1/point"), Some(7)));
-        assert_eq!(sources.service.as_deref(), Some("cell2/rig/operating_point"));
+        assert_eq!(sources.places, ["/brake1/point (ROS 2, domain 7)", "cell2/rig/operating_point (shared memory)"]);
         assert_eq!(
             sources.start.as_deref(),
             Some(

@@ -188,12 +188,15 @@ mod tests {
     fn the_page_is_sent_the_level_that_was_predicted() {
         let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
         let watch = Watch::default();
-        let inputs = Some(InputSources { topic: Some("/rig/operating_point".to_owned()), ..InputSources::default() });
+        let inputs = Some(InputSources { places: vec!["/rig/operating_point".to_owned()], start: None });
         let about = About { simulated: true, inputs, ..About::new(&rig, "live", 70.0) };
         let live = Live::new(rig, watch.clone(), about);
         let state = || serde_json::from_str::<serde_json::Value>(&live.state(None)).expect("JSON");
         let about = serde_json::to_value(live.about()).expect("JSON");
-        assert_eq!((&about["simulated"], &about["inputs"]["topic"]), (&true.into(), &"/rig/operating_point".into()));
+        assert_eq!(
+            (&about["simulated"], &about["inputs"]["places"][0]),
+            (&true.into(), &"/rig/operating_point".into())
+        );
         assert_eq!((&state()["status"], &state()["level"]), (&"waiting".into(), &serde_json::Value::Null));
         for (level, status) in [
             (level::OK, "ok"),

@@ -210,11 +210,8 @@ fn growing(fastest: Option<UnstableMode>, unstable: u32) -> String {
 /// Where a node expects its inputs, and how to simulate them.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct InputSources {
-    /// Topic on ROS 2, as remapped, and its domain; `None` without ROS 2.
-    pub topic: Option<String>,
-    pub domain: Option<u16>,
-    /// Service in shared memory; `None` without shared memory.
-    pub service: Option<String>,
+    /// The topics and services that it listens to, each with its bus in parentheses.
+    pub places: Vec<String>,
     /// The command that publishes simulated operating points there.
     pub start: Option<String>,
 }
@@ -222,15 +219,9 @@ pub struct InputSources {
 impl InputSources {
     /// A sentence for a user whose node waits for the first input.
     pub fn sentence(&self) -> String {
-        let ros2 = self.topic.as_ref().map(|topic| match self.domain {
-            Some(domain) => format!("{topic} (ROS 2, domain {domain})"),
-            None => format!("{topic} (ROS 2)"),
-        });
-        let shm = self.service.as_ref().map(|service| format!("{service} (shared memory)"));
-        let places: Vec<String> = ros2.into_iter().chain(shm).collect();
-        let mut text = match places.is_empty() {
-            true => "it listens to no bus".to_owned(),
-            false => format!("it listens to {}", places.join(" and ")),
+        let mut text = match self.places.as_slice() {
+            [] => "it listens to no bus".to_owned(),
+            places => format!("it listens to {}", places.join(" and ")),
         };
         if let Some(start) = &self.start {
             text += &format!("; without a rig, start: {start}");
@@ -339,9 +330,9 @@ mod tests {
     #[test]
     fn waiting_names_topic_domain_and_command_to_start() {
         let sources = InputSources {
-            topic: Some("/rig/operating_point".to_owned()),
-            domain: Some(7),
-            service: Some("rig/operating_point".to_owned()),
+            places: ["/rig/operating_point (ROS 2, domain 7)", "rig/operating_point (shared memory)"]
+                .map(str::to_owned)
+                .into(),
             start: Some("squealcast simulate --domain 7".to_owned()),
         };
         assert_eq!(

@@ -133,7 +133,7 @@ const event_columns = [
   ofMoment("disc_speed_rad_s", "speed", "rad/s", [2, 2]), ofMoment("friction_coefficient", "μ", "onset → fastest", [4, 4], true), once("reason", "reason"),
 ];
 
-const about = { kind: "live", rig: "tribometer", content_hash: "0".repeat(64), version: "0.1.0", band_max_hz: 4000, mu_max: 1, warn_margin: 0.05, instability_threshold: 1e-6, vibration_threshold_db: 70, span_s: null, notes: [], event_columns, simulated: false, inputs: { topic: "/rig/operating_point", domain: 0, service: "rig/operating_point", start: "squealcast simulate" } };
+const about = { kind: "live", rig: "tribometer", content_hash: "0".repeat(64), version: "0.1.0", band_max_hz: 4000, mu_max: 1, warn_margin: 0.05, instability_threshold: 1e-6, vibration_threshold_db: 70, span_s: null, notes: [], event_columns, simulated: false, inputs: { places: ["/rig/operating_point (ROS 2, domain 0)", "rig/operating_point (shared memory)"], start: "squealcast simulate" } };
 
 /** Serves the page of `assets` in a situation, which `turn` changes. */
 export function serve(assets, situation, more = {}) {

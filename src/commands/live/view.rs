@@ -338,9 +338,9 @@ pub mod tests {
             ],
             instability_threshold: 1e-6,
             inputs: Some(InputSources {
-                topic: Some("/rig/operating_point".to_owned()),
-                domain: Some(0),
-                service: Some("rig/operating_point".to_owned()),
+                places: ["/rig/operating_point (ROS 2, domain 0)", "rig/operating_point (shared memory)"]
+                    .map(str::to_owned)
+                    .into(),
                 start: Some("squealcast simulate".to_owned()),
             }),
             foot: Box::new(|_| vec!["solved 123456".to_owned(), "faults 0".to_owned()]),

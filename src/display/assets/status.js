@@ -8,8 +8,7 @@ const at = (id) => document.getElementById(id);
 /** Where the node expects its inputs, and how to simulate them. */
 function listening(inputs) {
   if (!inputs) return "";
-  const { topic, domain, service, start } = inputs;
-  const places = [topic && `topic ${topic} in ROS domain ${domain ?? 0}`, service && `shared-memory service ${service}`].filter(Boolean);
+  const { places, start } = inputs;
   const text = places.length ? `Listens to ${places.join(" and ")}.` : "Listens to no bus.";
   return start ? `${text} Without a rig, start: ${start}` : text;
 }
