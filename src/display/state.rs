@@ -64,7 +64,7 @@ pub struct Shown<'a> {
     pub modes: Vec<(u32, [f64; 6])>,
 }
 
-/// Counters of the session.
+/// Counters of the session. The page shows all but the last in this order, each with its name.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct CountersShown {
     pub solved: u64,

@@ -89,10 +89,11 @@ export class Status {
     at("age-unit").hidden = !known(age);
     put(at("seq"), known(state.seq) ? String(state.seq) : NONE, state.seq);
     put(at("rate"), fixed(state.rate_hz, 0), state.rate_hz);
-    const c = state.counters;
-    if (c) {
-      const falls = c.ros2_falls ? `, ROS 2 started again ${c.ros2_falls}` : "";
-      put(at("counters"), `${c.solved} solved, ${c.charted} charted, ${c.reused} reused, ${c.faults} faults, ${c.passed_over} passed over${falls}`);
+    if (state.counters) {
+      const { ros2_falls, ...counts } = state.counters;
+      const words = Object.entries(counts).map(([name, count]) => `${count} ${name.replaceAll("_", " ")}`);
+      if (ros2_falls) words.push(`ROS 2 started again ${ros2_falls}`);
+      put(at("counters"), words.join(", "));
     }
     this.#trend(state);
   }
