@@ -49,7 +49,7 @@ for (const [status, word] of Object.entries(WORDS)) {
         check(/pad 40 %/.test(await text(page, "shape-parts")) && /disc 100 %/.test(await text(page, "shape-parts")), `${where}: ${await text(page, "shape-parts")}`);
         check(/stiffness\s*−2\.04/.test(await text(page, "shape-changes")), `${where}: ${await text(page, "shape-changes")}`);
       } else if (status !== "fault") {
-        check(/topic \/rig\/operating_point in ROS domain 0/.test(answer) && /squealcast simulate/.test(answer), `${where}: ${answer}`);
+        check(/\/rig\/operating_point \(ROS 2, domain 0\)/.test(answer) && /squealcast simulate/.test(answer), `${where}: ${answer}`);
       }
       const wide = await page.evaluate(() => document.documentElement.scrollWidth - innerWidth);
       check(wide <= 0, `${where}: ${wide} px too wide`);
