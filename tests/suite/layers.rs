@@ -5,6 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
+use squealcast::physics::chart::BUILDER;
+
 /// Rooms of `crates/core/src`, from the inside out.
 const CORE: &[&str] = &["chebyshev", "sampling", "spoil", "contact", "physics", "reduction", "fem", "proof"];
 
@@ -69,6 +71,10 @@ const CIRCLES: &[(&[&str], &str)] = &[
         "a build makes leaves, and a leaf reads the options of its build",
     ),
 ];
+
+/// Modules of the core that the builder of charts imports and that do not determine the result of a build, and why.
+const BESIDE_BUILDER: &[(&str, &str)] =
+    &[("physics::numbering", "numbers the roots of a chart that is evaluated; charts hold no identities")];
 
 /// A Rust file: its path below the root, and its text without comments and without what follows `#[cfg(test)] mod`.
 struct Source {
@@ -267,6 +273,32 @@ fn files_of_the_core_import_each_other_in_the_known_circles_only() {
     let known: BTreeSet<Vec<String>> =
         CIRCLES.iter().map(|(circle, _)| circle.iter().map(|module| (*module).to_owned()).collect()).collect();
     assert_eq!(found, known, "circles found, and those listed in tests/suite/layers.rs");
+}
+
+/// A stored chart is keyed by the sources in `BUILDER`: if one were missing, a changed builder would use old charts.
+#[test]
+fn charts_are_keyed_by_all_sources_that_their_builder_imports() {
+    let sources = sources(&root().join("crates/core/src"));
+    let graph = module_graph(&sources);
+    let (mut reached, mut next) = (BTreeSet::new(), vec!["physics::chart::build"]);
+    while let Some(module) = next.pop() {
+        if BESIDE_BUILDER.iter().all(|(name, _)| *name != module) && reached.insert(module) {
+            next.extend(graph[module].iter().map(String::as_str));
+            // A module may pass on what its children define.
+            let child = |name: &&String| name.strip_prefix(module).is_some_and(|rest| rest.starts_with("::"));
+            next.extend(graph.keys().filter(child).map(String::as_str));
+        }
+    }
+    let file = |module: &str| {
+        let path = root().join("crates/core/src").join(module.replace("::", "/"));
+        fs::read_to_string(path.with_extension("rs")).or_else(|_| fs::read_to_string(path.join("mod.rs"))).unwrap()
+    };
+    let missing: Vec<&&str> = reached.iter().filter(|module| !BUILDER.contains(&file(module).as_str())).collect();
+    assert!(missing.is_empty(), "not in BUILDER of physics/chart/words.rs: {missing:?}");
+    for (module, _) in BESIDE_BUILDER {
+        let used = reached.iter().any(|user| graph[*user].contains(*module));
+        assert!(used, "the builder no longer imports {module}: take it off the list");
+    }
 }
 
 #[test]

@@ -10,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 25] = [
+pub const BUILDER: [&str; 29] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -18,6 +18,7 @@ pub const BUILDER: [&str; 25] = [
     include_str!("fit.rs"),
     include_str!("leaf.rs"),
     include_str!("mod.rs"),
+    include_str!("pairing.rs"),
     include_str!("samples.rs"),
     include_str!("totals.rs"),
     include_str!("words.rs"),
@@ -25,10 +26,13 @@ pub const BUILDER: [&str; 25] = [
     include_str!("../dense_eigen.rs"),
     include_str!("../flexible_contact.rs"),
     include_str!("../model.rs"),
+    include_str!("../operating_point.rs"),
     include_str!("../solver.rs"),
+    include_str!("../spectrum.rs"),
     include_str!("../steady_contact.rs"),
     include_str!("../traces.rs"),
     include_str!("../../contact/law.rs"),
+    include_str!("../../contact/mod.rs"),
     include_str!("../../contact/path.rs"),
     include_str!("../../contact/response.rs"),
     include_str!("../../contact/spline.rs"),
