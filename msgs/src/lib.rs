@@ -445,6 +445,21 @@ pub fn from_cdr<M: for<'de> Deserialize<'de>>(bytes: &[u8]) -> Result<M, CdrErro
 mod tests {
     use super::*;
 
+    #[test]
+    fn rosidl_generates_every_message_file() {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+        let list = std::fs::read_to_string(folder.join("CMakeLists.txt")).expect("the list");
+        let files = std::fs::read_dir(folder.join("msg")).expect("the messages");
+        let names = files.map(|file| file.expect("a file").file_name().into_string().expect("UTF-8"));
+        let missing: Vec<String> = names.filter(|name| !list.contains(&format!("\"msg/{name}\""))).collect();
+        assert_eq!(missing, [""; 0], "not in CMakeLists.txt");
+        for topic in schema::Topic::ALL.into_iter().filter(|topic| topic.is_own_type()) {
+            let name = topic.type_name().rsplit('/').next().unwrap_or_default();
+            let file = std::fs::read_to_string(folder.join(format!("msg/{name}.msg"))).expect("its file");
+            assert_eq!(file, topic.definition(), "{topic:?}");
+        }
+    }
+
     /// `STABILITY_MAP` of `StabilityMap`.
     fn constant_name(variant: &str) -> String {
         let mut name = String::new();
