@@ -185,6 +185,23 @@ impl Way {
             Self::LapackVectors => "LAPACK both vectors",
         }
     }
+
+    /// The way whose time its own is divided by. A chart is compared with LAPACK's time without vectors.
+    fn compared_with(self) -> Option<Self> {
+        match self {
+            Self::DenseValues | Self::ChartValues | Self::ChartBounds => Some(Self::LapackValues),
+            Self::DenseVectors => Some(Self::LapackVectors),
+            Self::LapackValues | Self::LapackVectors => None,
+        }
+    }
+
+    /// Whether it has an answer only where the chart has one.
+    fn needs_chart(self) -> bool {
+        match self {
+            Self::ChartValues | Self::ChartBounds => true,
+            Self::DenseValues | Self::DenseVectors | Self::LapackValues | Self::LapackVectors => false,
+        }
+    }
 }
 
 /// Times and errors collected for one route.
@@ -426,18 +443,11 @@ impl Routes<'_> {
             self.time_chart(p)?;
         }
         if self.lapack.is_some() {
-            // Charted routes are compared with LAPACK's time without vectors.
-            for (way, theirs) in [
-                (Way::DenseValues, Way::LapackValues),
-                (Way::DenseVectors, Way::LapackVectors),
-                (Way::ChartValues, Way::LapackValues),
-                (Way::ChartBounds, Way::LapackValues),
-            ] {
-                if answers.on_chart || matches!(way, Way::DenseValues | Way::DenseVectors) {
-                    let last = |way: Way| self.samples[way as usize].time_us.last().copied().unwrap_or(f64::NAN);
-                    let ratio = last(way) / last(theirs);
-                    self.sample(way).ratio.push(ratio);
-                }
+            let compared = Way::ALL.into_iter().filter_map(|way| Some((way, way.compared_with()?)));
+            for (way, theirs) in compared.filter(|(way, _)| answers.on_chart || !way.needs_chart()) {
+                let last = |way: Way| self.samples[way as usize].time_us.last().copied().unwrap_or(f64::NAN);
+                let ratio = last(way) / last(theirs);
+                self.sample(way).ratio.push(ratio);
             }
         }
         Ok(())
