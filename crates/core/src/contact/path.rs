@@ -509,46 +509,69 @@ fn determinant_sign(lu: &PartialPivLu<f64>, size: usize) -> i8 {
 /// The state at `load` and `s_mu`, continued from `s_mu = 0`.
 pub(super) fn follow(statics: &Statics, load: f64, s_mu: f64) -> Result<SteadyState, StaticsError> {
     let scales = Scales::new(statics, load);
-    let (at, jacobian) = at_rest(statics, load, &scales)?;
-    let sign = jacobian.sign;
-    let equations = Equations::new(statics, load, 0.0, 0.0, &scales);
-    if !equations.pushes(&at.point) {
-        let end = PathEnd::Jams;
-        return Err(StaticsError::NoEquilibrium { load_n: load, asked: s_mu, friction_coefficient: 0.0, end });
+    let mut path = Path::at_rest(statics, load, &scales)?;
+    path.advance(s_mu)?;
+    Ok(path.state)
+}
+
+/// A path of states at one load, from the one without friction on.
+struct Path<'a> {
+    statics: &'a Statics,
+    scales: &'a Scales,
+    /// The last state, and the sign of the determinant on the path.
+    state: SteadyState,
+    sign: i8,
+}
+
+impl<'a> Path<'a> {
+    fn at_rest(statics: &'a Statics, load: f64, scales: &'a Scales) -> Result<Self, StaticsError> {
+        let (at, jacobian) = at_rest(statics, load, scales)?;
+        let sign = jacobian.sign;
+        let equations = Equations::new(statics, load, 0.0, 0.0, scales);
+        if !equations.pushes(&at.point) {
+            let end = PathEnd::Jams;
+            return Err(StaticsError::NoEquilibrium { load_n: load, asked: 0.0, friction_coefficient: 0.0, end });
+        }
+        Ok(Self { statics, scales, state: equations.state(&at, &jacobian), sign })
     }
-    let mut state = equations.state(&at, &jacobian);
-    let (mut x, mut step) = (0.0, s_mu.clamp(-LONGEST, LONGEST));
-    while x != s_mu {
-        let rest = s_mu - x;
-        let next = if step.abs() >= rest.abs() { s_mu } else { x + step };
-        let equations = Equations::new(statics, load, next, 0.0, &scales);
-        let along = next - x;
-        let predicted = equations.predicted(&state, [0.0, along]);
-        let accepted = equations
-            .newton(predicted, false)
-            .ok()
-            .filter(|found| equations.is_near(&state, [0.0, along], sign, found));
-        match accepted {
-            Some((at, jacobian)) => {
-                state = equations.state(&at, &jacobian);
-                x = next;
-                step = (2.0 * step).clamp(-LONGEST, LONGEST);
-            }
-            None => {
-                step = 0.5 * along;
-                if step.abs() < SHORTEST * x.abs().max(1.0) {
-                    let end = classify(&equations, &state, step.signum(), sign);
-                    return Err(StaticsError::NoEquilibrium {
-                        load_n: load,
-                        asked: s_mu,
-                        friction_coefficient: x,
-                        end,
-                    });
+
+    /// Continues the path to `s_mu`.
+    fn advance(&mut self, s_mu: f64) -> Result<(), StaticsError> {
+        let Self { statics, scales, sign, .. } = *self;
+        let (load, mut x) = (self.state.load_n, self.state.friction);
+        let mut step = (s_mu - x).clamp(-LONGEST, LONGEST);
+        while x != s_mu {
+            let rest = s_mu - x;
+            let next = if step.abs() >= rest.abs() { s_mu } else { x + step };
+            let equations = Equations::new(statics, load, next, 0.0, scales);
+            let along = next - x;
+            let predicted = equations.predicted(&self.state, [0.0, along]);
+            let accepted = equations
+                .newton(predicted, false)
+                .ok()
+                .filter(|found| equations.is_near(&self.state, [0.0, along], sign, found));
+            match accepted {
+                Some((at, jacobian)) => {
+                    self.state = equations.state(&at, &jacobian);
+                    x = next;
+                    step = (2.0 * step).clamp(-LONGEST, LONGEST);
+                }
+                None => {
+                    step = 0.5 * along;
+                    if step.abs() < SHORTEST * x.abs().max(1.0) {
+                        let end = classify(&equations, &self.state, step.signum(), sign);
+                        return Err(StaticsError::NoEquilibrium {
+                            load_n: load,
+                            asked: s_mu,
+                            friction_coefficient: x,
+                            end,
+                        });
+                    }
                 }
             }
         }
+        Ok(())
     }
-    Ok(state)
 }
 
 /// The state without friction, the minimum of a convex energy.
@@ -606,17 +629,29 @@ pub(super) struct Anchor {
     jacobian: Jacobian,
 }
 
-/// Anchors at the given conditions; those without a state are left out.
+/// Anchors at the given conditions; those without a state are left out. At each load, one path leads through all friction
+/// coefficients of a sign.
 pub(super) fn anchors(statics: &Statics, loads_n: &[f64], s_mus: &[f64]) -> Vec<Anchor> {
     let mut anchors = vec![];
+    let side = |forward: bool| {
+        let mut side: Vec<f64> = s_mus.iter().copied().filter(|s_mu| (*s_mu >= 0.0) == forward).collect();
+        side.sort_by(|a, b| a.abs().total_cmp(&b.abs()));
+        side
+    };
+    let sides = [side(true), side(false)];
     for &load in loads_n {
         let scales = Scales::new(statics, load);
-        for &s_mu in s_mus {
-            let Ok(state) = follow(statics, load, s_mu) else { continue };
-            let equations = Equations::new(statics, load, s_mu, 0.0, &scales);
-            let at = equations.evaluate(equations.predicted(&state, [0.0; 2]));
-            let jacobian = equations.jacobian(&at);
-            anchors.push(Anchor { state, jacobian });
+        for side in sides.iter().filter(|side| !side.is_empty()) {
+            let Ok(mut path) = Path::at_rest(statics, load, &scales) else { continue };
+            for &s_mu in side {
+                if path.advance(s_mu).is_err() {
+                    break;
+                }
+                let equations = Equations::new(statics, load, s_mu, 0.0, &scales);
+                let at = equations.evaluate(equations.predicted(&path.state, [0.0; 2]));
+                let jacobian = equations.jacobian(&at);
+                anchors.push(Anchor { state: path.state.clone(), jacobian });
+            }
         }
     }
     anchors

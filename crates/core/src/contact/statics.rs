@@ -119,14 +119,15 @@ pub enum StaticsError {
     },
     /// There is no steady sliding at a friction coefficient.
     #[error(
-        "no steady sliding at a load of {load_n} N and friction coefficient {asked}: {end} at {friction_coefficient:.6}"
+        "no steady sliding at a load of {load_n} N and friction coefficient {}{}: {end} at {:.6}",
+        asked.abs(), if *asked < 0.0 { " in reverse" } else { "" }, friction_coefficient.abs()
     )]
     NoEquilibrium {
         /// The load, N.
         load_n: f64,
-        /// The friction coefficient requested.
+        /// The friction coefficient requested, with the sign of the disc speed.
         asked: f64,
-        /// The friction coefficient at which the states end.
+        /// The friction coefficient at which the states end, with the sign of the disc speed.
         friction_coefficient: f64,
         /// How they end.
         end: PathEnd,
