@@ -230,9 +230,10 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
             .into_iter()
             .chain(text_of_array())
             .collect(),
-        "rig" => ["nine-dof", "nine-dof-3+2", "hoffmann", "hulten", "brake4669", "tribometer"]
+        "rig" => ["nine-dof", "nine-dof-3+2", "hoffmann", "hulten", "brake4669", "tribometer", "rough-pad"]
             .map(|name| project(&format!("launch/rigs/{name}.toml")))
             .to_vec(),
+        "pressures" => text(&["closure_m,pressure_pa\n0,0\n1e-6,1e4\n2e-6,4e4\n\n5e-6, 3e5\n"]),
         "scale" => text(&["friction_coefficient / 0.3 + 1", "-(normal_load_n/500)^0.5 * (1 - 2e-3*disc_speed_rad_s)"]),
         "full_model" => targets::full_models(),
         "profile" => text(&[

@@ -71,6 +71,7 @@ impl Options {
             targets.truncate(first);
         }
         let load = self.load.unwrap_or(rig.reference.normal_load_n);
+        rig.has_stiffness_to_scale()?;
         let present = rig.contact_stiffness_n_per_m();
         let Some(low) = present.iter().copied().reduce(f64::min).filter(|low| *low > 0.0) else {
             bail!("{}: has no contact stiffness above 0 to start from", rig.name);

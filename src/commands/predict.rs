@@ -48,6 +48,8 @@ struct ContactReport {
     contact_force_n: f64,
     /// Force on the back of the pad.
     back_force_n: f64,
+    /// Force of each pair.
+    force_n: Vec<f64>,
 }
 
 impl From<&SteadyState> for ContactReport {
@@ -57,6 +59,7 @@ impl From<&SteadyState> for ContactReport {
             pairs_closed: state.pairs_closed(),
             contact_force_n: state.contact_force_n(),
             back_force_n: state.back_force_n,
+            force_n: state.force_n.clone(),
         }
     }
 }

@@ -12,6 +12,7 @@
 //! | modes and residuals of a rig (`.npz`) | [`RIG_PART`] | max(64 MiB, 100 times the file), up to 1 GiB |
 //! | modes of a rig (`.unv`, `.uff`) | [`RIG_PART`] | about 10 times the file; lines of 64 KiB |
 //! | matrices of a rig (Matrix Market) | [`RIG_PART`] | about 16 times the file |
+//! | table of contact pressures of a rig (CSV) | [`RIG_PART`] | twice the file; lines of 1 MiB, 1000 points |
 //! | matrices, nodes and rows of a full model | [`FULL_MODEL_PART`] | about 20 times the file; lines of 1 MiB |
 //! | tribometer log | [`LOG`] | about 12 times the file; lines of 64 KiB |
 //! | target frequencies | [`TARGETS`] | about 10 times the file |

@@ -24,6 +24,15 @@ pub enum VerificationError {
     /// No operating points were asked for.
     #[error("--points is 0, expected at least 1")]
     NoPoints,
+    /// The rig's contact pairs follow a contact state, those of the full model are always closed.
+    #[error(
+        "{rig}: `contact_state` is given, but the pairs of a full model are always closed, so the two cannot agree; \
+         expected a rig without it"
+    )]
+    ContactState {
+        /// Name of the rig.
+        rig: String,
+    },
     /// The full model could not be solved at an operating point.
     #[error("full model at {point:?}")]
     Full {
@@ -117,6 +126,9 @@ pub fn verify_against(
 ) -> Result<Verified, VerificationError> {
     if against.points == 0 {
         return Err(VerificationError::NoPoints);
+    }
+    if rig.model.statics().is_some() {
+        return Err(VerificationError::ContactState { rig: rig.name.clone() });
     }
     let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
     let band_rad_s = std::f64::consts::TAU * band_hz;

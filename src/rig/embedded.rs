@@ -27,7 +27,7 @@ macro_rules! embedded {
 }
 
 /// All embedded rigs. The first is the default of `run` and `demo`.
-pub const EMBEDDED: [Embedded; 8] = [
+pub const EMBEDDED: [Embedded; 9] = [
     embedded!(
         "tribometer",
         "pad-on-disc tribometer of 22032 degrees of freedom on a basis of 55 vectors (default)",
@@ -40,6 +40,10 @@ pub const EMBEDDED: [Embedded; 8] = [
         "tribometer-80+80-pad-a17eb7113e19.npz",
         "tribometer-80+80-disc-694d2050be74.npz",
         "tribometer-80+80-residual-c3ebf5556a34.npz"
+    ),
+    embedded!(
+        "rough-pad",
+        "a friction pad of 3 degrees of freedom on rough contact: the load decides whether it squeals"
     ),
     embedded!("nine-dof", "the paper's nine-degree-of-freedom model, case 1"),
     embedded!("nine-dof-case-2", "the paper's nine-degree-of-freedom model, case 2"),

@@ -1,5 +1,6 @@
 //! Why a rig could not be loaded: the file, the field, its value and what was expected.
 
+use crate::contact::StaticsError;
 use crate::physics::ModelError;
 use crate::reduction::ReductionError;
 
@@ -50,4 +51,6 @@ pub enum RigError {
     Reduction { file: String, source: ReductionError },
     #[error("{file}: {source}")]
     Model { file: String, source: ModelError },
+    #[error("{file}: `contact_state`: {source}")]
+    ContactState { file: String, source: StaticsError },
 }

@@ -1,7 +1,10 @@
 //! Kind 1: substructures given as matrices in the rig file, contact pairs given as rows over their degrees of freedom.
 
+use std::sync::Arc;
+
 use faer::Mat;
 
+use super::contact_state::{Load, StateTable};
 use super::raw::{RawContact, RawSubstructure};
 use super::settings::{Settings, finite, spread, within};
 use super::{Built, Contact, RigError, SideShapes};
@@ -23,12 +26,20 @@ pub(super) fn build(
     pad: &RawSubstructure,
     disc: Option<&RawSubstructure>,
     contacts: &[RawContact],
+    state: Option<StateTable>,
     settings: &Settings,
 ) -> Result<Built, RigError> {
     let pad = substructure(file, "pad", pad)?;
     let disc = disc.map(|disc| substructure(file, "disc", disc)).transpose()?;
     let pairs = contact_pairs(file, contacts, &pad.modes, disc.as_ref().map(|disc| &disc.modes))?;
-    assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), pairs, settings, None, Terms::default())
+    let state = state
+        .map(|state| {
+            let load = state.load_on_inline(&pad.modes, disc.as_ref().map(|disc| &disc.modes))?;
+            Ok((state, load))
+        })
+        .transpose()?;
+    let joint = Joint { pairs, residual: None, state };
+    assemble(file, "inline substructures (kind 1)", &pad, disc.as_ref(), joint, settings, Terms::default())
 }
 
 /// Terms of a model in addition to modes, modal damping ratios and contact pairs.
@@ -40,37 +51,50 @@ pub(super) struct Terms {
     pub contents: Vec<String>,
 }
 
-/// The contact in two lines of text: its pairs and the law of their stiffness.
-pub(super) fn describe_contact(pairs: &ContactPairs, law: &ContactLaw) -> [String; 2] {
+/// The contact in three lines of text: its pairs, the law of their stiffness, and that they are always closed.
+pub(super) fn describe_contact(pairs: &ContactPairs, law: &ContactLaw) -> Vec<String> {
     // Friction is described with the damping, if at all.
     let ContactLaw { exponent, reference_n, slope_s_per_m: _, lateral_damping: _ } = *law;
-    [
-        format!(
-            "contact    {} pairs, in all {:.6e} N/m, {:.6e} N s/m",
-            pairs.stiffness_n_per_m.len(),
-            pairs.stiffness_n_per_m.iter().sum::<f64>(),
-            pairs.damping_n_s_per_m.iter().sum::<f64>()
-        ),
+    vec![
+        describe_pairs(pairs),
         match exponent {
             0.0 => "stiffness  of the contact, independent of the load".to_owned(),
             exponent => format!("stiffness  of the contact times (load / {reference_n} N)^{exponent}"),
         },
+        "state      every pair always closed: springs that push and pull".to_owned(),
     ]
 }
 
-/// Builds the model of both sides: `K = diag(ω²)` and `C = diag(2 ζ ω)`, with `terms`, joined by the contact pairs. If
-/// `residual` is given, the contact acts in series with the residual flexibility of the truncated modes.
-#[expect(clippy::too_many_arguments, reason = "what a rig of modes is made of, each given once")]
+/// Number, stiffness and damping of the contact pairs.
+pub(super) fn describe_pairs(pairs: &ContactPairs) -> String {
+    format!(
+        "contact    {} pairs, in all {:.6e} N/m, {:.6e} N s/m",
+        pairs.stiffness_n_per_m.len(),
+        pairs.stiffness_n_per_m.iter().sum::<f64>(),
+        pairs.damping_n_s_per_m.iter().sum::<f64>()
+    )
+}
+
+/// How pad and disc are joined.
+pub(super) struct Joint {
+    pub pairs: ContactPairs,
+    /// Residual flexibility of the truncated modes, with which the contact acts in series.
+    pub residual: Option<ResidualFlexibility>,
+    /// `[contact_state]` with its load; `None` if the pairs are always closed.
+    pub state: Option<(StateTable, Load)>,
+}
+
+/// Builds the model of both sides: `K = diag(ω²)` and `C = diag(2 ζ ω)`, with `terms`, joined by the contact pairs.
 pub(super) fn assemble(
     file: &str,
     kind: &str,
     pad: &Side,
     disc: Option<&Side>,
-    pairs: ContactPairs,
+    joint: Joint,
     settings: &Settings,
-    residual: Option<ResidualFlexibility>,
     terms: Terms,
 ) -> Result<Built, RigError> {
+    let Joint { pairs, residual, state } = joint;
     let contact_law = settings.contact_law;
     let sides: Vec<&Side> = std::iter::once(pad).chain(disc).collect();
     let omega: Vec<f64> = sides.iter().flat_map(|side| side.modes.omega_rad_s.iter().copied()).collect();
@@ -86,10 +110,15 @@ pub(super) fn assemble(
     let (mut stiffness, mut damping) = (vec![stiffness], vec![damping]);
     stiffness.extend(terms.stiffness);
     damping.extend(terms.damping);
+    let statics = state
+        .as_ref()
+        .map(|(state, load)| state.statics(&omega, &pairs, residual.as_ref(), load, settings).map(Arc::new))
+        .transpose()?;
     let model = Model::new(n, stiffness, damping, contact_law, Some(pad_modes))
-        .and_then(|model| match &residual {
-            Some(residual) => model.with_flexible_contact(&pairs, residual, settings.largest_friction()),
-            None => model.with_contact(&pairs),
+        .and_then(|model| match (&statics, &residual) {
+            (Some(statics), residual) => model.with_steady_contact(&pairs, statics.clone(), residual.as_ref()),
+            (None, Some(residual)) => model.with_flexible_contact(&pairs, residual, settings.largest_friction()),
+            (None, None) => model.with_contact(&pairs),
         })
         .map_err(|source| RigError::Model { file: file.to_owned(), source })?;
 
@@ -103,7 +132,10 @@ pub(super) fn assemble(
             }
         ),
     ];
-    contents.extend(describe_contact(&pairs, &contact_law));
+    contents.extend(match (&state, &statics) {
+        (Some((state, load)), Some(statics)) => state.describe(load, statics, &pairs, settings)?,
+        (None, _) | (_, None) => describe_contact(&pairs, &contact_law),
+    });
     for (name, side) in ["pad", "disc"].into_iter().zip(&sides) {
         contents.extend(free_frequencies(name, &side.modes.omega_rad_s));
     }
@@ -209,7 +241,7 @@ fn contact_pairs(
 }
 
 /// `sign · row Φ` of one side. Empty for a rigid side, zero for an optional row that is not given.
-fn modal_row(
+pub(super) fn modal_row(
     file: &str,
     field: &str,
     row: Option<&Vec<f64>>,

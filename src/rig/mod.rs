@@ -11,6 +11,7 @@
 
 mod basis;
 mod certificate;
+mod contact_state;
 mod embedded;
 mod error;
 mod inline;
@@ -30,12 +31,16 @@ pub(crate) mod system;
 pub mod uff;
 mod warning;
 
+use std::sync::Arc;
+
 use faer::Mat;
 
+use crate::contact::{PressureLaw, Statics};
 use crate::files::input_file;
 use crate::physics::{ContactPairs, ContactState, Model, OperatingPoint, ResidualFlexibility};
 
 pub use certificate::Certificate;
+pub use contact_state::read_table as read_pressures;
 pub use embedded::{EMBEDDED, Embedded};
 pub use error::RigError;
 pub use modal_data::{ModalData, Residual};
@@ -255,7 +260,8 @@ impl Rig {
         let settings = settings::check(&source.rig_file, &raw.common())?;
         let mut built = match settings::kind(&source.rig_file, &raw)? {
             settings::Kind::Inline { pad, disc, contacts } => {
-                inline::build(&source.rig_file, pad, disc, contacts, &settings)?
+                let state = contact_state::read(&mut source, &raw)?;
+                inline::build(&source.rig_file, pad, disc, contacts, state, &settings)?
             }
             settings::Kind::Modal { pad, disc, patches } => {
                 modal::build(&mut source, pad, disc, patches, &raw, &settings)?
@@ -269,6 +275,10 @@ impl Rig {
             axis_point_m: patch.axis_point_m,
             axis_direction: patch.axis_direction,
             normal: patch.normal,
+        });
+        let certified = raw.reduction.as_ref().map(|reduction| match built.model.statics() {
+            Some(_) => format!("{}; with every pair always closed", reduction.summary()),
+            None => reduction.summary(),
         });
         Ok(Self {
             name: raw.name,
@@ -284,7 +294,7 @@ impl Rig {
             path: None,
             content_hash: source.content_hash(),
             files: source.into_files(),
-            contents: built.contents.into_iter().chain(raw.reduction.as_ref().map(Certificate::summary)).collect(),
+            contents: built.contents.into_iter().chain(certified).collect(),
             reduction: raw.reduction,
             basis_tolerance: raw.basis.as_ref().and_then(|basis| basis.tolerance),
             made_for: raw.basis.as_ref().map(|basis| MadeFor {
@@ -315,11 +325,31 @@ impl Rig {
         listed
     }
 
+    /// Checks that the contact stiffness of the rig file determines the contact forces.
+    ///
+    /// # Errors
+    /// [`RigError::Kind`] if the law of the rig's `[contact_state]` has no stiffness.
+    pub fn has_stiffness_to_scale(&self) -> Result<(), RigError> {
+        let law = match self.model.statics().map(|statics| &statics.parts().law) {
+            None | Some(PressureLaw::Linear { .. } | PressureLaw::Power { .. }) => return Ok(()),
+            Some(PressureLaw::Exponential { .. }) => "exponential",
+            Some(PressureLaw::Table(_)) => "table",
+        };
+        Err(RigError::Kind {
+            file: self.name.clone(),
+            field: "contact_state.law".to_owned(),
+            value: format!("is \"{law}\", in which no stiffness can be changed"),
+            limit: "linear or power, whose forces are proportional to stiffness_n_per_m".to_owned(),
+        })
+    }
+
     /// The same rig with the stiffness of every contact pair multiplied by `factor`.
     ///
     /// # Errors
-    /// [`RigError`] if the rig's own files cannot be read again, or if `factor` takes the stiffness out of range.
+    /// [`RigError`] if the rig's own files cannot be read again, if `factor` takes the stiffness out of range, or if the
+    /// law of its `[contact_state]` has no stiffness.
     pub fn with_contact_stiffness_times(&self, factor: f64) -> Result<Self, RigError> {
+        self.has_stiffness_to_scale()?;
         let Some(text) = self.visit_contact_stiffness(&mut |value| factor * value) else { return Ok(self.clone()) };
         let mut files = self.files.clone();
         files[0].bytes = text.into_bytes();
@@ -331,15 +361,24 @@ impl Rig {
     /// over `μ`.
     ///
     /// # Errors
-    /// [`RigError::Model`] if `factor` takes the contact out of range.
+    /// [`RigError::Model`], [`RigError::ContactState`] if `factor` takes the contact out of range; [`RigError::Kind`] if
+    /// the law of the rig's `[contact_state]` has no stiffness.
     pub fn at_rest_with_contact_stiffness_times(&self, factor: f64) -> Result<Model, RigError> {
         let Some(Contact { pairs, residual }) = &self.contact else { return Ok(self.model.clone()) };
+        self.has_stiffness_to_scale()?;
         let mut pairs = pairs.clone();
         pairs.stiffness_n_per_m.iter_mut().for_each(|stiffness| *stiffness *= factor);
         let free = self.model.without_contact();
-        match residual {
-            Some(residual) => free.with_flexible_contact_at_rest(&pairs, residual),
-            None => free.with_contact(&pairs),
+        match (self.model.statics(), residual) {
+            (Some(statics), residual) => {
+                let mut parts = statics.parts().clone();
+                parts.area.iter_mut().for_each(|stiffness| *stiffness *= factor);
+                let statics =
+                    Statics::new(parts).map_err(|source| RigError::ContactState { file: self.name.clone(), source })?;
+                free.with_steady_contact(&pairs, Arc::new(statics), residual.as_ref())
+            }
+            (None, Some(residual)) => free.with_flexible_contact_at_rest(&pairs, residual),
+            (None, None) => free.with_contact(&pairs),
         }
         .map_err(|source| RigError::Model { file: self.name.clone(), source })
     }

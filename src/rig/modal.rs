@@ -2,7 +2,8 @@
 
 use faer::Mat;
 
-use super::inline::{Side, Terms, assemble};
+use super::contact_state::{self, StateTable};
+use super::inline::{Joint, Side, Terms, assemble};
 use super::modal_data::{ModalData, Residual};
 use super::patch::{self, Pair};
 use super::raw::{RawPatch, RawResidual, RawRig, RawSubstructure};
@@ -43,7 +44,13 @@ pub(super) fn build(
         patch::contacts(&file, patches, &pad.data.nodes_m, disc.as_ref().map(|disc| &*disc.data.nodes_m))?;
     let values = [stiffness_n_per_m, damping_n_s_per_m];
     let given = raw.residual.as_ref().map(|raw| given(source, raw, &pad, disc.as_ref(), pairs.len())).transpose()?;
+    let state = contact_state::read(source, raw)?;
     let mut built = if shared {
+        if state.is_some() {
+            let (field, limit) = ("contact_state".to_owned(), "modes of the parts".to_owned());
+            let value = "cannot be combined with a shared basis, which does not hold the static response to the load";
+            return Err(RigError::Kind { file, field, value: value.to_owned(), limit });
+        }
         if given.is_some() {
             let (field, limit) = ("residual".to_owned(), "modes of the parts, or none".to_owned());
             return Err(RigError::Kind {
@@ -55,7 +62,7 @@ pub(super) fn build(
         }
         basis::build(&file, &pad, disc.as_ref(), &pairs, values, settings)?
     } else {
-        apart(&file, &pad, disc.as_ref(), &pairs, values, given, settings)?
+        apart(&file, &pad, disc.as_ref(), &pairs, values, given, state, settings)?
     };
     for (shapes, part) in built.shapes.iter_mut().zip(std::iter::once(&pad).chain(&disc)) {
         let rows = 3 * part.data.nodes_m.len();
@@ -74,6 +81,7 @@ pub(super) fn build(
 }
 
 /// Builds the model of sides that have separate modal coordinates.
+#[expect(clippy::too_many_arguments, reason = "what a rig of modes is made of, each given once")]
 fn apart(
     file: &str,
     pad: &Part,
@@ -81,6 +89,7 @@ fn apart(
     pairs: &[Pair],
     [stiffness_n_per_m, damping_n_s_per_m]: [Vec<f64>; 2],
     given: Option<ResidualFlexibility>,
+    state: Option<StateTable>,
     settings: &Settings,
 ) -> Result<Built, RigError> {
     let rows = |direction: &dyn Fn(&Pair) -> [f64; 3]| relative_displacement(pairs, direction, pad, disc);
@@ -99,16 +108,25 @@ fn apart(
         None => of_sides(file, pairs, &sides)?,
     };
     let cutoff_hz = sides.iter().map(|(_, part)| part.cutoff_hz()).fold(f64::INFINITY, f64::min);
-    let residual = known.map(|(known, of)| residual::within_band(known, &of, cutoff_hz, settings.band_max_hz));
+    let residual =
+        known.map(|(known, of)| residual::within_band(known, &of, cutoff_hz, settings.band_max_hz, state.is_some()));
     let (flexibility, description) = match residual {
         Some(residual) => (Some(residual.flexibility), Some((residual.description, residual.band_max_hz))),
         None => (None, None),
     };
+    let state = state
+        .map(|state| {
+            let load =
+                state.load_on_modes(pad, disc.map_or(0, |disc| disc.selected.len()), pairs, flexibility.is_some())?;
+            Ok((state, load))
+        })
+        .transpose()?;
     let pad_modes = pad.selected.len();
     let n = pad_modes + disc.map_or(0, |disc| disc.selected.len());
     let terms = terms(file, n, pad, disc.map(|disc| (disc, pad_modes)))?;
     let (kind, disc) = ("modal substructures (kind 2)", disc.map(|disc| &disc.side));
-    let mut built = assemble(file, kind, &pad.side, disc, contact, settings, flexibility, terms)?;
+    let joint = Joint { pairs: contact, residual: flexibility, state };
+    let mut built = assemble(file, kind, &pad.side, disc, joint, settings, terms)?;
     if let Some((description, band_max_hz)) = description {
         built.contents.push(description);
         built.band_max_hz = Some(band_max_hz);

@@ -19,6 +19,8 @@ pub struct ModalData {
     /// This part's contribution `V_pᵀ M_p V_p` to the unit mass matrix, `i×i`, if given. Used if the columns of `phi`
     /// are motions of both parts.
     pub mass_share: Option<Mat<f64>>,
+    /// Generalised force of a load of 1 N on this part in each mode, kg^-1/2, if given.
+    pub load: Option<Vec<f64>>,
     /// Damping and rotation of this part, `i×i`.
     pub matrices: PartMatrices,
     /// Residual flexibility of the modes above these, if given.

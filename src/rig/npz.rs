@@ -62,8 +62,8 @@ pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<Residual
     Ok(ResidualFlexibility { normal, sliding, inertia: both("inertia")? })
 }
 
-/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and the optional arrays `damping_ratio` (i), `mass_share`,
-/// `damping`, `gyroscopic` and `spin` (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
+/// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and the optional arrays `damping_ratio` and `load` (i),
+/// `mass_share`, `damping`, `gyroscopic` and `spin` (i, i), `residual_flexibility` and `residual_inertia` (3c, 3c).
 ///
 /// # Errors
 /// [`RigError::Npz`], [`RigError::NotFinite`].
@@ -86,6 +86,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
     let phi = required("phi", phi, "(c, 3, i)")?;
     let damping =
         archive.array("damping_ratio", |shape| expected(shape == [modes], format!("({modes}), as omega_rad_s")))?;
+    let load = archive.array("load", |shape| expected(shape == [modes], format!("({modes}), as omega_rad_s")))?;
     let mass_share = archive.array("mass_share", |shape| {
         expected(shape == [modes, modes], format!("({modes}, {modes}), by omega_rad_s"))
     })?;
@@ -116,6 +117,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
         nodes_m,
         damping_ratio: damping.map(|damping| damping.values),
         mass_share,
+        load: load.map(|load| load.values),
         matrices,
         residual,
     })

@@ -79,6 +79,7 @@ with_common_tables!(define_file! {
         contact_patch: Option<Vec<RawPatch>>,
         system: Option<RawSystem>,
         residual: Option<RawResidual>,
+        contact_state: Option<RawContactState>,
         basis: Option<RawBasis>,
         reduction: Option<Certificate>,
     }
@@ -146,6 +147,25 @@ pub struct RawSubstructure {
     pub modal: Option<String>,
     pub damping_ratio: Option<OneOrMany>,
     pub modes: Option<RawModes>,
+}
+
+/// `[contact_state]`: contact pairs that open and close with the state of steady sliding.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RawContactState {
+    pub law: String,
+    pub measured: String,
+    pub exponent: Option<f64>,
+    pub reference_m: Option<f64>,
+    pub roughness_m: Option<f64>,
+    pub pressure_pa: Option<f64>,
+    /// Name of a CSV file.
+    pub table: Option<String>,
+    pub area_m2: Option<OneOrMany>,
+    pub gap_m: Option<OneOrMany>,
+    pub load_pad: Option<Vec<f64>>,
+    pub load_coordinates: Option<Vec<f64>>,
+    pub residual_gap_m_per_n: Option<OneOrMany>,
 }
 
 /// `[residual]`: residual flexibility between the contact pairs.

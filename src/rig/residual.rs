@@ -92,17 +92,20 @@ pub fn between_patches(
 }
 
 /// Restricts `flexibility` to the band it is valid in: clamps `[band] max_hz` to the cut-off and drops the inertial
-/// term if the band exceeds half of it. `of` names the modes in the description.
+/// term if the band exceeds half of it, or beside a contact state, which has none. `of` names the modes in the
+/// description.
 pub(super) fn within_band(
     flexibility: ResidualFlexibility,
     of: &str,
     cutoff_hz: f64,
     band_max_hz: Option<f64>,
+    contact_state: bool,
 ) -> PairResidual {
     let asked_hz = band_max_hz.unwrap_or(cutoff_hz);
     let has_inertia = flexibility.inertia.is_some();
-    let inertia = flexibility.inertia.filter(|_| asked_hz <= INERTIA_BELOW * cutoff_hz);
+    let inertia = flexibility.inertia.filter(|_| !contact_state && asked_hz <= INERTIA_BELOW * cutoff_hz);
     let inertial = match (inertia.is_some(), has_inertia) {
+        (false, true) if contact_state => "without the inertial term, which a contact state does not use".to_owned(),
         (true, _) => "with the inertial term".to_owned(),
         (false, true) => format!("without the inertial term (the band is above {INERTIA_BELOW} of the cut-off)"),
         (false, false) => "no inertial term given".to_owned(),

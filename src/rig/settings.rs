@@ -151,6 +151,9 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
         if let Some((field, _)) = friction_or_load.iter().find(|(_, set)| *set) {
             return mixed(field, "has nothing to act on in a rig with [system]", "a scale of a matrix instead");
         }
+        if raw.contact_state.is_some() {
+            return mixed("contact_state", "cannot be combined with [system]", "[pad] with its contact");
+        }
         if raw.residual.is_some() {
             return mixed("residual", "cannot be combined with [system]", "[pad] and [disc] with modal");
         }

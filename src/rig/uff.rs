@@ -118,6 +118,7 @@ pub fn read(file: &str, bytes: &[u8]) -> Result<ModalData, RigError> {
         nodes_m: nodes.iter().map(|node| node.position.map(|value| value * units.length_m)).collect(),
         damping_ratio: damped.then(|| modes.iter().map(|mode| mode.damping_ratio).collect()),
         mass_share: None,
+        load: None,
         matrices: PartMatrices::default(),
         residual: None,
     })

@@ -15,7 +15,7 @@ use squealcast::physics::{Chart, OperatingPoint, Traces};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::Recording;
 use squealcast::recording::recover::recover;
-use squealcast::rig::{Rig, RigFile, matrix_market, npz, scale, uff};
+use squealcast::rig::{Rig, RigFile, matrix_market, npz, read_pressures, scale, uff};
 use squealcast::simulator::Profile;
 use tempfile::TempDir;
 
@@ -25,7 +25,7 @@ pub struct Target {
     pub read: fn(&[u8]),
 }
 
-pub const TARGETS: [Target; 13] = [
+pub const TARGETS: [Target; 14] = [
     Target {
         name: "npz",
         read: |bytes| {
@@ -51,6 +51,7 @@ pub const TARGETS: [Target; 13] = [
             let _ = Rig::from_files(&[RigFile { name: "rig.toml".to_owned(), bytes: bytes.to_vec() }]);
         },
     },
+    Target { name: "pressures", read: |bytes| drop(read_pressures("a.csv", bytes)) },
     Target { name: "scale", read: |bytes| drop(scale::parse(&String::from_utf8_lossy(bytes))) },
     Target { name: "full_model", read: full_model },
     Target { name: "profile", read: |bytes| drop(Profile::load(&file("profile.toml", bytes))) },

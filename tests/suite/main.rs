@@ -10,6 +10,7 @@ mod buses;
 mod ceilings;
 mod commands;
 mod contact_calculix;
+mod contact_rigs;
 mod contact_states;
 mod display;
 mod domain;
