@@ -14,6 +14,7 @@ mod hear;
 mod identify;
 mod import;
 mod live;
+mod map;
 mod memory;
 mod on_basis;
 mod player;
@@ -82,6 +83,7 @@ enum Command {
     Predict(predict::Options),
     Sweep(sweep::Options),
     Critical(critical::Options),
+    Map(map::Options),
     Replay(replay::Options),
     View(view::Options),
     Report(report::Options),
@@ -139,6 +141,7 @@ pub fn main() -> ExitCode {
         Command::Predict(options) => options.run(),
         Command::Sweep(options) => options.run(),
         Command::Critical(options) => options.run(),
+        Command::Map(options) => options.run(),
         Command::Rigs(options) => options.run(),
         Command::Check(options) => options.run(),
         Command::Identify(options) => options.run(),

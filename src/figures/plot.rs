@@ -17,7 +17,7 @@ use crate::physics::identification::{Identified, Trial};
 use crate::study::bench::Route;
 
 /// Drawing units per px. The plotting library rounds positions to whole units; a finer grid keeps curves smooth.
-const FINE: u32 = 8;
+pub(super) const FINE: u32 = 8;
 /// Colours of neighbouring curves, the same as on the page over white. They can be distinguished with colour blindness too.
 pub(crate) const COLOURS: [RGBColor; 7] = [
     RGBColor(26, 53, 216),
@@ -282,7 +282,7 @@ pub fn history(title: &str, history: &History, from_s: f64, threshold_db: f64) -
 }
 
 /// A figure of the given width and height, px.
-fn figure(
+pub(super) fn figure(
     title: &str,
     (width, height): (u32, u32),
     draw: impl FnOnce(&Area<'_>) -> Result<(), PlotError>,
@@ -325,7 +325,7 @@ fn legend_place(k: usize, columns: usize) -> (i32, i32) {
 }
 
 /// Draws the label of a legend entry, to the right of its line or marker.
-fn legend_text(area: &Area<'_>, (x, y): (i32, i32), label: &str) -> Result<(), PlotError> {
+pub(super) fn legend_text(area: &Area<'_>, (x, y): (i32, i32), label: &str) -> Result<(), PlotError> {
     let text = ("sans-serif", 15 * FINE).into_text_style(area).pos(Pos::new(HPos::Left, VPos::Center));
     area.draw(&Text::new(label.to_owned(), (x + 34 * FINE as i32, y), text)).map_err(failed)
 }
@@ -476,11 +476,11 @@ fn stretches<T>(history: &History, of: impl Fn(&Bin) -> Option<T>) -> Vec<Vec<(i
 }
 
 type Tick = fn(f64, (f64, f64)) -> String;
-type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
-type Chart<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+pub(super) type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+pub(super) type Chart<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 /// Axes with units, in the common style.
-fn axes<'a>(
+pub(super) fn axes<'a>(
     area: &Area<'a>,
     x: (f64, f64),
     y: (f64, f64),
@@ -578,7 +578,7 @@ fn padded((low, high): (f64, f64)) -> (f64, f64) {
     (low - pad, high + pad)
 }
 
-fn failed(error: impl std::fmt::Display) -> PlotError {
+pub(super) fn failed(error: impl std::fmt::Display) -> PlotError {
     PlotError(error.to_string())
 }
 

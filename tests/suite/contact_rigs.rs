@@ -454,3 +454,102 @@ fn charts_over_the_load_hold_their_bounds() {
         "{refused}"
     );
 }
+
+/// Values of the columns of a CSV table, by name.
+fn table(csv: &str) -> Vec<std::collections::BTreeMap<String, String>> {
+    let mut lines = csv.lines();
+    let names: Vec<String> = lines.next().expect("a header").split(',').map(str::to_owned).collect();
+    lines.map(|line| names.iter().cloned().zip(line.split(',').map(str::to_owned)).collect()).collect()
+}
+
+/// A map over two conditions has the growth rates that `predict` gives and, over the friction coefficient, the ends of windows
+/// that `critical` gives; the axes may be exchanged.
+#[test]
+fn a_map_shows_what_the_load_does_to_a_window() {
+    let folder = folder();
+    let [edges, svg] = ["edges.csv", "map.svg"].map(|name| text(&folder.path().join(name)));
+    let args = ["--points", "3x2", "--edges", &edges, "--svg", &svg, "--csv", "-", "-q"];
+    let map = |x: &str, y: &str| run(["map", "rough-pad", "--x", x, "--y", y].into_iter().chain(args)).exits(0).stdout;
+    let csv = map("mu=0:0.8", "load=500:2000");
+    let rows = table(&csv);
+    assert_eq!(rows.len(), 6);
+    for row in &rows {
+        let found = json([
+            "predict",
+            "rough-pad",
+            "--mu",
+            &row["friction_coefficient"],
+            "--load",
+            &row["normal_load_n"],
+            "--json",
+        ]);
+        assert_eq!(number(&found, "max_growth_rate_per_s").to_string(), row["max_growth_rate_per_s"], "{row:?}");
+        assert_eq!(
+            (found["unstable_modes"].to_string(), "7"),
+            (row["unstable_modes"].clone(), row["pairs_closed"].as_str())
+        );
+    }
+    let of_loads: Vec<f64> = table(&std::fs::read_to_string(&edges).unwrap())
+        .iter()
+        .map(|row| {
+            assert_eq!(row["instability"], "begins");
+            let found = json(["critical", "rough-pad", "--load", &row["normal_load_n"], "--json"]);
+            let mu: f64 = row["friction_coefficient"].parse().unwrap();
+            assert!((mu - number(&found, "critical_friction")).abs() < 1e-9, "{row:?}");
+            mu
+        })
+        .collect();
+    assert_eq!(of_loads.len(), 2);
+    let drawn = std::fs::read_to_string(&svg).unwrap();
+    assert!(drawn.starts_with("<svg") && drawn.contains("normal load, N") && drawn.contains("instability begins"));
+    // Exchanged axes, and one line further: the same values in another order.
+    let exchanged =
+        run(["map", "rough-pad", "--x", "load=500:2000", "--y", "mu=0:0.8", "--points", "2x3", "--csv", "-", "-q"]);
+    let sorted = |csv: &str| {
+        let mut lines: Vec<String> = csv.lines().map(str::to_owned).collect();
+        lines.sort();
+        lines
+    };
+    assert_eq!(sorted(&exchanged.exits(0).stdout), sorted(&csv));
+    // Over load and speed, at a fixed friction coefficient: squeal begins and ends with the load.
+    let args = ["--mu", "0.4", "--points", "5x2", "--edges", &edges, "--csv", "-", "-q"];
+    run(["map", "rough-pad", "--x", "load=100:2000", "--y", "speed=5:20"].into_iter().chain(args)).exits(0);
+    let found = table(&std::fs::read_to_string(&edges).unwrap());
+    let kinds: Vec<&str> = found.iter().map(|row| row["instability"].as_str()).collect();
+    assert_eq!(kinds, ["begins", "ends", "begins", "ends"], "{found:?}");
+    for row in &found {
+        let load: f64 = row["normal_load_n"].parse().unwrap();
+        let unstable = |factor: f64| {
+            let load = (factor * load).to_string();
+            let found = json(["predict", "rough-pad", "--mu", "0.4", "--load", &load, "--json"]);
+            number(&found, "unstable_modes") > 0.0
+        };
+        assert_eq!(
+            (unstable(0.999), unstable(1.001)),
+            if row["instability"] == "begins" { (false, true) } else { (true, false) }
+        );
+    }
+    // Where the pad jams there is a fault with its reason.
+    let rig = write(folder.path(), "jamming.toml", &jamming());
+    let map = run([
+        "map",
+        &rig,
+        "--x",
+        "mu=2:2.5",
+        "--y",
+        "load=50:90",
+        "--points",
+        "2x2",
+        "--speed",
+        "-13",
+        "-q",
+        "--svg",
+        &svg,
+    ]);
+    map.exits(0);
+    assert!(std::fs::read_to_string(&svg).unwrap().contains("no steady sliding"));
+    run(["map", "nine-dof", "--x", "mu=0:1", "--y", "mu=0:1"]).exits(1).complains("the same condition");
+    run(["map", "nine-dof", "--x", "mu=0:1", "--y", "speed=1:20000"]).exits(1).complains("disc_speed_rad_s is 20000");
+    run(["map", "nine-dof", "--x", "heat=0:1"]).exits(2).complains("expected mu, load or speed");
+    run(["map", "nine-dof", "--points", "1x5"]).exits(2).complains("expected at least 2");
+}

@@ -1,0 +1,356 @@
+use std::panic::resume_unwind;
+use std::path::PathBuf;
+use std::sync::Mutex;
+
+use anyhow::{Context, bail};
+use clap::Args;
+
+use super::steps::ProgressOptions;
+use super::{Conditions, Outcome, RigName, finite, print, write_file};
+use crate::figures::plane::{self, Axis, Cell, Edge, Plane};
+use crate::physics::{MapOptions, OperatingPoint, Solver, StabilityMap, Summary, Vectors};
+use crate::rig::Rig;
+use crate::session::map_options;
+
+/// Largest number of operating points of a map.
+const MOST_POINTS: usize = 1_000_000;
+/// An edge between two operating points is located to this share of their distance.
+const EDGE_TOLERANCE: f64 = 1e-6;
+
+/// Map the largest growth rate over two conditions, with the edges of the windows of instability
+#[derive(Debug, Args)]
+pub struct Options {
+    /// Rig file, or the name of an embedded rig
+    #[arg(value_parser = RigName, hide_possible_values = true)]
+    rig: String,
+    /// Condition along x with its range: mu, load (N) or speed (rad/s)
+    #[arg(long, value_name = "CONDITION=FROM:TO", default_value = "mu=0:1", allow_hyphen_values = true)]
+    x: Span,
+    /// Condition along y with its range
+    #[arg(long, value_name = "CONDITION=FROM:TO", default_value = "load=50:2000", allow_hyphen_values = true)]
+    y: Span,
+    /// Operating points along x and y
+    #[arg(long, value_name = "NXxNY", default_value = "81x41")]
+    points: Grid,
+    #[command(flatten)]
+    conditions: Conditions,
+    /// Write the map as CSV to this file, - for standard output [default: -, unless --svg is given]
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Write the edges of the windows as CSV to this file
+    #[arg(long, value_name = "FILE")]
+    edges: Option<PathBuf>,
+    /// Draw the map to this file
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+    #[command(flatten)]
+    progress: ProgressOptions,
+}
+
+/// A condition.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Condition {
+    Friction,
+    Load,
+    Speed,
+}
+
+/// A condition with its range.
+#[derive(Clone, Copy, Debug)]
+struct Span {
+    condition: Condition,
+    from: f64,
+    to: f64,
+}
+
+/// Number of operating points along x and y.
+#[derive(Clone, Copy, Debug)]
+struct Grid([usize; 2]);
+
+impl std::str::FromStr for Span {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let Some((name, range)) = text.split_once('=') else { return Err("expected CONDITION=FROM:TO".to_owned()) };
+        let condition = match name {
+            "mu" => Condition::Friction,
+            "load" => Condition::Load,
+            "speed" => Condition::Speed,
+            other => return Err(format!("`{other}` is no condition, expected mu, load or speed")),
+        };
+        let Some((from, to)) = range.split_once(':') else { return Err("expected a range FROM:TO".to_owned()) };
+        let (from, to) = (finite(from)?, finite(to)?);
+        if to <= from {
+            return Err(format!("the range ends at {to}, expected more than {from}"));
+        }
+        Ok(Self { condition, from, to })
+    }
+}
+
+impl std::str::FromStr for Grid {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let Some((x, y)) = text.split_once('x') else { return Err("expected two numbers, NXxNY".to_owned()) };
+        let count = |text: &str| match text.parse::<usize>() {
+            Ok(count) if count >= 2 => Ok(count),
+            _ => Err(format!("`{text}` is no number of points, expected at least 2")),
+        };
+        let counts = [count(x)?, count(y)?];
+        match counts[0].checked_mul(counts[1]) {
+            Some(all) if all <= MOST_POINTS => Ok(Self(counts)),
+            _ => Err(format!("expected at most {MOST_POINTS} points in all")),
+        }
+    }
+}
+
+impl Condition {
+    fn label(self) -> &'static str {
+        match self {
+            Self::Friction => "friction coefficient",
+            Self::Load => "normal load, N",
+            Self::Speed => "disc speed, rad/s",
+        }
+    }
+
+    /// `point` with this condition at `value`.
+    fn set(self, point: OperatingPoint, value: f64) -> OperatingPoint {
+        match self {
+            Self::Friction => point.with_friction(value),
+            Self::Load => OperatingPoint { normal_load_n: value, ..point },
+            Self::Speed => OperatingPoint { disc_speed_rad_s: value, ..point },
+        }
+    }
+
+    fn of(self, point: &OperatingPoint) -> f64 {
+        match self {
+            Self::Friction => point.friction_coefficient,
+            Self::Load => point.normal_load_n,
+            Self::Speed => point.disc_speed_rad_s,
+        }
+    }
+}
+
+impl Span {
+    /// `count` values over the range, each computed independently.
+    fn values(&self, count: usize) -> Vec<f64> {
+        (0..count).map(|k| self.from + (self.to - self.from) * k as f64 / (count - 1) as f64).collect()
+    }
+}
+
+impl Options {
+    pub fn run(self) -> anyhow::Result<Outcome> {
+        let rig = Rig::load(&self.rig)?;
+        if self.x.condition == self.y.condition {
+            bail!(
+                "--x and --y are the same condition, {}: expected two of mu, load and speed",
+                self.x.condition.label()
+            );
+        }
+        let fixed = self.conditions.point(&rig.name, &rig.reference, &rig.limits)?;
+        for (x, y) in [(self.x.from, self.y.from), (self.x.to, self.y.to)] {
+            let corner = self.y.condition.set(self.x.condition.set(fixed, x), y);
+            rig.limits.check(&corner).with_context(|| rig.name.clone())?;
+        }
+        let Grid([nx, ny]) = self.points;
+        let (xs, ys) = (self.x.values(nx), self.y.values(ny));
+        // Along the friction coefficient a stability map finds every window, so it lies along the lines that are computed.
+        let across = self.y.condition == Condition::Friction;
+        let (along, over) = if across { (self.y, self.x) } else { (self.x, self.y) };
+        let (values, lines) = if across { (&ys, &xs) } else { (&xs, &ys) };
+        let steps = Mutex::new((self.progress.steps(1), 0));
+        let one = |at: f64, solver: &mut Solver| {
+            let found = line(&rig, solver, over.condition.set(fixed, at), along, values);
+            if let Ok(mut steps) = steps.lock() {
+                steps.1 += 1;
+                let done = steps.1;
+                steps.0.at(0, "lines", done, lines.len());
+            }
+            found
+        };
+        let found = in_parallel(lines, rig.model.dimension(), one);
+        drop(steps);
+        let (mut cells, mut edges) = (vec![], vec![]);
+        for line in found {
+            let line = line?;
+            cells.push(line.cells);
+            edges.extend(line.edges);
+        }
+        if across {
+            cells = (0..ny).map(|y| (0..nx).map(|x| cells[x][y].clone()).collect()).collect();
+        }
+        let csv = to_csv(&cells)?;
+        match (&self.csv, &self.svg) {
+            (Some(path), _) => write_file(path, csv.as_bytes())?,
+            (None, None) => print(&csv)?,
+            (None, Some(_)) => {}
+        }
+        if let Some(path) = &self.edges {
+            write_file(path, edges_to_csv(&edges)?.as_bytes())?;
+        }
+        if let Some(path) = &self.svg {
+            let axis = |span: &Span, values: Vec<f64>| Axis { label: span.condition.label(), values };
+            let rest = match (self.x.condition, self.y.condition) {
+                (Condition::Friction, Condition::Load) | (Condition::Load, Condition::Friction) => {
+                    format!("{} rad/s", fixed.disc_speed_rad_s)
+                }
+                (Condition::Friction, Condition::Speed) | (Condition::Speed, Condition::Friction) => {
+                    format!("{} N", fixed.normal_load_n)
+                }
+                (Condition::Load | Condition::Speed | Condition::Friction, _) => {
+                    format!("friction coefficient {}", fixed.friction_coefficient)
+                }
+            };
+            let (x, y) = (self.x.condition, self.y.condition);
+            let plane = Plane {
+                x: axis(&self.x, xs),
+                y: axis(&self.y, ys),
+                growth_rate_per_s: cells
+                    .iter()
+                    .map(|row| row.iter().map(|(_, cell)| cell.clone().map_or(Cell::Fault, Cell::from)).collect())
+                    .collect(),
+                edges: edges.iter().map(|(point, edge)| (x.of(point), y.of(point), *edge)).collect(),
+            };
+            let title = format!("{}: largest growth rate, {rest}", rig.name);
+            write_file(path, plane::draw(&title, &plane)?.as_bytes())?;
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+/// The largest growth rate at an operating point.
+#[derive(Clone, Debug)]
+struct Growth {
+    max_growth_rate_per_s: f64,
+    frequency_hz: f64,
+    unstable_modes: u32,
+    /// Contact pairs that carry a force; for a rig with a contact state.
+    pairs_closed: Option<usize>,
+}
+
+impl From<Growth> for Cell {
+    fn from(growth: Growth) -> Self {
+        if growth.unstable_modes == 0 { Self::Stable } else { Self::Growing(growth.max_growth_rate_per_s) }
+    }
+}
+
+/// The growth rate at each operating point, or why there is none, and the edges of windows.
+struct Line {
+    cells: Vec<(OperatingPoint, Result<Growth, String>)>,
+    edges: Vec<(OperatingPoint, Edge)>,
+}
+
+/// The operating points of one line: `fixed` with `along` at each of `values`.
+fn line(rig: &Rig, solver: &mut Solver, fixed: OperatingPoint, along: Span, values: &[f64]) -> anyhow::Result<Line> {
+    let mut cells = vec![];
+    for &value in values {
+        let point = along.condition.set(fixed, value);
+        cells.push((point, growth(rig, solver, &point)));
+    }
+    let mut edges = vec![];
+    match along.condition {
+        Condition::Friction => {
+            // A map is followed from 0.
+            let (mu_min, mu_max) = (along.from.min(0.0), along.to.max(0.0));
+            let options = MapOptions { mu_min, mu_max, ..map_options(rig) };
+            let map = StabilityMap::build(&rig.model, solver, &fixed, &options)?;
+            for window in &map.windows {
+                let ends = [Some((window.mu_from, Edge::Begins)), window.mu_to.map(|mu| (mu, Edge::Ends))];
+                let inside = |(mu, _): &(f64, Edge)| *mu > along.from && *mu < along.to;
+                edges.extend(
+                    ends.into_iter().flatten().filter(inside).map(|(mu, edge)| (fixed.with_friction(mu), edge)),
+                );
+            }
+        }
+        Condition::Load | Condition::Speed => {
+            let unstable = |cell: &Result<Growth, String>| cell.as_ref().ok().map(|growth| growth.unstable_modes > 0);
+            for pair in cells.windows(2) {
+                let [(from, left), (to, right)] = pair else { continue };
+                let (Some(before), Some(after)) = (unstable(left), unstable(right)) else { continue };
+                if before == after {
+                    continue;
+                }
+                let (mut low, mut high) = (along.condition.of(from), along.condition.of(to));
+                let least = EDGE_TOLERANCE * (high - low);
+                while high - low > least {
+                    let middle = 0.5 * (low + high);
+                    match unstable(&growth(rig, solver, &along.condition.set(fixed, middle))) {
+                        Some(state) if state == before => low = middle,
+                        Some(_) | None => high = middle,
+                    }
+                }
+                let edge = if after { Edge::Begins } else { Edge::Ends };
+                edges.push((along.condition.set(fixed, high), edge));
+            }
+        }
+    }
+    Ok(Line { cells, edges })
+}
+
+/// The largest growth rate in the band at `point`, or why there is no prediction.
+fn growth(rig: &Rig, solver: &mut Solver, point: &OperatingPoint) -> Result<Growth, String> {
+    let spectrum = solver.solve(&rig.model, point, Vectors::Right).map_err(|error| error.to_string())?;
+    let summary = Summary::of_spectrum(&spectrum, None, rig.band_max_hz, rig.instability_threshold);
+    Ok(Growth {
+        max_growth_rate_per_s: summary.max_growth_rate_per_s.unwrap_or(f64::NAN),
+        frequency_hz: summary.worst_frequency_hz.unwrap_or(f64::NAN),
+        unstable_modes: summary.unstable_modes,
+        pairs_closed: spectrum.state.as_ref().map(|state| state.pairs_closed()),
+    })
+}
+
+/// `task` for every value, on all cores: each is computed by one thread and does not depend on the others.
+fn in_parallel<T: Send>(values: &[f64], dimension: usize, task: impl Fn(f64, &mut Solver) -> T + Sync) -> Vec<T> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from).min(values.len());
+    let part = |first: usize| {
+        let mut solver = Solver::new(dimension);
+        let own = values.iter().enumerate().skip(first).step_by(threads);
+        own.map(|(index, &value)| (index, task(value, &mut solver))).collect::<Vec<_>>()
+    };
+    let mut found: Vec<(usize, T)> = std::thread::scope(|scope| {
+        let part = &part;
+        let workers: Vec<_> = (0..threads).map(|first| scope.spawn(move || part(first))).collect();
+        workers.into_iter().flat_map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic))).collect()
+    });
+    found.sort_by_key(|(index, _)| *index);
+    found.into_iter().map(|(_, found)| found).collect()
+}
+
+const CONDITIONS: [&str; 3] = ["normal_load_n", "disc_speed_rad_s", "friction_coefficient"];
+
+fn conditions(point: &OperatingPoint) -> [String; 3] {
+    [point.normal_load_n, point.disc_speed_rad_s, point.friction_coefficient].map(|value| value.to_string())
+}
+
+fn to_csv(rows: &[Vec<(OperatingPoint, Result<Growth, String>)>]) -> anyhow::Result<String> {
+    let mut writer = csv::Writer::from_writer(vec![]);
+    let own = ["unstable_modes", "max_growth_rate_per_s", "frequency_hz", "pairs_closed", "fault"];
+    writer.write_record(CONDITIONS.into_iter().chain(own))?;
+    for (point, cell) in rows.iter().flatten() {
+        let values = match cell {
+            Ok(growth) => [
+                growth.unstable_modes.to_string(),
+                growth.max_growth_rate_per_s.to_string(),
+                growth.frequency_hz.to_string(),
+                growth.pairs_closed.map_or_else(String::new, |closed| closed.to_string()),
+                String::new(),
+            ],
+            Err(reason) => [String::new(), String::new(), String::new(), String::new(), reason.clone()],
+        };
+        writer.write_record(conditions(point).into_iter().chain(values))?;
+    }
+    Ok(String::from_utf8(writer.into_inner()?)?)
+}
+
+fn edges_to_csv(edges: &[(OperatingPoint, Edge)]) -> anyhow::Result<String> {
+    let mut writer = csv::Writer::from_writer(vec![]);
+    writer.write_record(CONDITIONS.into_iter().chain(["instability"]))?;
+    for (point, edge) in edges {
+        let name = match edge {
+            Edge::Begins => "begins",
+            Edge::Ends => "ends",
+        };
+        writer.write_record(conditions(point).into_iter().chain([name.to_owned()]))?;
+    }
+    Ok(String::from_utf8(writer.into_inner()?)?)
+}
