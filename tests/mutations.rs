@@ -259,6 +259,11 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
             let riff = [b"RIFF".as_slice(), &[60, 0, 0, 0], b"WAVE", &format(16, 4), &data].concat();
             vec![riff, [long, format(24, 6), data].concat(), float]
         }
+        "uff58" => vec![project("tests/data/samples/text.uff"), project("tests/data/samples/binary.uff")],
+        "samples_csv" => text(&[
+            "time [s],microphone [Pa],load [N]\n0,0.5,1\n0.00002,-1e-3,1\n0.00004,2,1\n",
+            "Zeit (ms);Mikrofon (Pa)\n0,00;1,5\n0,02;-2,5\n0,04;1\n",
+        ]),
         "recording" => {
             let folder =
                 std::fs::read_dir(format!("{}/recordings/ramp", env!("CARGO_MANIFEST_DIR"))).expect("a recording");

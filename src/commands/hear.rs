@@ -1,6 +1,4 @@
 use std::fmt::Write as _;
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail, ensure};
@@ -9,12 +7,12 @@ use serde::Serialize;
 
 use super::against::{Against, AgainstArgs};
 use super::{Outcome, finite, not_negative, positive, print, write_file};
-use crate::files::input_file;
-use crate::import::wav::Wav;
+use crate::import::samples::SampleFile;
 use crate::sound::matching::Meeting;
 use crate::sound::spectrum::{Spectra, frame_length};
 use crate::sound::waveform::stamp_ns;
 use crate::sound::{Channel, Counts, Detection, Detector, Quantity, Sensitivity, Settings, Squeal, Unit};
+use crate::text::terminal::printable;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -24,12 +22,13 @@ Examples:
   squealcast hear pad.wav --unit g --channel 2 --threshold-db 130 an accelerometer, 130 dB re 1 µm/s²
   squealcast hear test.wav --unit Pa --against sessions/test      hits, misses and false alarms of predictions";
 
-/// Find squeal in a WAV file: onset, end, frequency, level and growth rate of every tone that is loud enough. The
+/// Find squeal in a file of samples: onset, end, frequency, level and growth rate of every tone that is loud enough. The
 /// defaults are those of SAE J2521: at least 70 dB(A) between 1.25 and 16 kHz
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Options {
-    /// WAV file of any length: 16, 24 or 32 bits, integers or floats
+    /// WAV file of any length (16, 24 or 32 bits, integers or floats), Universal File with time histories (datasets 58),
+    /// or CSV file with a header such as `time [s],microphone [Pa]`
     file: PathBuf,
     /// Analyse this channel, counted from 1 [default: all]
     #[arg(long, value_name = "N")]
@@ -51,14 +50,14 @@ pub struct Options {
 /// What the samples of a file mean
 #[derive(Clone, Debug, Args)]
 struct CalibrationArgs {
-    /// Unit of the samples: FS (parts of full scale), V, Pa, m/s² or g
-    #[arg(long, value_name = "UNIT", default_value = "FS")]
-    unit: Unit,
+    /// Unit of the samples: FS (parts of full scale), V, Pa, m/s² or g [default: as the file says; of a WAV file, FS]
+    #[arg(long, value_name = "UNIT")]
+    unit: Option<Unit>,
     /// Output of the sensor, such as '0.05 FS/Pa', '50 mV/Pa' or '100 mV/g'
     #[arg(long, value_name = "VALUE")]
     sensitivity: Option<Sensitivity>,
-    /// WAV file of a sound calibrator, recorded with the same settings, instead of --sensitivity
-    #[arg(long, value_name = "WAV", conflicts_with = "sensitivity")]
+    /// File of a sound calibrator, recorded with the same settings, instead of --sensitivity
+    #[arg(long, value_name = "FILE", conflicts_with = "sensitivity")]
     calibration: Option<PathBuf>,
     /// Level of the calibrator
     #[arg(long, value_name = "DB", value_parser = finite, default_value = "94", requires = "calibration")]
@@ -67,7 +66,7 @@ struct CalibrationArgs {
 
 /// What counts as squeal
 #[derive(Clone, Copy, Debug, Args)]
-struct DetectionArgs {
+pub struct DetectionArgs {
     /// Least level, dB(A) re 20 µPa or dB re 1 µm/s²
     #[arg(long, value_name = "DB", value_parser = finite, default_value = "70", allow_negative_numbers = true)]
     threshold_db: f64,
@@ -80,6 +79,13 @@ struct DetectionArgs {
     /// Least duration, s
     #[arg(long, value_name = "S", value_parser = not_negative, default_value = "0.1")]
     min_duration_s: f64,
+}
+
+impl DetectionArgs {
+    pub fn settings(&self) -> Settings {
+        let Self { threshold_db, band_hz, prominence_db, min_duration_s } = *self;
+        Settings { threshold_db, band_hz, prominence_db, min_duration_s, ..Default::default() }
+    }
 }
 
 fn band(text: &str) -> Result<[f64; 2], String> {
@@ -96,6 +102,9 @@ const STEADY_DB: f64 = 1.0;
 /// The squeals of a channel.
 struct Heard {
     channel: u16,
+    name: String,
+    sample_rate_hz: f64,
+    duration_s: f64,
     quantity: Quantity,
     band_hz: [f64; 2],
     frame_s: f64,
@@ -129,7 +138,9 @@ struct Row {
 struct Report<'a> {
     file: String,
     encoding: &'a str,
-    sample_rate_hz: u32,
+    /// Of the first channel.
+    sample_rate_hz: f64,
+    /// Of the longest channel.
     duration_s: f64,
     missing_bytes: u64,
     threshold_db: f64,
@@ -139,6 +150,9 @@ struct Report<'a> {
 #[derive(Serialize)]
 struct ChannelReport {
     channel: u16,
+    /// Empty if the file gives none.
+    name: String,
+    sample_rate_hz: f64,
     level_unit: &'static str,
     band_hz: [f64; 2],
     frame_s: f64,
@@ -199,10 +213,13 @@ impl Row {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let mut wav = open(&self.file)?;
+        let mut samples = SampleFile::open(&self.file)?;
         let file = self.file.display();
+        for omitted in samples.omitted() {
+            note!("{file}: omitted {omitted}");
+        }
         if let Some(channel) = self.channel {
-            let channels = wav.channels;
+            let channels = samples.channel_count() as u16;
             ensure!(
                 (1..=channels).contains(&channel),
                 "--channel is {channel}, expected 1 to the {channels} of {file}"
@@ -210,47 +227,52 @@ impl Options {
         }
         let against = self.against.read()?;
         let start_ns = against.as_ref().map_or(0, |against| against.start_ns);
-        let heard = self.detect(&mut wav, start_ns)?;
+        let heard = self.detect(&mut samples, start_ns)?;
         let rows: Vec<Row> = heard.iter().flat_map(|heard| heard.rows(start_ns)).collect();
         if let Some(path) = &self.csv {
             write_file(path, &csv(&rows)?)?;
         }
         if self.json {
-            print(&(serde_json::to_string(&self.report(&wav, &heard, against.as_ref())?)? + "\n"))?;
+            print(&(serde_json::to_string(&self.report(&samples, &heard, against.as_ref())?)? + "\n"))?;
         } else if self.csv.as_deref() != Some(Path::new("-")) {
-            print(&self.text(&wav, &heard, against.as_ref())?)?;
+            print(&self.text(&samples, &heard, against.as_ref())?)?;
         }
-        if wav.missing_bytes == 0 {
+        if samples.missing_bytes() == 0 {
             return Ok(Outcome::Done);
         }
-        note!("{file}: {} bytes of samples are missing at its end", wav.missing_bytes);
+        note!("{file}: {} bytes of samples are missing at its end", samples.missing_bytes());
         Ok(Outcome::Differences)
     }
 
-    fn detect(&self, wav: &mut Wav<BufReader<File>>, start_ns: i64) -> anyhow::Result<Vec<Heard>> {
-        let file = self.file.display().to_string();
-        let sample_rate_hz = f64::from(wav.sample_rate_hz);
-        let DetectionArgs { threshold_db, band_hz, prominence_db, min_duration_s } = self.detection;
-        let settings = Settings { threshold_db, band_hz, prominence_db, min_duration_s, ..Default::default() };
+    fn detect(&self, file: &mut SampleFile, start_ns: i64) -> anyhow::Result<Vec<Heard>> {
+        let path = self.file.display().to_string();
+        let settings = self.detection.settings();
         let wanted: Vec<u16> =
-            (1..=wav.channels).filter(|n| self.channel.is_none_or(|channel| channel == *n)).collect();
+            (1..=file.channel_count() as u16).filter(|n| self.channel.is_none_or(|channel| channel == *n)).collect();
         let mut detectors = vec![];
         for &channel in &wanted {
-            let (unit, sensitivity) = (self.calibration.unit, self.calibration.sensitivity(channel)?);
+            let index = usize::from(channel - 1);
+            let unit = self.calibration.unit.or(file.unit(index)).unwrap_or(Unit::FullScale);
+            let sensitivity = self.calibration.sensitivity(channel, unit)?;
+            let sample_rate_hz = file.sample_rate_hz(index);
             let channel = Channel { name: channel.to_string(), sample_rate_hz, unit, sensitivity };
-            let detector = Detector::new(&channel, settings).with_context(|| file.clone())?;
+            let detector = Detector::new(&channel, settings).with_context(|| path.clone())?;
             detectors.push((detector, vec![]));
         }
-        let mut samples = vec![vec![]; usize::from(wav.channels)];
+        let mut samples = vec![vec![]; file.channel_count()];
         let mut read = 0;
         loop {
             samples.iter_mut().for_each(Vec::clear);
-            let count = wav.read(BLOCK, &mut samples)?;
+            let count = file.read(BLOCK, &mut samples)?;
             if count == 0 {
                 break;
             }
             for (&channel, (detector, found)) in wanted.iter().zip(&mut detectors) {
-                detector.push(stamp_ns(start_ns, read, sample_rate_hz), &samples[usize::from(channel - 1)], found);
+                let index = usize::from(channel - 1);
+                // A channel may end before the others.
+                if !samples[index].is_empty() {
+                    detector.push(stamp_ns(start_ns, read, file.sample_rate_hz(index)), &samples[index], found);
+                }
                 // Announcements are for live use.
                 found.retain(|detection| matches!(detection, Detection::Ended(_)));
             }
@@ -260,8 +282,12 @@ impl Options {
             detector.finish(&mut found);
             let mut squeals: Vec<Squeal> = found.into_iter().filter_map(Detection::ended).collect();
             squeals.sort_by_key(|squeal| (squeal.onset_ns, squeal.number));
+            let index = usize::from(channel - 1);
             Heard {
                 channel,
+                name: file.name(index).to_owned(),
+                sample_rate_hz: file.sample_rate_hz(index),
+                duration_s: file.duration_s(index),
                 quantity: detector.quantity(),
                 band_hz: detector.band_hz(),
                 frame_s: detector.frame_s(),
@@ -273,18 +299,15 @@ impl Options {
         Ok(heard.collect())
     }
 
-    fn report(
-        &self,
-        wav: &Wav<BufReader<File>>,
-        heard: &[Heard],
-        against: Option<&Against>,
-    ) -> anyhow::Result<Report<'static>> {
+    fn report(&self, file: &SampleFile, heard: &[Heard], against: Option<&Against>) -> anyhow::Result<Report<'static>> {
         let mut channels = vec![];
         for heard in heard {
             let met =
-                against.map(|against| against.meet(&heard.squeals, duration_s(wav), heard.band_hz)).transpose()?;
+                against.map(|against| against.meet(&heard.squeals, heard.duration_s, heard.band_hz)).transpose()?;
             channels.push(ChannelReport {
                 channel: heard.channel,
+                name: heard.name.clone(),
+                sample_rate_hz: heard.sample_rate_hz,
                 level_unit: heard.quantity.level_unit(),
                 band_hz: heard.band_hz,
                 frame_s: heard.frame_s,
@@ -297,33 +320,34 @@ impl Options {
         }
         Ok(Report {
             file: self.file.display().to_string(),
-            encoding: wav.encoding.name(),
-            sample_rate_hz: wav.sample_rate_hz,
-            duration_s: duration_s(wav),
-            missing_bytes: wav.missing_bytes,
+            encoding: file.format(),
+            sample_rate_hz: file.sample_rate_hz(0),
+            duration_s: duration_s(file),
+            missing_bytes: file.missing_bytes(),
             threshold_db: self.detection.threshold_db,
             channels,
         })
     }
 
-    fn text(&self, wav: &Wav<BufReader<File>>, heard: &[Heard], against: Option<&Against>) -> anyhow::Result<String> {
+    fn text(&self, file: &SampleFile, heard: &[Heard], against: Option<&Against>) -> anyhow::Result<String> {
         let plural = |number: usize| if number == 1 { "" } else { "s" };
         let mut text = format!(
             "{}: {:.3} s, {} Hz, {}, {} channel{}\n",
             self.file.display(),
-            duration_s(wav),
-            wav.sample_rate_hz,
-            wav.encoding.name(),
-            wav.channels,
-            plural(wav.channels.into()),
+            duration_s(file),
+            file.sample_rate_hz(0),
+            file.format(),
+            file.channel_count(),
+            plural(file.channel_count()),
         );
         for heard in heard {
             let [low, high] = heard.band_hz;
             let count = heard.squeals.len();
             let _ = writeln!(
                 text,
-                "\nchannel {}: {count} squeal{} of at least {} {} between {low} and {high} Hz",
+                "\nchannel {}{}: {count} squeal{} of at least {} {} between {low} and {high} Hz",
                 heard.channel,
+                if heard.name.is_empty() { String::new() } else { format!(" ({})", printable(&heard.name)) },
                 plural(count),
                 self.detection.threshold_db,
                 heard.quantity.level_unit(),
@@ -345,7 +369,7 @@ impl Options {
                 text += &line(&row);
             }
             if let Some(against) = against {
-                text += &against.text(&against.meet(&heard.squeals, duration_s(wav), heard.band_hz)?);
+                text += &against.text(&against.meet(&heard.squeals, heard.duration_s, heard.band_hz)?);
             }
         }
         Ok(text)
@@ -354,21 +378,22 @@ impl Options {
 
 impl CalibrationArgs {
     /// The sensitivity of a channel: as given, or from the recording of a calibrator.
-    fn sensitivity(&self, channel: u16) -> anyhow::Result<Option<Sensitivity>> {
+    fn sensitivity(&self, channel: u16, unit: Unit) -> anyhow::Result<Option<Sensitivity>> {
         let Some(path) = &self.calibration else { return Ok(self.sensitivity) };
         let file = path.display();
-        if !matches!(self.unit, Unit::FullScale | Unit::Volt) {
-            bail!("--calibration: the samples are in {}, which needs no calibrator", self.unit);
+        if !matches!(unit, Unit::FullScale | Unit::Volt) {
+            bail!("--calibration: the samples are in {unit}, which needs no calibrator");
         }
-        let mut wav = open(path)?;
+        let mut calibrator = SampleFile::open(path)?;
+        let channels = calibrator.channel_count();
         // A calibrator is recorded microphone by microphone, or on all channels.
-        let index = if wav.channels == 1 { 0 } else { usize::from(channel) - 1 };
-        ensure!(index < usize::from(wav.channels), "{file}: has {} channels and no channel {channel}", wav.channels);
-        let length = frame_length(f64::from(wav.sample_rate_hz));
+        let index = if channels == 1 { 0 } else { usize::from(channel) - 1 };
+        ensure!(index < channels, "{file}: has {channels} channels and no channel {channel}");
+        let length = frame_length(calibrator.sample_rate_hz(index));
         let mut spectra = Spectra::new(length);
         let mut powers = vec![];
-        let mut samples = vec![vec![]; usize::from(wav.channels)];
-        while wav.read(length, &mut samples)? == length {
+        let mut samples = vec![vec![]; channels];
+        while calibrator.read(length, &mut samples)? == length && samples[index].len() == length {
             let power = spectra.power(samples[index].iter().map(|&sample| f64::from(sample)));
             let inner = 1..power.len() - 1;
             let highest = inner.max_by(|&a, &b| power[a].total_cmp(&power[b])).unwrap_or(1);
@@ -377,7 +402,7 @@ impl CalibrationArgs {
         }
         powers.sort_by(f64::total_cmp);
         let Some(&median) = powers.get(powers.len() / 2) else {
-            bail!("{file}: has {} samples, expected at least {length}", wav.frames);
+            bail!("{file}: has {} samples, expected at least {length}", samples[index].len());
         };
         let [low, high] = [powers.len() / 10, powers.len() - 1 - powers.len() / 10].map(|index| powers[index]);
         let range_db = 10.0 * (high / low).log10();
@@ -388,18 +413,13 @@ impl CalibrationArgs {
         }
         let pressure = Quantity::SoundPressure.reference() * 10.0_f64.powf(0.05 * self.calibration_db);
         let value = median.sqrt() / pressure;
-        Ok(Some(Sensitivity { value, output: self.unit, quantity: Quantity::SoundPressure }))
+        Ok(Some(Sensitivity { value, output: unit, quantity: Quantity::SoundPressure }))
     }
 }
 
-fn open(path: &Path) -> anyhow::Result<Wav<BufReader<File>>> {
-    let file = path.display().to_string();
-    let opened = input_file::open(path, input_file::ANY_SIZE).with_context(|| file.clone())?;
-    Ok(Wav::open(&file, BufReader::new(opened))?)
-}
-
-fn duration_s(wav: &Wav<BufReader<File>>) -> f64 {
-    wav.frames as f64 / f64::from(wav.sample_rate_hz)
+/// Length of the longest channel, s.
+fn duration_s(file: &SampleFile) -> f64 {
+    (0..file.channel_count()).map(|channel| file.duration_s(channel)).fold(0.0, f64::max)
 }
 
 fn line(row: &Row) -> String {

@@ -17,6 +17,7 @@
 //! | tribometer log | [`LOG`] | about 12 times the file; lines of 64 KiB |
 //! | target frequencies | [`TARGETS`] | about 10 times the file |
 //! | WAV file | none: read in pieces | 20 MiB for each channel, of at most 64 |
+//! | Universal File and CSV file of samples | [`SAMPLES`] | 8 times the file |
 //! | chart | [`CHART`] | 3 times the file |
 //! | recording (MCAP) | none: read in pieces | 256 MiB and an attachment, see [`crate::recording::record_walker`] |
 
@@ -35,6 +36,8 @@ pub const RIG_PART: u64 = 512 << 20;
 pub const FULL_MODEL_PART: u64 = 16 << 30;
 /// Logs of a tribometer.
 pub const LOG: u64 = 512 << 20;
+/// Samples of sound and acceleration, other than WAV files.
+pub const SAMPLES: u64 = 1 << 30;
 /// Natural frequencies to which a rig is fitted.
 pub const TARGETS: u64 = 1 << 20;
 /// Charts on disk.

@@ -1,6 +1,9 @@
-//! Converts a tribometer log to a recording of operating points; reads WAV files.
+//! Converts a tribometer log to a recording of operating points; reads files of sampled sound and acceleration.
 
+pub mod samples;
+pub mod samples_csv;
 pub mod tribometer_log;
+pub mod uff58;
 pub mod wav;
 
 use std::{

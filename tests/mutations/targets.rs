@@ -7,8 +7,8 @@ use std::sync::LazyLock;
 
 use squealcast::bus::params_file;
 use squealcast::full_model::FullModelFile;
-use squealcast::import::tribometer_log;
 use squealcast::import::wav::Wav;
+use squealcast::import::{samples_csv, tribometer_log, uff58};
 use squealcast::msgs::schema::Topic;
 use squealcast::physics::chart::Scratch;
 use squealcast::physics::{Chart, OperatingPoint, Traces};
@@ -25,7 +25,7 @@ pub struct Target {
     pub read: fn(&[u8]),
 }
 
-pub const TARGETS: [Target; 14] = [
+pub const TARGETS: [Target; 16] = [
     Target {
         name: "npz",
         read: |bytes| {
@@ -68,6 +68,8 @@ pub const TARGETS: [Target; 14] = [
         },
     },
     Target { name: "wav", read: wav },
+    Target { name: "uff58", read: |bytes| drop(uff58::read("a.uff", bytes)) },
+    Target { name: "samples_csv", read: |bytes| drop(samples_csv::read("a.csv", bytes)) },
     Target { name: "recording", read: recording },
     Target {
         name: "cdr",

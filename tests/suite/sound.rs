@@ -7,7 +7,8 @@ use std::process::Command;
 
 use crate::program::{self, folder, json, number, python, run, text};
 use serde_json::Value;
-use squealcast::sound::spectrum::Spectra;
+use squealcast::import::samples::SampleFile;
+use squealcast::sound::{self, spectrum::Spectra};
 
 const RATE_HZ: u32 = 48_000;
 
@@ -76,6 +77,26 @@ fn squeals_of_a_file_have_their_frequency_level_and_time_in_every_resolution() {
     assert_eq!(found["channels"][0]["level_unit"], "dB re 1 µm/s²");
 }
 
+/// A tone that rises by 50 Hz/s, from 2000 to 2150 Hz: its mean frequency over the time is 2075 Hz. 0.5 Pa are 84.95 dB, with
+/// the A-weighting of IEC 61672-1 at 2 kHz, 1.2 dB, 86.15 dB(A); at 2.5 kHz it is 1.3 dB.
+#[test]
+fn a_tone_that_drifts_is_one_squeal_with_its_mean_frequency_and_level() {
+    let folder = folder();
+    let sample = |k: usize| {
+        let t = k as f64 / f64::from(RATE_HZ) - 0.5;
+        let flank = (t.min(3.0 - t) / 0.01).clamp(0.0, 1.0);
+        0.5 * (0.25 * TAU * flank).sin().powi(2) * (TAU * (2000.0 * t + 25.0 * t * t)).sin()
+    };
+    let samples: Vec<f64> = (0..4 * RATE_HZ as usize).map(sample).collect();
+    let file = wav(&folder.path().join("a.wav"), 3, &[samples]);
+    let found = json(["hear", &file, "--sensitivity", "1 FS/Pa", "--json"]);
+    let [squeal] = squeals(&found, 0).as_slice() else { panic!("{found}") };
+    assert!((number(squeal, "frequency_hz") - 2075.0).abs() < 1.0, "{squeal}");
+    assert!((number(squeal, "level_db") - 86.15).abs() < 0.1, "{squeal}");
+    let times = (number(squeal, "onset_s"), number(squeal, "end_s"));
+    assert!((times.0 - 0.5).abs() < 0.005 && (times.1 - 3.5).abs() < 0.005, "{squeal}");
+}
+
 #[test]
 fn tables_and_csv_hold_the_squeals_and_options_select_them() {
     let folder = folder();
@@ -116,6 +137,54 @@ fn the_recording_of_a_calibrator_gives_the_sensitivity() {
     run(["hear", &file, "--calibration", &calibrator, "--unit", "Pa"]).exits(1).complains("needs no calibrator");
 }
 
+/// All samples of the one channel of a file.
+fn samples_of(path: &Path) -> (f64, Option<sound::Unit>, Vec<f32>) {
+    let mut file = SampleFile::open(path).unwrap_or_else(|error| panic!("{error}"));
+    let mut samples = vec![vec![]];
+    while file.read(1 << 16, &mut samples).expect("read") > 0 {}
+    (file.sample_rate_hz(0), file.unit(0), samples.remove(0))
+}
+
+/// The same samples written by scipy, pyuff, asammdf, nptdms and h5py, the last three converted by the lines of
+/// launch/SAMPLES.md.
+#[test]
+fn files_of_other_programs_have_the_same_samples() {
+    let python = python();
+    if !program::python_has(&python, "numpy, scipy") {
+        return;
+    }
+    let folder = folder();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let output = Command::new(&python)
+        .arg(root.join("tests/peers/sample_files.py"))
+        .args([folder.path(), &root.join("launch/SAMPLES.md")])
+        .output()
+        .expect("Python starts");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    eprintln!("compared with {report}");
+    let (rate_hz, _, reference) = samples_of(&folder.path().join("reference.wav"));
+    assert_eq!((rate_hz, reference.len()), (51_200.0, 76_800));
+    for name in report["written"].as_array().expect("names").iter().map(|name| name.as_str().expect("a name")) {
+        let (rate_hz, unit, samples) = samples_of(&folder.path().join(name));
+        assert_eq!(rate_hz, 51_200.0, "{name}");
+        assert_eq!(unit, (!name.ends_with(".wav")).then_some(sound::Unit::Pascal), "{name}");
+        if name == "text.uff" {
+            // Six digits.
+            let near = |(a, b): (&f32, &f32)| (a - b).abs() <= 5.1e-6 * b.abs();
+            assert!(samples.len() == reference.len() && samples.iter().zip(&reference).all(near), "{name}");
+        } else {
+            assert!(samples == reference, "{name}");
+        }
+        let found = json(["hear", &text(&folder.path().join(name)), "--unit", "Pa", "--json"]);
+        let [squeal] = squeals(&found, 0).as_slice() else { panic!("{name}: {found}") };
+        assert!((number(squeal, "frequency_hz") - 3210.5).abs() < 0.1, "{name}: {squeal}");
+    }
+    let csv = run(["hear", &text(&folder.path().join("test.csv"))]).exits(0);
+    assert!(csv.stderr.contains("omitted column `load`: unit `N`"), "{}", csv.stderr);
+    assert!(csv.stdout.contains("channel 1 (microphone): 1 squeal of at least 70 dB(A)"), "{}", csv.stdout);
+}
+
 #[test]
 fn damaged_files_are_named_with_position_and_expectation() {
     let folder = folder();
@@ -128,8 +197,8 @@ fn damaged_files_are_named_with_position_and_expectation() {
     run(hear).exits(3).complains("96000 bytes of samples are missing at its end").says("goes on after the samples");
     std::fs::write(&path, &whole[..30]).expect("a test can write its files");
     run(hear).exits(1).complains("a.wav, byte 20: 10 bytes up to the end of the file, expected the 16 bytes");
-    std::fs::write(&path, b"time_s,load\n0,1\n").expect("a test can write its files");
-    run(hear).exits(1).complains("byte 0: \"time_s,load\\n\", expected a WAV file");
+    std::fs::write(&path, b"hello\n").expect("a test can write its files");
+    run(hear).exits(1).complains("line 1: `hello`, expected a WAV file, a Universal File");
     run(["hear", "/dev/zero", "--sensitivity", "0.1 FS/Pa"]).exits(1).complains("is a device");
     let slow = [&whole[..24], &100_u32.to_le_bytes(), &whole[28..]].concat();
     std::fs::write(&path, slow).expect("a test can write its files");
