@@ -38,6 +38,8 @@ pub mod topic {
     pub const OPERATING_POINT: &str = "/rig/operating_point";
     /// Measured vibration, received by the node; it does not affect predictions.
     pub const VIBRATION: &str = "/rig/vibration";
+    /// Samples of microphones and accelerometers, received by the node; they do not affect predictions.
+    pub const WAVEFORM: &str = "/rig/waveform";
     /// Predictions, published by the node.
     pub const PREDICTION: &str = "/squealcast/prediction";
     /// Description of the node's rig; transient local.
@@ -46,6 +48,8 @@ pub mod topic {
     pub const SESSION_EVENT: &str = "/squealcast/session_event";
     /// Sensitivities of predictions to conditions and contact.
     pub const SENSITIVITY: &str = "/squealcast/sensitivity";
+    /// Squeals found in the samples, published by the node.
+    pub const HEARD: &str = "/squealcast/heard";
     /// Diagnostics of the node.
     pub const DIAGNOSTICS: &str = "/diagnostics";
 
@@ -61,6 +65,12 @@ pub mod topic {
 
 /// Largest number of modes in a [`Prediction`].
 pub const MAX_MODES: usize = 64;
+
+/// Largest number of samples in a [`Waveform`].
+pub const MAX_WAVEFORM_SAMPLES: usize = 1 << 14;
+
+/// Longest name of a channel of a [`Waveform`], bytes.
+pub const MAX_CHANNEL_BYTES: usize = 128;
 
 /// `builtin_interfaces/Time`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -104,6 +114,112 @@ pub struct Vibration {
     pub frequency_hz: f64,
     /// Level of that peak, dB; the reference is that of the instrument.
     pub level_db: f64,
+}
+
+/// `squealcast_msgs/Waveform`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Waveform {
+    /// The stamp is the time of the first sample.
+    pub header: Header,
+    /// Name of the channel, at most [`MAX_CHANNEL_BYTES`].
+    pub channel: String,
+    /// Samples per second.
+    pub sample_rate_hz: f64,
+    /// Unit of the samples: `Pa`, `m/s²`, `g`, `V` or `FS`.
+    pub unit: String,
+    /// Output of the sensor for samples in V or FS, such as `50 mV/Pa`; else empty.
+    pub sensitivity: String,
+    /// At most [`MAX_WAVEFORM_SAMPLES`].
+    pub samples: Vec<f32>,
+}
+
+/// `squealcast_msgs/Heard`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Heard {
+    /// The stamp is the time of the onset.
+    pub header: Header,
+    /// Channel of the samples in which the squeal was found.
+    pub channel: String,
+    /// Counts the squeals of the channel.
+    pub number: u64,
+    /// One of [`heard_state`].
+    pub state: u8,
+    /// End of the squeal; while it lasts, the latest time at which it was found.
+    pub end_stamp: Time,
+    /// Whether samples are missing at the onset.
+    pub cut_at_onset: bool,
+    /// Whether samples are missing at the end.
+    pub cut_at_end: bool,
+    /// Mean frequency of the steady part, Hz.
+    pub frequency_hz: f64,
+    /// One of [`heard_quantity`].
+    pub quantity: u8,
+    /// Level of the steady part, dB(A) re 20 µPa or dB re 1 µm/s².
+    pub level_db: f64,
+    /// Highest level, dB.
+    pub peak_level_db: f64,
+    /// Ratio of the tone to the noise in its bin at the onset, dB.
+    pub prominence_db: f64,
+    /// Growth rate at the onset, 1/s; NaN if it cannot be measured.
+    pub growth_rate_per_s: f64,
+    /// Lower end of its 95 % confidence interval, 1/s.
+    pub growth_rate_low_per_s: f64,
+    /// Upper end of its 95 % confidence interval, 1/s.
+    pub growth_rate_high_per_s: f64,
+    /// Of a harmonic: its order, at least 2; else 0.
+    pub harmonic_order: u32,
+    /// Of a harmonic: number of the fundamental; else 0.
+    pub harmonic_of: u64,
+    /// One of [`heard_verdict`].
+    pub verdict: u8,
+    /// Of a hit: identity of the mode that was predicted to squeal; else 0.
+    pub mode_id: u32,
+    /// Of a hit: frequency of that mode, Hz; else NaN.
+    pub predicted_frequency_hz: f64,
+    /// Of a hit: growth rate of that mode, 1/s; else NaN.
+    pub predicted_growth_rate_per_s: f64,
+    /// Sequence number of the prediction that the squeal is compared with.
+    pub input_seq: u64,
+    /// Stamp of that prediction; zero without one.
+    pub prediction_stamp: Time,
+}
+
+/// The values of [`Heard::state`].
+pub mod heard_state {
+    /// The squeal lasts.
+    pub const BEGAN: u8 = 0;
+    /// The squeal is over.
+    pub const ENDED: u8 = 1;
+}
+
+/// The values of [`Heard::quantity`].
+pub mod heard_quantity {
+    /// Levels in dB(A) re 20 µPa.
+    pub const SOUND_PRESSURE: u8 = 0;
+    /// Levels in dB re 1 µm/s².
+    pub const ACCELERATION: u8 = 1;
+}
+
+/// The values of [`Heard::verdict`].
+pub mod heard_verdict {
+    /// A mode was predicted to squeal at this frequency.
+    pub const HIT: u8 = 0;
+    /// No mode was.
+    pub const MISS: u8 = 1;
+    /// A harmonic of another squeal, not judged separately.
+    pub const HARMONIC: u8 = 2;
+    /// There is no prediction for this time.
+    pub const NOT_JUDGED: u8 = 3;
+
+    /// The name of a verdict.
+    pub fn name(verdict: u8) -> &'static str {
+        match verdict {
+            HIT => "hit",
+            MISS => "miss",
+            HARMONIC => "harmonic",
+            _ => "not judged",
+        }
+    }
 }
 
 /// `squealcast_msgs/Mode`.

@@ -23,6 +23,10 @@ listed! {
         Diagnostics,
         /// [`topic::VIBRATION`]
         Vibration,
+        /// [`topic::WAVEFORM`]
+        Waveform,
+        /// [`topic::HEARD`]
+        Heard,
     }
 }
 
@@ -54,6 +58,8 @@ impl Topic {
             Self::Sensitivity => topic::SENSITIVITY,
             Self::Diagnostics => topic::DIAGNOSTICS,
             Self::Vibration => topic::VIBRATION,
+            Self::Waveform => topic::WAVEFORM,
+            Self::Heard => topic::HEARD,
         }
     }
 
@@ -67,6 +73,8 @@ impl Topic {
             Self::Sensitivity => "squealcast_msgs/msg/Sensitivity",
             Self::Diagnostics => "diagnostic_msgs/msg/DiagnosticArray",
             Self::Vibration => "squealcast_msgs/msg/Vibration",
+            Self::Waveform => "squealcast_msgs/msg/Waveform",
+            Self::Heard => "squealcast_msgs/msg/Heard",
         }
     }
 
@@ -84,7 +92,9 @@ impl Topic {
             | Self::SessionEvent
             | Self::Sensitivity
             | Self::Diagnostics
-            | Self::Vibration => false,
+            | Self::Vibration
+            | Self::Waveform
+            | Self::Heard => false,
         }
     }
 
@@ -98,13 +108,17 @@ impl Topic {
             Self::Sensitivity => include_str!("../msg/Sensitivity.msg"),
             Self::Diagnostics => DIAGNOSTIC_ARRAY,
             Self::Vibration => include_str!("../msg/Vibration.msg"),
+            Self::Waveform => include_str!("../msg/Waveform.msg"),
+            Self::Heard => include_str!("../msg/Heard.msg"),
         }
     }
 
     /// The messages it refers to, as `package/Type` and text.
     fn dependencies(self) -> &'static [(&'static str, &'static str)] {
         match self {
-            Self::OperatingPoint | Self::SessionEvent | Self::Vibration => &[HEADER, TIME],
+            Self::OperatingPoint | Self::SessionEvent | Self::Vibration | Self::Waveform | Self::Heard => {
+                &[HEADER, TIME]
+            }
             Self::Prediction => &[HEADER, TIME, MODE],
             Self::RigInfo => &[],
             Self::Sensitivity => &[HEADER, TIME, MODE_SENSITIVITY, PAIR_SENSITIVITY, DERIVATIVES],

@@ -6,7 +6,9 @@ use super::ros2::Ros2Error;
 use super::shm::ShmError;
 use super::{Bus, Counts, Received};
 use crate::msgs::schema::Topic;
-use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration};
+use crate::msgs::{
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, Waveform,
+};
 
 /// A message to be published.
 #[derive(Clone, Copy, Debug)]
@@ -18,6 +20,8 @@ pub enum Outgoing<'a> {
     Sensitivity(&'a Sensitivity),
     Diagnostics(&'a DiagnosticArray),
     Vibration(&'a Vibration),
+    Waveform(&'a Waveform),
+    Heard(&'a Heard),
 }
 
 /// Why a bus refused to publish a message.
@@ -34,6 +38,8 @@ pub enum BusError {
 pub struct Report {
     /// Counts of the operating points received so far; `None` if the connection receives none.
     pub counts: Option<Counts>,
+    /// Counts of the blocks of samples received so far; `None` if the connection receives none.
+    pub waveform_counts: Option<Counts>,
     /// Number of predictions so far that were not encoded, because they had no reader.
     pub encodings_skipped: u64,
     /// How often so far the bus failed and was started again.
@@ -67,7 +73,7 @@ pub trait Connection: Send {
 
 /// Takes what a node receives over its buses. Buses call it on their own threads; it must not block.
 pub trait Sink: Send + Sync {
-    /// Whether operating points and vibrations are wanted. If not, a bus need not receive them.
+    /// Whether operating points, vibrations and samples are wanted. If not, a bus need not receive them.
     fn takes_inputs(&self) -> bool;
 
     /// Takes an operating point. With `may_predict` the calling thread may be used for the time of a prediction.
@@ -75,6 +81,9 @@ pub trait Sink: Send + Sync {
 
     /// Takes a measured vibration.
     fn vibration(&self, received: Received<Vibration>);
+
+    /// Takes a block of samples of a microphone or accelerometer.
+    fn waveform(&self, received: Received<Waveform>);
 
     /// Takes a parameter value that a peer has set and that was validated.
     fn parameter(&self, name: &str, value: f64);

@@ -11,6 +11,7 @@ pub mod ros_args;
 pub mod shm;
 mod shm_connection;
 mod shm_place;
+pub mod shm_waveform;
 
 pub use connection::{BusError, Connection, Outgoing, Report, Sink};
 pub use received::{Counts, Received};

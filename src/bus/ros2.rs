@@ -28,12 +28,14 @@ use thiserror::Error;
 pub use self::connection::{Ros2NodeConnection, Ros2ReplayConnection};
 
 use self::discovery::Discovery;
-use self::link::{Durability, Link, MAX_UNANSWERED};
+use self::link::{Durability, Link, MAX_BLOCKS_WAITING, MAX_UNANSWERED, MAX_WAITING};
 use super::Bus;
-use super::received::{Counts, Received};
+use super::received::{Counters, Counts, Received};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
 use crate::msgs::schema::Topic;
-use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
+use crate::msgs::{
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, Waveform, topic,
+};
 
 /// Name of the node before remapping.
 pub const NODE_NAME: &str = "squealcast";
@@ -151,7 +153,10 @@ impl Parameters {
     }
 }
 
-/// The node's side: receives operating points and the measured vibration, and publishes all other topics.
+/// Receives the blocks of samples of microphones and accelerometers.
+type WaveformSink = Box<dyn FnMut(Received<Waveform>) + Send>;
+
+/// The node's side: receives operating points, the measured vibration and samples, and publishes all other topics.
 pub struct Ros2 {
     // Declared first, because publishers must be dropped before the node.
     prediction: Publisher<Prediction>,
@@ -162,6 +167,9 @@ pub struct Ros2 {
     session_event: Publisher<SessionEvent>,
     sensitivity: Publisher<Sensitivity>,
     diagnostics: Publisher<DiagnosticArray>,
+    heard: Publisher<Heard>,
+    /// Counts of the blocks of samples.
+    waveform_counters: Arc<Counters>,
     beats: Arc<AtomicU64>,
     link: Link<OperatingPoint>,
 }
@@ -178,17 +186,18 @@ impl Ros2 {
         sink: impl FnMut(Received<OperatingPoint>) + Send + 'static,
         vibration: impl FnMut(Received<Vibration>) + Send + 'static,
     ) -> Result<Self, Ros2Error> {
-        Self::start_with(options, parameters, MAX_UNANSWERED, sink, vibration)
+        Self::start_with(options, parameters, MAX_UNANSWERED, sink, vibration, None)
     }
 
     /// As [`Self::start`]. Publishing a prediction fails once a reader has left `max_unanswered` of them
-    /// unacknowledged.
+    /// unacknowledged. With `waveform`, samples are received too.
     fn start_with(
         options: &Ros2Options,
         parameters: Parameters,
         max_unanswered: i32,
         sink: impl FnMut(Received<OperatingPoint>) + Send + 'static,
         vibration: impl FnMut(Received<Vibration>) + Send + 'static,
+        waveform: Option<WaveformSink>,
     ) -> Result<Self, Ros2Error> {
         let started = Arc::new(AtomicBool::new(false));
         let mut link = Link::join(options, NODE_NAME, parameters.declare(Arc::clone(&started)))?;
@@ -200,11 +209,22 @@ impl Ros2 {
             link.publisher(topic::SENSITIVITY, ours("Sensitivity"), Durability::Volatile, MAX_UNANSWERED)?;
         let diagnostics_type = MessageTypeName::new("diagnostic_msgs", "DiagnosticArray");
         let diagnostics = link.publisher(topic::DIAGNOSTICS, diagnostics_type, Durability::Volatile, MAX_UNANSWERED)?;
-        let vibration = link.aside(topic::VIBRATION, ours("Vibration"), vibration)?;
+        let heard = link.publisher(topic::HEARD, ours("Heard"), Durability::Volatile, MAX_UNANSWERED)?;
+        let vibration = link.aside(topic::VIBRATION, ours("Vibration"), MAX_WAITING, vibration, Arc::default())?;
+        let waveform_counters = Arc::<Counters>::default();
+        let counters = waveform_counters.clone();
+        let waveform = waveform
+            .map(|sink| link.aside(topic::WAVEFORM, ours("Waveform"), MAX_BLOCKS_WAITING, sink, counters))
+            .transpose()?;
         let beats = Arc::new(AtomicU64::new(0));
         let beating = beats.clone();
         let aside = Box::pin(async move {
-            tokio::join!(vibration, beat(&beating));
+            let waveform = async {
+                if let Some(waveform) = waveform {
+                    waveform.await;
+                }
+            };
+            tokio::join!(vibration, waveform, beat(&beating));
         });
         link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink, Some(aside))?;
         started.store(true, Ordering::Release);
@@ -216,6 +236,8 @@ impl Ros2 {
             session_event,
             sensitivity,
             diagnostics,
+            heard,
+            waveform_counters,
             beats,
             link,
         })
@@ -284,6 +306,14 @@ impl Ros2 {
         publish(&self.diagnostics, topic::DIAGNOSTICS, diagnostics)
     }
 
+    /// Publishes a squeal found in sound.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn publish_heard(&self, heard: &Heard) -> Result<(), Ros2Error> {
+        publish(&self.heard, topic::HEARD, heard)
+    }
+
     /// Number of readers of the predictions, including killed ones whose lease has not expired. A [`Ros2Source`] counts
     /// twice: it has a reliable and a best-effort reader.
     pub fn prediction_readers(&self) -> usize {
@@ -299,8 +329,9 @@ impl Ros2 {
             Topic::SessionEvent => self.session_event.get_subscription_count(node),
             Topic::Sensitivity => self.sensitivity.get_subscription_count(node),
             Topic::Diagnostics => self.diagnostics.get_subscription_count(node),
+            Topic::Heard => self.heard.get_subscription_count(node),
             // Published by the rig.
-            Topic::OperatingPoint | Topic::Vibration => 0,
+            Topic::OperatingPoint | Topic::Vibration | Topic::Waveform => 0,
         }
     }
 
@@ -313,6 +344,11 @@ impl Ros2 {
     /// Counts of operating points so far.
     pub fn counts(&self) -> Counts {
         self.link.counts()
+    }
+
+    /// Counts of the blocks of samples so far. Blocks have no sequence numbers: their stamps show what is missing.
+    pub fn waveform_counts(&self) -> Counts {
+        self.waveform_counters.counts()
     }
 
     /// A counter that grows ten times a second while the receiving thread is running.
@@ -329,10 +365,11 @@ impl Ros2 {
     pub fn stop(self) {}
 }
 
-/// The rig's side: publishes operating points and measured vibration, receives predictions.
+/// The rig's side: publishes operating points, measured vibration and samples, receives predictions.
 pub struct Ros2Source {
     operating_point: Publisher<OperatingPoint>,
     vibration: Publisher<Vibration>,
+    waveform: Publisher<Waveform>,
     link: Link<Prediction>,
 }
 
@@ -350,8 +387,9 @@ impl Ros2Source {
         let operating_point =
             link.publisher(topic::OPERATING_POINT, ours("OperatingPoint"), Durability::Volatile, MAX_UNANSWERED)?;
         let vibration = link.publisher(topic::VIBRATION, ours("Vibration"), Durability::Volatile, MAX_UNANSWERED)?;
+        let waveform = link.publisher(topic::WAVEFORM, ours("Waveform"), Durability::Volatile, MAX_BLOCKS_WAITING)?;
         link.listen(topic::PREDICTION, ours("Prediction"), |prediction| prediction.input_seq, sink, None)?;
-        Ok(Self { operating_point, vibration, link })
+        Ok(Self { operating_point, vibration, waveform, link })
     }
 
     /// Publishes an operating point without blocking.
@@ -368,6 +406,19 @@ impl Ros2Source {
     /// [`Ros2Error::Publish`].
     pub fn publish_vibration(&self, vibration: &Vibration) -> Result<(), Ros2Error> {
         publish(&self.vibration, topic::VIBRATION, vibration)
+    }
+
+    /// Publishes a block of samples without blocking.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn publish_waveform(&self, waveform: &Waveform) -> Result<(), Ros2Error> {
+        publish(&self.waveform, topic::WAVEFORM, waveform)
+    }
+
+    /// Number of readers of the samples, including killed ones whose lease has not expired. A node counts twice.
+    pub fn waveform_readers(&self) -> usize {
+        self.waveform.get_subscription_count(self.link.node())
     }
 
     /// Number of readers of the operating points, including killed ones whose lease has not expired. A node counts

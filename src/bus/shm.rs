@@ -15,7 +15,7 @@ use iceoryx2::port::listener::{Listener, ListenerCreateError};
 use iceoryx2::port::notifier::{Notifier, NotifierCreateError, NotifierNotifyError};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
-use iceoryx2::port::{ReceiveError, SendError};
+use iceoryx2::port::{LoanError, ReceiveError, SendError};
 use iceoryx2::prelude::*;
 use iceoryx2::service::builder::event::{EventCreateError, EventOpenError, EventOpenOrCreateError};
 use iceoryx2::service::builder::publish_subscribe::{
@@ -28,10 +28,12 @@ use thiserror::Error;
 use super::Bus;
 use super::received::{Counters, Counts, Gaps, Received};
 use super::shm_place;
-use crate::msgs::shm::{Form, FormError, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm};
+use crate::msgs::shm::{
+    Form, FormError, HeardForm, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm,
+};
 
 /// The ports may be used from any thread; peers with single-threaded ports can connect to them.
-type Ipc = ipc_threadsafe::Service;
+pub(super) type Ipc = ipc_threadsafe::Service;
 
 /// Receives operating points: the node's input.
 pub type ShmInput = ShmReader<OperatingPointForm>;
@@ -47,12 +49,16 @@ pub type ShmSource = ShmWriter<OperatingPointForm>;
 pub type ShmVibrationInput = ShmReader<VibrationForm>;
 /// Publishes the measured vibration.
 pub type ShmVibrationSource = ShmWriter<VibrationForm>;
+/// Publishes squeals found in sound.
+pub type ShmHeard = ShmWriter<HeardForm>;
+/// Receives squeals found in sound.
+pub type ShmHeardSink = ShmReader<HeardForm>;
 /// Receives predictions.
 pub type ShmSink = ShmReader<PredictionForm>;
 
-const MAX_PUBLISHERS: usize = 8;
+pub(super) const MAX_PUBLISHERS: usize = 8;
 const MAX_SUBSCRIBERS: usize = 32;
-const MAX_NODES: usize = 64;
+pub(super) const MAX_NODES: usize = 64;
 const HISTORY_SAMPLES: usize = 16;
 
 /// Interval at which a reader without events checks for samples and for the request to stop.
@@ -107,6 +113,8 @@ pub enum ShmError {
     ReaderGone,
     #[error(transparent)]
     Form(#[from] FormError),
+    #[error("no memory for a sample of {service}: {source:?}")]
+    Loan { service: String, source: LoanError },
     #[error("sample not sent on {service}: {source:?}")]
     Send { service: String, source: SendError },
     #[error("sample sent on {service}, but its readers were not woken: {source:?}")]
@@ -157,13 +165,17 @@ impl<F: Form> ShmWriter<F> {
             .publisher
             .send_copy(form)
             .map_err(|source| ShmError::Send { service: self.service.clone(), source })?;
-        match self.notifier.notify() {
-            // The creator of the service may have set a deadline; the readers were woken nevertheless.
-            Ok(_) | Err(NotifierNotifyError::MissedDeadline | NotifierNotifyError::UnableToAcquireElapsedTime) => {
-                Ok(readers)
-            }
-            Err(source) => Err(ShmError::Notify { service: self.service.clone(), source }),
-        }
+        wake(&self.notifier, &self.service)?;
+        Ok(readers)
+    }
+}
+
+/// Wakes the readers of a service.
+pub(super) fn wake(notifier: &Notifier<Ipc>, service: &str) -> Result<(), ShmError> {
+    match notifier.notify() {
+        // The creator of the service may have set a deadline; the readers were woken nevertheless.
+        Ok(_) | Err(NotifierNotifyError::MissedDeadline | NotifierNotifyError::UnableToAcquireElapsedTime) => Ok(()),
+        Err(source) => Err(ShmError::Notify { service: service.to_owned(), source }),
     }
 }
 
@@ -187,9 +199,7 @@ impl<F: Form> ShmWriter<F> {
 /// Receives messages over shared memory on its own thread, until it is stopped or dropped.
 #[derive(Debug)]
 pub struct ShmReader<F: Form> {
-    stop: Arc<AtomicBool>,
-    counters: Arc<Counters>,
-    thread: Option<JoinHandle<()>>,
+    thread: ReadingThread,
     _form: std::marker::PhantomData<fn() -> F>,
 }
 
@@ -213,48 +223,95 @@ impl<F: Form> ShmReader<F> {
     /// Errors of iceoryx2.
     pub fn spawn_with_backlog(
         options: &ShmOptions,
-        sink: impl FnMut(Received<F::Message>, bool) + Send + 'static,
+        mut sink: impl FnMut(Received<F::Message>, bool) + Send + 'static,
     ) -> Result<Self, ShmError> {
         let node = new_node(options)?;
         let Services { service, topic, event } = Services::<F>::open(&node, options)?;
         // The listener is created first, so that every later sample wakes the thread.
-        let listener = event
-            .listener_builder()
-            .create()
-            .map_err(|source| ShmError::Listener { service: service.clone(), source })?;
+        let listener = new_listener(&event, &service)?;
         let subscriber = topic
             .subscriber_builder()
             .create()
             .map_err(|source| ShmError::Subscriber { service: service.clone(), source })?;
-
-        let stop = Arc::new(AtomicBool::new(false));
-        let counters = Arc::new(Counters::default());
-        let (ready, is_ready) = crossbeam_channel::bounded(1);
-        let reading = Reading {
-            node,
-            subscriber,
-            stop: Arc::clone(&stop),
-            counters: Arc::clone(&counters),
-            gaps: Gaps::new(),
-            sink,
-        };
-        let thread = thread::Builder::new()
-            .name(format!("shm {}", F::SERVICE.rsplit('/').next().unwrap_or(F::SERVICE)))
-            .spawn(move || reading.run(&listener, &ready))?;
-        is_ready.recv().unwrap_or(Err(ShmError::ReaderGone))?;
-        Ok(Self { stop, counters, thread: Some(thread), _form: std::marker::PhantomData })
+        let mut gaps = Gaps::new();
+        let thread = ReadingThread::spawn(F::SERVICE, node, listener, move |counters| {
+            drain(&subscriber, &mut gaps, &mut sink, counters)
+        })?;
+        Ok(Self { thread, _form: std::marker::PhantomData })
     }
 
     /// The counts so far.
     pub fn counts(&self) -> Counts {
-        self.counters.counts()
+        self.thread.counts()
     }
 
     /// Stops the thread and waits for it, at most 50 ms plus the time of the sink. Dropping does the same.
     pub fn stop(self) {}
 }
 
-impl<F: Form> Drop for ShmReader<F> {
+/// Passes a sample to the sink, copied and released at once, because a reader may hold only a few. Returns whether there
+/// was one.
+fn drain<F: Form>(
+    subscriber: &Subscriber<Ipc, F, ()>,
+    gaps: &mut Gaps<u128>,
+    sink: &mut impl FnMut(Received<F::Message>, bool),
+    counters: &Counters,
+) -> bool {
+    let (publisher, form) = match subscriber.receive() {
+        Ok(Some(sample)) => (sample.origin().value(), *sample.payload()),
+        Ok(None) => return false,
+        Err(ReceiveError::ExceedsMaxBorrows | ReceiveError::ConnectionFailure(_)) => {
+            counters.failure();
+            return false;
+        }
+    };
+    let missed = gaps.note(publisher, form.seq());
+    match form.to_message() {
+        Ok(message) => {
+            counters.received(missed);
+            let more_waits = subscriber.has_samples().unwrap_or(true);
+            sink(Received::now(Bus::Shm, message), more_waits);
+        }
+        Err(_) => counters.malformed(),
+    }
+    true
+}
+
+/// A thread that sleeps until an event wakes it and then takes all samples. It ends when this is dropped, at most 50 ms
+/// plus the time of its sink later.
+#[derive(Debug)]
+pub(super) struct ReadingThread {
+    stop: Arc<AtomicBool>,
+    counters: Arc<Counters>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl ReadingThread {
+    /// Starts the thread, which calls `take` for a sample until it returns that there is none.
+    pub(super) fn spawn(
+        service: &'static str,
+        node: Node<Ipc>,
+        listener: Listener<Ipc>,
+        take: impl FnMut(&Counters) -> bool + Send + 'static,
+    ) -> Result<Self, ShmError> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let counters = Arc::new(Counters::default());
+        let (ready, is_ready) = crossbeam_channel::bounded(1);
+        let reading = Reading { node, stop: Arc::clone(&stop), counters: Arc::clone(&counters), take };
+        let thread = thread::Builder::new()
+            .name(format!("shm {}", service.rsplit('/').next().unwrap_or(service)))
+            .spawn(move || reading.run(&listener, &ready))?;
+        is_ready.recv().unwrap_or(Err(ShmError::ReaderGone))?;
+        Ok(Self { stop, counters, thread: Some(thread) })
+    }
+
+    /// The counts so far.
+    pub(super) fn counts(&self) -> Counts {
+        self.counters.counts()
+    }
+}
+
+impl Drop for ReadingThread {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
@@ -265,16 +322,15 @@ impl<F: Form> Drop for ShmReader<F> {
 }
 
 /// State of the reading thread.
-struct Reading<F: Form, S> {
-    subscriber: Subscriber<Ipc, F, ()>,
+struct Reading<T> {
+    take: T,
     stop: Arc<AtomicBool>,
     counters: Arc<Counters>,
-    gaps: Gaps<u128>,
-    sink: S,
+    // Declared last, because the port in `take` must be dropped before its node.
     node: Node<Ipc>,
 }
 
-impl<F: Form, S: FnMut(Received<F::Message>, bool)> Reading<F, S> {
+impl<T: FnMut(&Counters) -> bool> Reading<T> {
     fn run(mut self, listener: &Listener<Ipc>, ready: &crossbeam_channel::Sender<Result<(), ShmError>>) {
         let wait_set = match WaitSetBuilder::new().signal_handling_mode(SignalHandlingMode::Disabled).create::<Ipc>() {
             Ok(wait_set) => wait_set,
@@ -317,29 +373,16 @@ impl<F: Form, S: FnMut(Received<F::Message>, bool)> Reading<F, S> {
         }
     }
 
-    /// Passes all available samples to the sink. Each is copied and released at once, because a reader may hold only a
-    /// few.
+    /// Takes all available samples.
     fn drain(&mut self) {
-        while !self.stop.load(Ordering::Acquire) {
-            let (publisher, form) = match self.subscriber.receive() {
-                Ok(Some(sample)) => (sample.origin().value(), *sample.payload()),
-                Ok(None) => return,
-                Err(ReceiveError::ExceedsMaxBorrows | ReceiveError::ConnectionFailure(_)) => {
-                    self.counters.failure();
-                    return;
-                }
-            };
-            let missed = self.gaps.note(publisher, form.seq());
-            match form.to_message() {
-                Ok(message) => {
-                    self.counters.received(missed);
-                    let more_waits = self.subscriber.has_samples().unwrap_or(true);
-                    (self.sink)(Received::now(Bus::Shm, message), more_waits);
-                }
-                Err(_) => self.counters.malformed(),
-            }
-        }
+        while !self.stop.load(Ordering::Acquire) && (self.take)(&self.counters) {}
     }
+}
+
+/// A listener for the events of a service.
+pub(super) fn new_listener(event: &event::PortFactory<Ipc>, service: &str) -> Result<Listener<Ipc>, ShmError> {
+    let created = event.listener_builder().create();
+    created.map_err(|source| ShmError::Listener { service: service.to_owned(), source })
 }
 
 /// A topic and its event service.
@@ -361,7 +404,7 @@ impl<F: Form> Services<F> {
     }
 }
 
-fn new_node(options: &ShmOptions) -> Result<Node<Ipc>, ShmError> {
+pub(super) fn new_node(options: &ShmOptions) -> Result<Node<Ipc>, ShmError> {
     // iceoryx2 would log to the terminal, which may show a table. All errors are returned to the caller.
     static QUIET: Once = Once::new();
     QUIET.call_once(|| set_log_level_from_env_or(LogLevel::Fatal));
@@ -400,7 +443,10 @@ fn open_topic<F: Form>(
 }
 
 /// Opens the event service with the settings it has, or creates it with ours.
-fn open_event(node: &Node<Ipc>, name: &ServiceName) -> Result<event::PortFactory<Ipc>, EventOpenOrCreateError> {
+pub(super) fn open_event(
+    node: &Node<Ipc>,
+    name: &ServiceName,
+) -> Result<event::PortFactory<Ipc>, EventOpenOrCreateError> {
     match node.service_builder(name).event().open() {
         Ok(event) => Ok(event),
         Err(EventOpenError::DoesNotExist) => node
@@ -416,7 +462,7 @@ fn open_event(node: &Node<Ipc>, name: &ServiceName) -> Result<event::PortFactory
 }
 
 /// Whether another process is creating or removing the topic at this moment.
-fn topic_in_flux(error: &PublishSubscribeOpenOrCreateError) -> bool {
+pub(super) fn topic_in_flux(error: &PublishSubscribeOpenOrCreateError) -> bool {
     use PublishSubscribeCreateError as Create;
     use PublishSubscribeOpenError as Open;
     use PublishSubscribeOpenOrCreateError as Error;
@@ -437,7 +483,7 @@ fn topic_in_flux(error: &PublishSubscribeOpenOrCreateError) -> bool {
 }
 
 /// Whether another process is creating or removing the event service at this moment.
-fn event_in_flux(error: &EventOpenOrCreateError) -> bool {
+pub(super) fn event_in_flux(error: &EventOpenOrCreateError) -> bool {
     use EventCreateError as Create;
     use EventOpenError as Open;
     use EventOpenOrCreateError as Error;
@@ -457,7 +503,7 @@ fn event_in_flux(error: &EventOpenOrCreateError) -> bool {
     }
 }
 
-fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, passes: impl Fn(&E) -> bool) -> Result<T, E> {
+pub(super) fn retry<T, E>(mut attempt: impl FnMut() -> Result<T, E>, passes: impl Fn(&E) -> bool) -> Result<T, E> {
     for _ in 1..OPEN_ATTEMPTS {
         match attempt() {
             Err(error) if passes(&error) => thread::sleep(OPEN_RETRY),

@@ -5,9 +5,10 @@ use std::sync::Arc;
 use super::Bus;
 use super::connection::{BusError, Connection, Outgoing, Report, Sink};
 use super::shm::{
-    ShmError, ShmInput, ShmOptions, ShmOutput, ShmSensitivity, ShmSource, ShmVibrationInput, ShmVibrationSource,
-    ShmWriter,
+    ShmError, ShmHeard, ShmInput, ShmOptions, ShmOutput, ShmSensitivity, ShmSource, ShmVibrationInput,
+    ShmVibrationSource, ShmWriter,
 };
+use super::shm_waveform::{ShmWaveformInput, ShmWaveformSource};
 use crate::msgs::schema::Topic;
 use crate::msgs::shm::Form;
 
@@ -18,12 +19,15 @@ pub struct ShmConnection {
     sensitivities: Option<ShmSensitivity>,
     operating_points: Option<ShmSource>,
     vibrations: Option<ShmVibrationSource>,
+    waveforms: Option<ShmWaveformSource>,
+    heard: Option<ShmHeard>,
     inputs: Option<ShmInput>,
     vibration_inputs: Option<ShmVibrationInput>,
+    waveform_inputs: Option<ShmWaveformInput>,
 }
 
 impl ShmConnection {
-    /// The ports of a node: publishes predictions and sensitivities, and receives into `sink` if it takes inputs.
+    /// The ports of a node: publishes predictions, sensitivities and squeals found in sound, and receives into `sink` if it takes inputs.
     ///
     /// # Errors
     /// Errors of iceoryx2.
@@ -31,15 +35,18 @@ impl ShmConnection {
         let mut ports = Self {
             predictions: Some(ShmOutput::new(options)?),
             sensitivities: Some(ShmSensitivity::new(options)?),
+            heard: Some(ShmHeard::new(options)?),
             ..Self::default()
         };
         if sink.takes_inputs() {
-            let (inputs, vibrations) = (sink.clone(), sink.clone());
+            let (inputs, vibrations, waveforms) = (sink.clone(), sink.clone(), sink.clone());
             ports.inputs = Some(ShmInput::spawn_with_backlog(options, move |received, more_waits| {
                 inputs.operating_point(received, !more_waits);
             })?);
             ports.vibration_inputs =
                 Some(ShmVibrationInput::spawn(options, move |received| vibrations.vibration(received))?);
+            ports.waveform_inputs =
+                Some(ShmWaveformInput::spawn(options, move |received| waveforms.waveform(received))?);
         }
         Ok(ports)
     }
@@ -66,6 +73,8 @@ impl ShmConnection {
             sensitivities: Some(ShmSensitivity::new(options)?),
             operating_points: Some(ShmSource::new(options)?),
             vibrations: Some(ShmVibrationSource::new(options)?),
+            waveforms: Some(ShmWaveformSource::new(options)?),
+            heard: Some(ShmHeard::new(options)?),
             ..Self::default()
         })
     }
@@ -82,6 +91,13 @@ impl Connection for ShmConnection {
             Outgoing::Prediction(message) => publish(self.predictions.as_ref(), message),
             Outgoing::Sensitivity(message) => publish(self.sensitivities.as_ref(), message),
             Outgoing::Vibration(message) => publish(self.vibrations.as_ref(), message),
+            Outgoing::Heard(message) => publish(self.heard.as_ref(), message),
+            Outgoing::Waveform(message) => {
+                if let Some(waveforms) = &self.waveforms {
+                    waveforms.publish(message)?;
+                }
+                Ok(())
+            }
             // These have no form in shared memory.
             Outgoing::SessionEvent(_) | Outgoing::RigInfo(_) | Outgoing::Diagnostics(_) => Ok(()),
         }
@@ -93,6 +109,8 @@ impl Connection for ShmConnection {
             Topic::Prediction => readers(self.predictions.as_ref()),
             Topic::Sensitivity => readers(self.sensitivities.as_ref()),
             Topic::Vibration => readers(self.vibrations.as_ref()),
+            Topic::Heard => readers(self.heard.as_ref()),
+            Topic::Waveform => self.waveforms.as_ref().map_or(0, ShmWaveformSource::readers),
             Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0,
         }
     }
@@ -110,6 +128,7 @@ impl Connection for ShmConnection {
         };
         Report {
             counts: self.inputs.as_ref().map(ShmInput::counts),
+            waveform_counts: self.waveform_inputs.as_ref().map(ShmWaveformInput::counts),
             warnings: (others > 0).then(warning).into_iter().collect(),
             ..Report::default()
         }

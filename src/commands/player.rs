@@ -76,5 +76,7 @@ fn outgoing(payload: &Payload) -> Outgoing<'_> {
         Payload::Sensitivity(message) => Outgoing::Sensitivity(message),
         Payload::Diagnostics(message) => Outgoing::Diagnostics(message),
         Payload::Vibration(message) => Outgoing::Vibration(message),
+        Payload::Waveform(message) => Outgoing::Waveform(message),
+        Payload::Heard(message) => Outgoing::Heard(message),
     }
 }

@@ -75,7 +75,9 @@ impl Options {
                     | Payload::SessionEvent(_)
                     | Payload::RigInfo(_)
                     | Payload::Sensitivity(_)
-                    | Payload::Diagnostics(_),
+                    | Payload::Diagnostics(_)
+                    | Payload::Waveform(_)
+                    | Payload::Heard(_),
                 )
                 | Recorded::Unreadable(_)
                 | Recorded::Other => return None,

@@ -16,6 +16,7 @@ use crate::msgs::schema::Topic;
 use crate::msgs::{SessionEventKind, Time};
 use crate::node::Watch;
 use crate::offline::verify::{Charts, Verification, verify};
+use crate::offline::verify_sound::{SoundVerification, recorded_settings, verify_sound};
 use crate::recording::message::Payload;
 use crate::recording::pace::{Due, Pacer, Pacing};
 use crate::recording::reader::{Recorded, Recording};
@@ -119,8 +120,13 @@ impl Options {
             note!("damaged: {damage}");
         }
         print(&report(&found, started.elapsed()))?;
+        let sound = verify_sound(&recording, recorded_settings(&recording));
+        if let Some(sound) = &sound {
+            print(&report_sound(sound))?;
+        }
+        let agrees = found.agrees() && sound.is_none_or(|sound| sound.agrees());
         let lost = recording.damage().iter().chain(&found.damage).any(|damage| damage.damage.loses_data);
-        Ok(if found.agrees() && !lost { Outcome::Done } else { Outcome::Differences })
+        Ok(if agrees && !lost { Outcome::Done } else { Outcome::Differences })
     }
 
     fn play(&self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
@@ -223,8 +229,12 @@ impl Options {
                         )
                         | None => {}
                     },
-                    Payload::RigInfo(_) | Payload::Sensitivity(_) | Payload::Diagnostics(_) | Payload::Vibration(_) => {
-                    }
+                    Payload::RigInfo(_)
+                    | Payload::Sensitivity(_)
+                    | Payload::Diagnostics(_)
+                    | Payload::Vibration(_)
+                    | Payload::Waveform(_)
+                    | Payload::Heard(_) => {}
                 }
             }
             let nothing = played.load(Ordering::Relaxed) == 0;
@@ -284,6 +294,19 @@ pub fn recorded_rig(recording: &Recording) -> anyhow::Result<Rig> {
         bail!("the recorded rig has hash {}, expected {hash} of the metadata", rig.content_hash);
     }
     Ok(rig)
+}
+
+fn report_sound(found: &SoundVerification) -> String {
+    let SoundVerification { channels, samples, missing_samples, identical, different, missing, extra, described } =
+        found;
+    let mut text = format!(
+        "sound: {samples} samples of {channels} channels, {missing_samples} missing; messages about squeals: {identical} \
+         identical, {different} different, {missing} missing, {extra} extra\n"
+    );
+    for difference in described {
+        text += &format!("  {difference}\n");
+    }
+    text
 }
 
 fn report(found: &Verification, took: Duration) -> String {

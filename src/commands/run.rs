@@ -6,13 +6,15 @@ use clap::Args;
 
 use super::buses::{BusOptions, NodeStart};
 use super::display::{DisplayOptions, ThresholdOption};
+use super::hear::DetectionArgs;
 use super::{Outcome, live, signals};
 use crate::bus::Sink;
 use crate::bus::ros_args::RosArgs;
 use crate::display::server::{About, Server};
 use crate::files::chart_file::ChartFile;
 use crate::node::status::InputSources;
-use crate::node::{Inlet, Node, Outputs, Watch};
+use crate::node::{Inlet, Node, Outputs, SoundOptions, Watch};
+use crate::offline::verify_sound::settings_metadata;
 use crate::recording::recorder::{Recorder, RecorderConfig, State};
 use crate::rig::{EMBEDDED, Rig};
 use crate::session::Counters;
@@ -50,6 +52,24 @@ pub struct NodeOptions {
     display: DisplayOptions,
     #[command(flatten)]
     threshold: ThresholdOption,
+    #[command(flatten)]
+    sound: SoundArgs,
+}
+
+/// The search for squeal in the samples that are received on /rig/waveform
+#[derive(Clone, Copy, Debug, Args)]
+struct SoundArgs {
+    #[command(flatten)]
+    detection: DetectionArgs,
+    /// Record the received samples too
+    #[arg(long, requires = "record")]
+    record_sound: bool,
+}
+
+impl SoundArgs {
+    fn options(&self) -> SoundOptions {
+        SoundOptions { settings: self.detection.settings(), record_samples: self.record_sound }
+    }
 }
 
 /// Time limit for the recorder to finish its files, so that a signal ends the program within 2 s.
@@ -83,7 +103,8 @@ pub fn serve(
     let buses = buses.resolve(ros_args)?;
     let NodeStart { name: node_name, settings, parameters } = buses.node(Settings::for_rig(rig))?;
     let watch = Watch::default();
-    let (mut node, inlet) = Node::new(rig.clone(), settings, watch.clone());
+    let (node, inlet) = Node::new(rig.clone(), settings, watch.clone());
+    let mut node = node.with_sound(options.sound.options());
     // Before the recording begins, so that it is always finished when a signal arrives.
     let stop = inlet.clone();
     signals::on_stop(move || stop.stop())?;
@@ -105,7 +126,8 @@ pub fn serve(
     }
 
     // The last step that can fail, so that a failed start leaves no recording.
-    let recorder = options.record.as_ref().map(|directory| start_recorder(rig, directory)).transpose()?;
+    let recorder =
+        options.record.as_ref().map(|directory| start_recorder(rig, directory, options.sound.options())).transpose()?;
     let outputs =
         Outputs { buses: joined, recorder: recorder.as_ref().map(Recorder::handle), node_name, ..Outputs::default() };
     let shown = live::show(frame(rig, sources, display.as_ref(), inlet.clone()), watch, options.plain);
@@ -146,6 +168,8 @@ fn frame(rig: &Rig, inputs: Option<InputSources>, display: Option<&Server>, node
                 format!("passed over {passed_over}"),
             ];
             let restarts = snapshot.bus_restarts;
+            let squeals = snapshot.squeals_in_sound;
+            counts.extend((squeals > 0).then(|| format!("squeals in sound {squeals}")));
             counts.extend((restarts > 0).then(|| format!("ROS 2 started again {restarts}")));
             counts
         }),
@@ -153,11 +177,12 @@ fn frame(rig: &Rig, inputs: Option<InputSources>, display: Option<&Server>, node
     }
 }
 
-fn start_recorder(rig: &Rig, directory: &std::path::Path) -> anyhow::Result<Recorder> {
+fn start_recorder(rig: &Rig, directory: &std::path::Path, sound: SoundOptions) -> anyhow::Result<Recorder> {
     let config = RecorderConfig {
         rig_name: rig.name.clone(),
         rig_content_hash: rig.content_hash.clone(),
         rig_files: rig.files.clone(),
+        metadata: settings_metadata(sound.settings),
         ..RecorderConfig::new(directory)
     };
     let recorder = Recorder::start_when_possible(config)?;

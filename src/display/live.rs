@@ -6,10 +6,12 @@ use std::time::{Duration, Instant};
 
 use super::curves::Curves;
 use super::events::{Events, seconds};
+use super::heard::SquealsInSound;
 use super::history::History;
 use super::server::{About, Source};
 use super::shape::shape;
 use super::state::{CountersShown, Shown, State, spread, trend_per_s};
+use crate::msgs::Heard;
 use crate::node::{Sample, VibrationSample, Watch};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
@@ -37,6 +39,8 @@ struct Followed {
     vibrations: Vec<VibrationSample>,
     history: History,
     events: Events,
+    heard: Vec<Heard>,
+    squeals_in_sound: SquealsInSound,
     event_changes: u64,
     /// Number of the last bin in the state sent before.
     sent: i64,
@@ -57,6 +61,8 @@ impl Live {
             vibrations: vec![],
             history: History::new(BIN_NS, BINS),
             events: Events::default(),
+            heard: vec![],
+            squeals_in_sound: SquealsInSound::default(),
             event_changes: 0,
             sent: i64::MIN,
             sent_at: None,
@@ -85,12 +91,17 @@ impl Followed {
         for sample in &self.vibrations {
             self.history.push_vibration(sample);
         }
+        watch.take_heard(&mut self.heard);
+        for heard in &self.heard {
+            self.squeals_in_sound.push(heard, heard.header.stamp.as_ns());
+            self.event_changes += 1;
+        }
         let now = Instant::now();
         self.ticks.push_back((now, self.samples.len()));
         while self.ticks.front().is_some_and(|tick| now - tick.0 > Duration::from_secs(1)) {
             self.ticks.pop_front();
         }
-        !self.samples.is_empty() || !self.vibrations.is_empty()
+        !self.samples.is_empty() || !self.vibrations.is_empty() || !self.heard.is_empty()
     }
 
     fn state(&mut self, watch: &Watch, with_bins: bool) -> String {
@@ -149,6 +160,10 @@ impl Source for Live {
 
     fn events(&self) -> Events {
         self.followed().events.clone()
+    }
+
+    fn squeals_in_sound(&self) -> SquealsInSound {
+        self.followed().squeals_in_sound.clone()
     }
 
     fn map(&self, number: u64) -> Option<Arc<str>> {

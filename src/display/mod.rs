@@ -11,6 +11,7 @@ pub mod comparison;
 mod connections;
 pub mod curves;
 pub mod events;
+pub mod heard;
 pub mod history;
 pub mod live;
 pub mod recorded;

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use super::comparison::{Comparison, Criteria, Measurements};
 use super::curves::Curves;
 use super::events::{Events, seconds};
+use super::heard::SquealsInSound;
 use super::history::History;
 use super::server::{About, Note, Source};
 use super::shape::shape;
@@ -53,6 +54,7 @@ pub struct Recorded {
     pub rig: Arc<Rig>,
     pub history: History,
     pub events: Events,
+    pub squeals_in_sound: SquealsInSound,
     /// The measured vibration.
     pub vibration: Measurements,
     /// The predictions kept, in order; see [`Recorded::stride`].
@@ -87,6 +89,7 @@ impl Recorded {
             rig,
             history: History::coarsening(FIRST_BIN_NS, BINS),
             events: Events::default(),
+            squeals_in_sound: SquealsInSound::default(),
             vibration: Measurements::new(criteria),
             moments: vec![],
             stride: 1,
@@ -135,6 +138,9 @@ impl Recorded {
                     recorded.history.push_vibration(&sample);
                     recorded.vibration.push(&sample);
                 }
+                Content::Known(Payload::Heard(heard)) => {
+                    recorded.squeals_in_sound.push(&heard, line.of_stamp(heard.header.stamp, log_ns));
+                }
                 Content::Known(Payload::Diagnostics(counted)) => recorded.counted = Some(counted),
                 Content::Known(Payload::SessionEvent(event)) => {
                     if SessionEventKind::of(&event) == Some(SessionEventKind::Silence) {
@@ -142,7 +148,7 @@ impl Recorded {
                     }
                     recorded.session_events.push((line.unstamped(log_ns), event));
                 }
-                Content::Known(Payload::RigInfo(_) | Payload::Sensitivity(_))
+                Content::Known(Payload::RigInfo(_) | Payload::Sensitivity(_) | Payload::Waveform(_))
                 | Content::Unreadable(_)
                 | Content::Other => {}
             }
@@ -321,6 +327,10 @@ impl Source for Recorded {
 
     fn events(&self) -> Events {
         self.events.clone()
+    }
+
+    fn squeals_in_sound(&self) -> SquealsInSound {
+        self.squeals_in_sound.clone()
     }
 
     fn comparison(&self) -> Option<Comparison> {

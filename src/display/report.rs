@@ -5,6 +5,7 @@ use std::fmt::Write;
 use super::comparison::{Comparison, Judged, Verdict};
 use super::curves::Curves;
 use super::events::{Event, EventColumn, EventKind, EventMoment, Events, MomentColumn, iso, seconds};
+use super::heard::SquealsInSound;
 use super::recorded::Recorded;
 use crate::figures::html::{escaped, facts, figure, page, section};
 use crate::figures::plot;
@@ -49,6 +50,9 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         ),
     );
     html += &section("Events", &events(&recorded.events, from_s));
+    if recorded.squeals_in_sound.iter().len() > 0 {
+        html += &section("Squeal in sound", &squeals_in_sound(&recorded.squeals_in_sound, from_s));
+    }
     let measured = recorded.comparison().map_or_else(
         || {
             "<p>The recording holds no measured vibration (topic /rig/vibration): nothing to compare with.</p>\n"
@@ -199,6 +203,38 @@ fn events(events: &Events, from_s: f64) -> String {
     html += "</tbody></table>\n";
     if count > LISTED {
         let _ = writeln!(html, "<p>{} more in events.csv.</p>", count - LISTED);
+    }
+    html
+}
+
+/// The squeals found in samples while the session ran, and the predictions they were compared with then.
+fn squeals_in_sound(squeals: &SquealsInSound, from_s: f64) -> String {
+    let mut html =
+        "<table><thead><tr><th>channel</th><th>no.</th><th>onset, s</th><th>end, s</th><th>frequency, Hz</th>\
+                    <th>level</th><th>growth, 1/s</th><th>prediction</th><th>mode</th><th>predicted, Hz</th>\
+                    <th>predicted growth, 1/s</th></tr></thead><tbody>\n"
+            .to_owned();
+    for squeal in squeals.iter().take(LISTED) {
+        let cells = [
+            escaped(&squeal.channel),
+            squeal.number.to_string(),
+            format!("{:.3}", squeal.onset_s - from_s),
+            squeal.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - from_s)),
+            format!("{:.1}", squeal.frequency_hz),
+            format!("{:.1} {}", squeal.level_db, squeal.level_unit),
+            optional(squeal.growth_rate_per_s),
+            squeal.verdict.to_owned(),
+            squeal.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
+            optional(squeal.predicted_frequency_hz),
+            optional(squeal.predicted_growth_rate_per_s),
+        ];
+        let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
+        let _ = writeln!(html, "<tr>{cells}</tr>");
+    }
+    html += "</tbody></table>\n";
+    let count = squeals.iter().len();
+    if count > LISTED {
+        let _ = writeln!(html, "<p>{} more in the recording.</p>", count - LISTED);
     }
     html
 }

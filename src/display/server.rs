@@ -29,6 +29,7 @@ use super::assets;
 use super::comparison::Comparison;
 use super::connections::{self, Bounds};
 use super::events::{Events, PageColumn, page_columns};
+use super::heard::SquealsInSound;
 use crate::node::status::InputSources;
 use crate::rig::Rig;
 
@@ -49,6 +50,8 @@ pub trait Source: Send + Sync + 'static {
     fn state(&self, at_s: Option<f64>) -> String;
     fn history(&self) -> String;
     fn events(&self) -> Events;
+    /// The squeals found in samples.
+    fn squeals_in_sound(&self) -> SquealsInSound;
     /// The measured vibration compared with the predictions; `None` without measurements, or while a session is
     /// running.
     fn comparison(&self) -> Option<Comparison> {
@@ -183,6 +186,7 @@ async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Sourc
         .route("/history.json", get(history))
         .route("/events.json", get(events_json))
         .route("/events.csv", get(events_csv))
+        .route("/squeals-in-sound.json", get(squeals_in_sound))
         .route("/comparison.json", get(comparison))
         .route("/map.json", get(map))
         .route("/shape.json", get(shape))
@@ -311,6 +315,10 @@ async fn events_json(Shared(app): Shared<App>) -> Response {
         json(serde_json::to_string(&shown).unwrap_or_default())
     })
     .await
+}
+
+async fn squeals_in_sound(Shared(app): Shared<App>) -> Response {
+    aside(move || json(app.source.squeals_in_sound().to_json())).await
 }
 
 async fn events_csv(Shared(app): Shared<App>) -> Response {

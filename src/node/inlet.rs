@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crossbeam_channel::Sender;
 
+use super::detection::DetectionInlet;
 use super::{Incoming, Worker};
 use crate::bus::{Received, Sink};
 use crate::msgs;
@@ -27,11 +28,17 @@ pub struct Inlet {
     running: Running,
     lost: Arc<AtomicU64>,
     takes_bus_inputs: bool,
+    detection: DetectionInlet,
 }
 
 impl Inlet {
-    pub(super) fn new(queue: Sender<Incoming>, running: Running, lost: Arc<AtomicU64>) -> Self {
-        Self { queue, running, lost, takes_bus_inputs: true }
+    pub(super) fn new(
+        queue: Sender<Incoming>,
+        running: Running,
+        lost: Arc<AtomicU64>,
+        detection: DetectionInlet,
+    ) -> Self {
+        Self { queue, running, lost, takes_bus_inputs: true, detection }
     }
 
     /// The same inlet for buses that deliver parameters only, since the inputs come from this process.
@@ -83,6 +90,10 @@ impl Sink for Inlet {
 
     fn vibration(&self, received: Received<msgs::Vibration>) {
         self.queue_or_lose(Incoming::Vibration(received));
+    }
+
+    fn waveform(&self, received: Received<msgs::Waveform>) {
+        self.detection.waveform(received);
     }
 
     fn parameter(&self, name: &str, value: f64) {

@@ -10,6 +10,7 @@
 //! queues or shared memory without waiting, so it is held no longer than the computation takes. Everything that affects
 //! predictions is recorded in the order in which the session gets it, so that a replay can reproduce it.
 
+mod detection;
 mod inlet;
 mod mapper;
 mod outputs;
@@ -27,6 +28,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
 
+pub use detection::{SoundOptions, channel_of, in_force};
 pub use inlet::Inlet;
 pub use mapper::{kept_chart, yield_to_predictions};
 pub use outputs::{NodeName, Outputs};
@@ -43,6 +45,7 @@ use crate::session::computed::{Request, parameter_record, record_of};
 use crate::session::{Event, Session, map_serves};
 use crate::session::{conditions, settings::Settings};
 use crate::system::clock;
+use detection::DetectionInlet;
 use inlet::Running;
 use mapper::Mapper;
 use sensitivity::Question;
@@ -74,6 +77,8 @@ pub enum Incoming {
     Input(Received<msgs::OperatingPoint>),
     /// A measured vibration received over a bus. It is recorded and shown, and does not affect predictions.
     Vibration(Received<msgs::Vibration>),
+    /// A squeal found in received samples. It is published, recorded and shown, and does not affect predictions.
+    Heard(Box<msgs::Heard>),
     /// A changed setting; its value is already validated.
     Parameter { name: String, value: f64 },
     /// The result of a request of the session, as [`compute`] returns it, with the map in force when it was made.
@@ -94,6 +99,7 @@ pub struct Node {
     sender: Sender<Incoming>,
     queue: Receiver<Incoming>,
     running: Running,
+    detection: detection::Prepared,
 }
 
 /// A session with its backlog, outputs, background computations and statistics.
@@ -122,6 +128,7 @@ struct Worker {
     /// Set when the node ends; stops the thread that builds the chart.
     stopped: Arc<AtomicBool>,
     next_sensitivity: Instant,
+    detection: DetectionInlet,
 }
 
 impl Node {
@@ -129,7 +136,8 @@ impl Node {
     pub fn new(rig: Arc<Rig>, settings: Settings, watch: Watch) -> (Self, Inlet) {
         let (sender, queue) = bounded(QUEUE);
         let (running, lost) = (Running::default(), Arc::<AtomicU64>::default());
-        let inlet = Inlet::new(sender.clone(), running.clone(), lost.clone());
+        let (detection, samples) = detection::Prepared::new();
+        let inlet = Inlet::new(sender.clone(), running.clone(), lost.clone(), samples.clone());
         let worker = Worker {
             session: Session::new(rig.clone(), settings),
             mapper: Mapper::spawn(rig.clone(), sender.clone()),
@@ -148,8 +156,9 @@ impl Node {
             passing_over: false,
             next_diagnostics: Instant::now() + DIAGNOSTICS_EVERY,
             next_sensitivity: Instant::now(),
+            detection: samples,
         };
-        (Self { worker, sender, queue, running }, inlet)
+        (Self { worker, sender, queue, running, detection }, inlet)
     }
 
     /// Builds the chart of the rig in the background, or loads it from the file `kept`. Predictions use the chart as
@@ -159,10 +168,16 @@ impl Node {
         self
     }
 
+    /// Defines what counts as squeal in received samples.
+    pub fn with_sound(mut self, options: SoundOptions) -> Self {
+        self.detection.options = options;
+        self
+    }
+
     /// Runs until [`Incoming::Stop`], then returns the outputs.
     pub fn run(self, outputs: Outputs) -> Outputs {
-        let Self { mut worker, sender, queue, running } = self;
-        drop(sender);
+        let Self { mut worker, sender, queue, running, detection } = self;
+        let detection = detection.start(sender, outputs.recorder.clone());
         worker.outputs = outputs;
         worker.begin();
         let mut next = Next::Wait(worker.deadline());
@@ -181,6 +196,12 @@ impl Node {
             {
                 drop(running);
                 worker.stopped.store(true, Ordering::Relaxed);
+                let lasted = detection.stop();
+                let found = queue.try_iter().filter_map(|item| match item {
+                    Incoming::Heard(heard) => Some(*heard),
+                    _ => None,
+                });
+                found.chain(lasted).for_each(|heard| worker.heard(heard));
                 worker.diagnose(0);
                 return worker.outputs;
             }
@@ -207,6 +228,7 @@ impl Worker {
                     self.input(received);
                 }
                 Some(Incoming::Vibration(received)) => self.vibration(received),
+                Some(Incoming::Heard(heard)) => self.heard(*heard),
                 Some(Incoming::Parameter { name, value }) => self.parameter(name, value),
                 Some(Incoming::Computed { request, map, result }) => self.computed(&request, map.as_ref(), result),
                 Some(Incoming::Sensitivity(found)) => self.sensitivity(*found),
@@ -314,6 +336,12 @@ impl Worker {
             self.watch.vibration(received.at.wall_ns, &vibration);
             self.outputs.record(received.at, Payload::Vibration(vibration));
         }
+    }
+
+    /// Publishes, shows and records a squeal found in received samples.
+    fn heard(&mut self, heard: msgs::Heard) {
+        self.watch.heard(&heard);
+        self.outputs.heard(heard);
     }
 
     fn parameter(&mut self, name: String, value: f64) {
@@ -442,6 +470,7 @@ impl Worker {
                     }
                     self.outputs.record_prediction(prediction);
                     self.watch.prediction(prediction);
+                    self.detection.predicted(prediction);
                 }
                 match effects.request {
                     Some(Request::Map(point)) => self.mapper.request_map(point),
@@ -460,7 +489,9 @@ impl Worker {
     fn diagnose(&mut self, queued: usize) {
         let counters = self.session.counters();
         let pending = self.mapper.pending();
-        let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, &mut self.outputs);
+        let sound = self.detection.report();
+        let outputs = &mut self.outputs;
+        let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, sound, outputs);
         self.watch.counters(counters, self.statistics.passed_over, self.statistics.restarts);
         self.watch.recording_problem(self.outputs.recorder.as_ref().and_then(|recorder| recorder.status().problem()));
         self.outputs.diagnostics(array);

@@ -3,7 +3,7 @@
 use crate::bus::ros2::NODE_NAME;
 use crate::bus::{Bus, Connection, Outgoing, Report};
 use crate::msgs::schema::Topic;
-use crate::msgs::{DiagnosticArray, Prediction, RigInfo, Sensitivity, SessionEvent};
+use crate::msgs::{DiagnosticArray, Heard, Prediction, RigInfo, Sensitivity, SessionEvent};
 use crate::recording::message::{Message, Payload};
 use crate::recording::recorder::RecorderHandle;
 use crate::system::clock::Reading;
@@ -41,14 +41,19 @@ impl Default for NodeName {
     }
 }
 
+/// As [`Outputs::record`], from any thread.
+pub(super) fn record(recorder: &RecorderHandle, at: Reading, payload: Payload) {
+    let publish_time_ns = u64::try_from(at.wall_ns).unwrap_or(0);
+    // A message that does not fit the recorder's queue is counted there.
+    recorder.record(Message { log_time_ns: at.log_ns(), publish_time_ns, payload });
+}
+
 impl Outputs {
     /// Records a message that was received or made at `at`. Its log time is the monotonic one, its publish time the
     /// wall clock.
     pub fn record(&self, at: Reading, payload: Payload) {
         if let Some(recorder) = &self.recorder {
-            let publish_time_ns = u64::try_from(at.wall_ns).unwrap_or(0);
-            // A message that does not fit the recorder's queue is counted there.
-            recorder.record(Message { log_time_ns: at.log_ns(), publish_time_ns, payload });
+            record(recorder, at, payload);
         }
     }
 
@@ -95,6 +100,11 @@ impl Outputs {
     pub fn diagnostics(&mut self, diagnostics: DiagnosticArray) {
         self.publish(Outgoing::Diagnostics(&diagnostics));
         self.record(Reading::now(), Payload::Diagnostics(diagnostics));
+    }
+
+    pub fn heard(&mut self, heard: Heard) {
+        self.publish(Outgoing::Heard(&heard));
+        self.record(Reading::now(), Payload::Heard(heard));
     }
 
     /// The state of each bus since the last report.

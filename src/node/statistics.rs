@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use super::Outputs;
+use super::detection::SoundReport;
 use super::status::{Inputs, Status};
 use crate::bus::{Bus, Counts, Report};
 use crate::msgs::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
@@ -43,6 +44,7 @@ pub struct Statistics {
     level: Option<u8>,
     /// The losses counted at the last report.
     lost_before: Lost,
+    sound_before: SoundReport,
     times: Vec<Duration>,
 }
 
@@ -128,6 +130,7 @@ impl Statistics {
     }
 
     /// The diagnostics message for the time since the last report.
+    #[expect(clippy::too_many_arguments, reason = "the parts of the node that are reported")]
     pub fn report(
         &mut self,
         header: Header,
@@ -135,6 +138,7 @@ impl Statistics {
         counters: Counters,
         queued: usize,
         map_pending: bool,
+        sound: Option<SoundReport>,
         outputs: &mut Outputs,
     ) -> DiagnosticArray {
         let mut reports = outputs.reports();
@@ -148,6 +152,7 @@ impl Statistics {
             values.push(pair(&format!("{bus}_failures"), counts.failures));
             values.push(pair(&format!("{bus}_incompatible_peers"), counts.incompatible));
         }
+        let sound = sound.map(|sound| self.sound_status(rig, sound, &reports, outputs));
         for (_, report) in &mut reports {
             values.extend(report.values.drain(..).map(|(key, value)| pair(key, value)));
         }
@@ -179,8 +184,64 @@ impl Statistics {
         let hardware_id = rig.name.clone();
         let predictions =
             DiagnosticStatus { level, name: format!("{name}: predictions"), message, hardware_id, values };
-        let status = std::iter::once(predictions).chain(recorder_status(rig, outputs)).collect();
+        let status = std::iter::once(predictions).chain(sound).chain(recorder_status(rig, outputs)).collect();
         DiagnosticArray { header, status }
+    }
+
+    /// The status of the search for squeal in received samples: every interruption since the last report is a warning.
+    fn sound_status(
+        &mut self,
+        rig: &Rig,
+        sound: SoundReport,
+        reports: &[(Bus, Report)],
+        outputs: &Outputs,
+    ) -> DiagnosticStatus {
+        let before = std::mem::replace(&mut self.sound_before, sound.clone());
+        let mut values = vec![
+            pair("blocks_twice", sound.duplicates),
+            pair("blocks_refused", sound.refused),
+            pair("blocks_lost", sound.lost),
+            pair("blocks_not_recorded", sound.unrecorded),
+            pair("squeals_not_published", sound.unpublished),
+        ];
+        for (bus, counts) in reports.iter().filter_map(|(bus, report)| Some((bus.name(), report.waveform_counts?))) {
+            values.push(pair(&format!("{bus}_blocks_missed"), counts.missed));
+            values.push(pair(&format!("{bus}_blocks_malformed"), counts.malformed));
+        }
+        for channel in &sound.channels {
+            let mut push = |what: &str, value: String| values.push(pair(&format!("{}_{what}", channel.name), value));
+            push("sample_rate_hz", channel.sample_rate_hz.to_string());
+            push("samples", channel.samples.to_string());
+            push("missing", channel.missing.to_string());
+            push("repeated", channel.repeated.to_string());
+            push("not_finite", channel.not_finite.to_string());
+            push("squeals", channel.squeals.to_string());
+        }
+        let mut message = format!("channels: {}", sound.channels.len());
+        let mut level = diagnostic_level::OK;
+        let mut warn = |warning: &str| {
+            message += "; ";
+            message += warning;
+            level = diagnostic_level::WARN;
+        };
+        sound.interruptions.iter().for_each(|interruption| warn(interruption));
+        let unnamed = sound.interruption_count - sound.interruptions.len() as u64;
+        for (count, what) in [
+            (unnamed, "further interruptions"),
+            (sound.lost - before.lost, "blocks lost in a full queue"),
+            (sound.unrecorded - before.unrecorded, "blocks not recorded, because the disk is too slow,"),
+            (sound.unpublished - before.unpublished, "squeals lost in a full queue"),
+        ] {
+            if count > 0 {
+                warn(&format!("{what} since the last report: {count}"));
+            }
+        }
+        if sound.refused > before.refused {
+            let why = sound.why_refused.as_deref().unwrap_or("no reason given");
+            warn(&format!("blocks refused since the last report: {}, {why}", sound.refused - before.refused));
+        }
+        let name = format!("{}: sound", outputs.node_name.as_str());
+        DiagnosticStatus { level, name, message, hardware_id: rig.name.clone(), values }
     }
 
     fn values(
@@ -288,7 +349,7 @@ mod tests {
         /// Level and message of the next report.
         fn report(&mut self) -> (u8, String) {
             let Self { statistics, outputs, rig } = self;
-            let mut array = statistics.report(Header::default(), rig, Counters::default(), 0, false, outputs);
+            let mut array = statistics.report(Header::default(), rig, Counters::default(), 0, false, None, outputs);
             let status = array.status.remove(0);
             (status.level, status.message)
         }
@@ -354,7 +415,7 @@ mod tests {
         (1..=100).for_each(|us| reporter.statistics.predicted(Duration::from_micros(us)));
         let Reporter { statistics, outputs, rig } = &mut reporter;
         let mut value = |key: &str| {
-            let array = statistics.report(Header::default(), rig, Counters::default(), 0, false, outputs);
+            let array = statistics.report(Header::default(), rig, Counters::default(), 0, false, None, outputs);
             let found = array.status[0].values.iter().find(|pair| pair.key == key);
             found.map(|pair| pair.value.clone()).expect("there is such a value")
         };
@@ -367,7 +428,8 @@ mod tests {
         let mut reporter = Reporter::new();
         let name = |reporter: &mut Reporter| {
             let Reporter { statistics, outputs, rig } = reporter;
-            statistics.report(Header::default(), rig, Counters::default(), 0, false, outputs).status.remove(0).name
+            let mut array = statistics.report(Header::default(), rig, Counters::default(), 0, false, None, outputs);
+            array.status.remove(0).name
         };
         assert_eq!(name(&mut reporter), "squealcast: predictions");
         reporter.outputs.node_name = super::super::outputs::NodeName::new("/brake1", "left");

@@ -6,7 +6,7 @@ use std::time::Instant;
 use serde::Serialize;
 
 use super::status::{Assessment, Inputs, Status};
-use crate::msgs::{OperatingPoint, Prediction, Vibration, level};
+use crate::msgs::{Heard, OperatingPoint, Prediction, Vibration, heard_state, level};
 use crate::physics::{Ends, NextWindow, StabilityMap};
 use crate::session::{Counters, conditions};
 use crate::system::clock;
@@ -30,6 +30,8 @@ pub struct Snapshot {
     pub passed_over: u64,
     /// Number of restarts of the ROS 2 side.
     pub bus_restarts: u64,
+    /// Number of squeals found in received samples.
+    pub squeals_in_sound: u64,
     /// Why some messages are not recorded.
     pub recording_problem: Option<String>,
 }
@@ -163,6 +165,8 @@ struct Watched {
     samples: Option<Vec<Sample>>,
     /// The measured vibrations for the same follower.
     vibrations: Vec<VibrationSample>,
+    /// The squeals found in samples, for the same follower.
+    heard: Vec<Heard>,
     lost: u64,
 }
 
@@ -187,6 +191,12 @@ impl Watch {
     pub fn take_vibrations(&self, vibrations: &mut Vec<VibrationSample>) {
         vibrations.clear();
         self.with(|watched| std::mem::swap(&mut watched.vibrations, vibrations));
+    }
+
+    /// As [`Watch::take_samples`], for squeals found in samples.
+    pub fn take_heard(&self, heard: &mut Vec<Heard>) {
+        heard.clear();
+        self.with(|watched| std::mem::swap(&mut watched.heard, heard));
     }
 
     fn with<T>(&self, action: impl FnOnce(&mut Watched) -> T) -> T {
@@ -232,6 +242,15 @@ impl Watch {
         self.with(|watched| {
             if watched.samples.is_some() && watched.vibrations.len() < MOST_SAMPLES {
                 watched.vibrations.push(VibrationSample::new(time_ns, vibration));
+            }
+        });
+    }
+
+    pub(super) fn heard(&self, heard: &Heard) {
+        self.with(|watched| {
+            watched.snapshot.squeals_in_sound += u64::from(heard.state == heard_state::BEGAN);
+            if watched.samples.is_some() && watched.heard.len() < MOST_SAMPLES {
+                watched.heard.push(heard.clone());
             }
         });
     }

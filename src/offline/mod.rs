@@ -5,6 +5,7 @@
 
 mod ahead;
 pub mod verify;
+pub mod verify_sound;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -153,7 +153,9 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
                 | Payload::RigInfo(_)
                 | Payload::Sensitivity(_)
                 | Payload::Diagnostics(_)
-                | Payload::Vibration(_),
+                | Payload::Vibration(_)
+                | Payload::Waveform(_)
+                | Payload::Heard(_),
             )
             | Recorded::Unreadable(_)
             | Recorded::Other => {}

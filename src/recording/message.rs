@@ -1,8 +1,8 @@
 //! Recorded messages of all topics of the node.
 
 use crate::msgs::{
-    self, CdrError, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Time, Vibration,
-    schema::Topic,
+    self, CdrError, DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Time,
+    Vibration, Waveform, schema::Topic,
 };
 
 /// The content of a recorded message; its variant determines the topic.
@@ -15,6 +15,8 @@ pub enum Payload {
     Sensitivity(Sensitivity),
     Diagnostics(DiagnosticArray),
     Vibration(Vibration),
+    Waveform(Waveform),
+    Heard(Heard),
 }
 
 impl Payload {
@@ -28,6 +30,8 @@ impl Payload {
             Self::Sensitivity(_) => Topic::Sensitivity,
             Self::Diagnostics(_) => Topic::Diagnostics,
             Self::Vibration(_) => Topic::Vibration,
+            Self::Waveform(_) => Topic::Waveform,
+            Self::Heard(_) => Topic::Heard,
         }
     }
 
@@ -41,6 +45,8 @@ impl Payload {
             Self::Sensitivity(message) => Some(&mut message.header.stamp),
             Self::Diagnostics(message) => Some(&mut message.header.stamp),
             Self::Vibration(message) => Some(&mut message.header.stamp),
+            Self::Waveform(message) => Some(&mut message.header.stamp),
+            Self::Heard(message) => Some(&mut message.header.stamp),
         }
     }
 
@@ -58,6 +64,8 @@ impl Payload {
             Self::Sensitivity(message) => msgs::to_cdr(message),
             Self::Diagnostics(message) => msgs::to_cdr(message),
             Self::Vibration(message) => msgs::to_cdr(message),
+            Self::Waveform(message) => msgs::to_cdr(message),
+            Self::Heard(message) => msgs::to_cdr(message),
         }
     }
 
@@ -75,6 +83,8 @@ impl Payload {
             Topic::Sensitivity => Self::Sensitivity(msgs::from_cdr(cdr)?),
             Topic::Diagnostics => Self::Diagnostics(msgs::from_cdr(cdr)?),
             Topic::Vibration => Self::Vibration(msgs::from_cdr(cdr)?),
+            Topic::Waveform => Self::Waveform(msgs::from_cdr(cdr)?),
+            Topic::Heard => Self::Heard(msgs::from_cdr(cdr)?),
         })
     }
 }

@@ -36,7 +36,7 @@ use worker::Worker;
 pub const FORMAT: u32 = 1;
 
 /// Name of the metadata record in each file. Its keys: `format`, `session_id`, `squealcast_version`, `rig_name`,
-/// `rig_content_hash`, `split_index`, `started_utc`.
+/// `rig_content_hash`, `split_index`, `started_utc`, and of a node `sound_*`, its definition of squeal in samples.
 pub const METADATA_NAME: &str = "squealcast";
 
 /// Capacity of the queue to the recorder, in messages. A node that was stopped and continues receives up to 4096 inputs
@@ -53,6 +53,8 @@ pub struct RecorderConfig {
     pub rig_content_hash: String,
     /// Attached to every file.
     pub rig_files: Vec<RigFile>,
+    /// Further entries of the metadata record.
+    pub metadata: Vec<(String, String)>,
     /// Identifies the recordings of one run.
     pub session_id: String,
     /// File size after which the next file is begun, bytes.
@@ -79,6 +81,7 @@ impl RecorderConfig {
             rig_name: String::new(),
             rig_content_hash: String::new(),
             rig_files: Vec::new(),
+            metadata: Vec::new(),
             session_id: format!("{:032x}", rand::random::<u128>()),
             split_bytes: 1 << 30,
             split_duration: Duration::from_secs(3600),
@@ -274,6 +277,11 @@ impl RecorderHandle {
         };
         dropped.fetch_add(1, Relaxed);
         false
+    }
+
+    /// Number of messages in the queue.
+    pub fn queued(&self) -> usize {
+        self.queue.len()
     }
 
     /// The current status.

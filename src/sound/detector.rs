@@ -117,6 +117,20 @@ struct Stream {
 }
 
 impl Settings {
+    /// The settings by name. Frequencies are in Hz, levels in dB, times in s.
+    pub fn values_mut(&mut self) -> [(&'static str, &mut f64); 7] {
+        let Self { threshold_db, band_hz: [low, high], prominence_db, min_duration_s, bridge_s, gap_s } = self;
+        [
+            ("threshold_db", threshold_db),
+            ("band_low_hz", low),
+            ("band_high_hz", high),
+            ("prominence_db", prominence_db),
+            ("min_duration_s", min_duration_s),
+            ("bridge_s", bridge_s),
+            ("gap_s", gap_s),
+        ]
+    }
+
     /// # Errors
     /// [`DetectorError::Setting`], naming setting, value and limits.
     fn check(&self) -> Result<(), DetectorError> {
@@ -202,6 +216,11 @@ impl Detector {
     /// Counts of received samples.
     pub fn counts(&self) -> &Counts {
         &self.counts
+    }
+
+    /// The interruptions named since the last call. A stream without end is thereby named completely.
+    pub fn take_interruptions(&mut self) -> Vec<Interruption> {
+        std::mem::take(&mut self.counts.named)
     }
 
     fn bin_hz(&self) -> f64 {

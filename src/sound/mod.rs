@@ -4,12 +4,14 @@
 //! - [`spectrum`]: short-time spectra and the tones in them; [`weighting`]: A-weighting.
 //! - [`envelope`]: onset, end and growth of one tone; [`detector`]: squeals in a stream of samples.
 //! - [`matching`]: predictions scored against squeal in sound.
+//! - [`in_force`]: the same while the rig runs, against the prediction in force.
 //! - [`simulated`]: sound with squeals whose properties are known.
 //!
 //! Nothing here reads a file, a bus or a clock; time comes from the stamps of the samples.
 
 pub mod detector;
 pub mod envelope;
+pub mod in_force;
 pub mod matching;
 pub mod simulated;
 pub mod spectrum;

@@ -144,6 +144,7 @@ export function serve(assets, situation, more = {}) {
     "/state.json": () => SITUATIONS[situation],
     "/history.json": () => history(situation),
     "/events.json": () => (situation === "waiting" ? [] : events()),
+    "/squeals-in-sound.json": () => [],
     "/comparison.json": () => null,
     "/map.json": map,
     "/shape.json": (query) => shape(Number(query.get("id"))),

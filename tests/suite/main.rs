@@ -22,6 +22,7 @@ mod full_scipy;
 mod identify;
 mod identities;
 mod layers;
+mod live_sound;
 mod modal_rigs;
 mod neighbours;
 mod non_matching;

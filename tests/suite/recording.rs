@@ -334,6 +334,8 @@ fn others_read_our_recordings() {
                 Payload::Sensitivity(m) => serde_json::to_value(m),
                 Payload::Diagnostics(m) => serde_json::to_value(m),
                 Payload::Vibration(m) => serde_json::to_value(m),
+                Payload::Waveform(m) => serde_json::to_value(m),
+                Payload::Heard(m) => serde_json::to_value(m),
             };
             assert_eq!(theirs["message"], ours.unwrap(), "{reader}");
         }

@@ -135,6 +135,90 @@ fn sensitivities_come_back_whole_in_the_documented_layout() {
     assert_eq!(refused(bad), FormError::Law(2));
 }
 
+fn heard() -> Heard {
+    Heard {
+        header: Header { stamp: Time { sec: 7, nanosec: 8 }, frame_id: String::new() },
+        channel: "microphone".to_owned(),
+        number: 3,
+        state: heard_state::ENDED,
+        end_stamp: Time { sec: 8, nanosec: 9 },
+        cut_at_onset: true,
+        cut_at_end: false,
+        frequency_hz: 1750.25,
+        quantity: heard_quantity::ACCELERATION,
+        level_db: 90.0,
+        peak_level_db: 91.0,
+        prominence_db: 20.0,
+        growth_rate_per_s: 30.0,
+        growth_rate_low_per_s: 29.0,
+        growth_rate_high_per_s: 31.0,
+        harmonic_order: 2,
+        harmonic_of: 1,
+        verdict: heard_verdict::NOT_JUDGED,
+        mode_id: 5,
+        predicted_frequency_hz: 1740.0,
+        predicted_growth_rate_per_s: 33.0,
+        input_seq: u64::MAX,
+        prediction_stamp: Time { sec: 6, nanosec: 5 },
+    }
+}
+
+#[test]
+fn squeals_come_back_whole_in_the_documented_layout() {
+    assert_eq!((size_of::<HeardForm>(), align_of::<HeardForm>()), (264, 8));
+    let places = [
+        offset_of!(HeardForm, prediction_stamp_ns),
+        offset_of!(HeardForm, input_seq),
+        offset_of!(HeardForm, growth_rate_per_s),
+        offset_of!(HeardForm, predicted_growth_rate_per_s),
+        offset_of!(HeardForm, mode_id),
+        offset_of!(HeardForm, state),
+        offset_of!(HeardForm, cut),
+        offset_of!(HeardForm, channel_len),
+        offset_of!(HeardForm, channel),
+    ];
+    assert_eq!(places, [16, 40, 80, 112, 124, 128, 131, 133, 136]);
+    let form = HeardForm::from_message(&heard()).expect("fits");
+    assert_eq!(form.to_message().expect("is one"), heard());
+    let refused = |form: HeardForm| form.to_message().expect_err("is none").to_string();
+    assert_eq!(refused(HeardForm { verdict: 4, ..form }), "verdict 4, expected 0 to 3");
+    assert_eq!(refused(HeardForm { cut: [0, 2], ..form }), "cut_at_end 2, expected 0 to 1");
+    assert_eq!(refused(HeardForm { channel_len: 129, ..form }), "channel has 129 bytes, at most 128 are carried");
+    let bad = Heard { state: 2, ..heard() };
+    assert!(matches!(HeardForm::from_message(&bad), Err(FormError::Value { field: "state", .. })));
+}
+
+#[test]
+fn waveforms_come_back_whole_in_the_documented_layout() {
+    assert_eq!((size_of::<WaveformHeader>(), align_of::<WaveformHeader>()), (200, 8));
+    let places = [
+        offset_of!(WaveformHeader, sample_rate_hz),
+        offset_of!(WaveformHeader, channel_len),
+        offset_of!(WaveformHeader, channel),
+        offset_of!(WaveformHeader, unit),
+        offset_of!(WaveformHeader, sensitivity),
+    ];
+    assert_eq!(places, [8, 16, 24, 152, 168]);
+    let message = Waveform {
+        header: Header { stamp: Time { sec: 7, nanosec: 8 }, frame_id: String::new() },
+        channel: "m".repeat(128),
+        sample_rate_hz: 51_200.0,
+        unit: "m/s²".to_owned(),
+        sensitivity: "100 mV/g".to_owned(),
+        samples: vec![1.5; MAX_WAVEFORM_SAMPLES],
+    };
+    let header = WaveformHeader::from_message(&message).expect("fits");
+    assert_eq!(header.to_message(&message.samples).expect("is one"), message);
+    let long = vec![0.0; MAX_WAVEFORM_SAMPLES + 1];
+    assert_eq!(header.to_message(&long), Err(FormError::SampleCount { found: MAX_WAVEFORM_SAMPLES + 1 }));
+    let mut bad = header;
+    bad.unit[0] = 0xff;
+    assert_eq!(bad.to_message(&[]).expect_err("is none").to_string(), "unit is valid UTF-8 only up to byte 0");
+    let message = Waveform { channel: "m".repeat(300), ..message };
+    let error = WaveformHeader::from_message(&message).expect_err("does not fit").to_string();
+    assert_eq!(error, "channel has 300 bytes, at most 128 are carried");
+}
+
 #[test]
 fn type_names_carry_a_version() {
     let names = unsafe {
@@ -143,10 +227,18 @@ fn type_names_carry_a_version() {
             <PredictionForm as ZeroCopySend>::type_name(),
             <ModeForm as ZeroCopySend>::type_name(),
             <VibrationForm as ZeroCopySend>::type_name(),
+            <WaveformHeader as ZeroCopySend>::type_name(),
+            <HeardForm as ZeroCopySend>::type_name(),
         ]
     };
-    let expected =
-        ["squealcast/OperatingPoint/1", "squealcast/Prediction/2", "squealcast/Mode/1", "squealcast/Vibration/1"];
+    let expected = [
+        "squealcast/OperatingPoint/1",
+        "squealcast/Prediction/2",
+        "squealcast/Mode/1",
+        "squealcast/Vibration/1",
+        "squealcast/Waveform/1",
+        "squealcast/Heard/1",
+    ];
     assert_eq!(names, expected);
 }
 

@@ -27,7 +27,7 @@ impl Ros2NodeConnection {
         parameters: Vec<(String, f64)>,
         sink: &Arc<dyn Sink>,
     ) -> Result<Self, Ros2Error> {
-        let (inputs, vibrations, changes) = (sink.clone(), sink.clone(), sink.clone());
+        let (inputs, vibrations, waveforms, changes) = (sink.clone(), sink.clone(), sink.clone(), sink.clone());
         let sinks = Sinks {
             // The thread that receives from the child process serves all topics: it must not be held up.
             input: Box::new(move |received| {
@@ -38,6 +38,11 @@ impl Ros2NodeConnection {
             vibration: Box::new(move |received| {
                 if vibrations.takes_inputs() {
                     vibrations.vibration(received);
+                }
+            }),
+            waveform: Box::new(move |received| {
+                if waveforms.takes_inputs() {
+                    waveforms.waveform(received);
                 }
             }),
             parameter: Box::new(move |name, value| changes.parameter(name, value)),
@@ -70,8 +75,9 @@ impl Connection for Ros2NodeConnection {
             Outgoing::RigInfo(message) => self.process.publish_rig(message)?,
             Outgoing::Sensitivity(message) => self.process.publish_sensitivity(message)?,
             Outgoing::Diagnostics(message) => self.process.publish_diagnostics(message)?,
+            Outgoing::Heard(message) => self.process.publish_heard(message)?,
             // Published by the rig.
-            Outgoing::OperatingPoint(_) | Outgoing::Vibration(_) => {}
+            Outgoing::OperatingPoint(_) | Outgoing::Vibration(_) | Outgoing::Waveform(_) => {}
         }
         Ok(())
     }
@@ -81,7 +87,13 @@ impl Connection for Ros2NodeConnection {
             Topic::Prediction => self.process.prediction_readers(),
             Topic::Sensitivity => self.process.sensitivity_readers(),
             // The child process does not report readers of these.
-            Topic::OperatingPoint | Topic::Vibration | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0,
+            Topic::OperatingPoint
+            | Topic::Vibration
+            | Topic::Waveform
+            | Topic::SessionEvent
+            | Topic::RigInfo
+            | Topic::Diagnostics
+            | Topic::Heard => 0,
         }
     }
 
@@ -99,6 +111,7 @@ impl Connection for Ros2NodeConnection {
         }
         Report {
             counts: Some(self.process.counts()),
+            waveform_counts: Some(self.process.waveform_counts()),
             encodings_skipped: self.encodings_skipped,
             restarts: now.falls,
             values: vec![
@@ -139,12 +152,14 @@ impl Connection for Ros2Source {
         match message {
             Outgoing::OperatingPoint(message) => Self::publish(self, message)?,
             Outgoing::Vibration(message) => self.publish_vibration(message)?,
+            Outgoing::Waveform(message) => self.publish_waveform(message)?,
             // Published by the node.
             Outgoing::Prediction(_)
             | Outgoing::SessionEvent(_)
             | Outgoing::RigInfo(_)
             | Outgoing::Sensitivity(_)
-            | Outgoing::Diagnostics(_) => {}
+            | Outgoing::Diagnostics(_)
+            | Outgoing::Heard(_) => {}
         }
         Ok(())
     }
@@ -153,7 +168,13 @@ impl Connection for Ros2Source {
         match topic {
             Topic::OperatingPoint => Self::readers(self),
             Topic::Vibration => self.vibration_readers(),
-            Topic::Prediction | Topic::SessionEvent | Topic::RigInfo | Topic::Sensitivity | Topic::Diagnostics => 0,
+            Topic::Waveform => self.waveform_readers(),
+            Topic::Prediction
+            | Topic::SessionEvent
+            | Topic::RigInfo
+            | Topic::Sensitivity
+            | Topic::Diagnostics
+            | Topic::Heard => 0,
         }
     }
 }
@@ -193,6 +214,8 @@ impl Connection for Ros2ReplayConnection {
             Outgoing::RigInfo(message) => self.node.publish_rig(message)?,
             Outgoing::Sensitivity(message) => self.node.publish_sensitivity(message)?,
             Outgoing::Diagnostics(message) => self.node.publish_diagnostics(message)?,
+            Outgoing::Waveform(message) => self.rig.publish_waveform(message)?,
+            Outgoing::Heard(message) => self.node.publish_heard(message)?,
         }
         Ok(())
     }
@@ -203,7 +226,11 @@ impl Connection for Ros2ReplayConnection {
             Topic::OperatingPoint => self.rig.readers().saturating_sub(OWN_READERS),
             Topic::Vibration => self.rig.vibration_readers().saturating_sub(OWN_READERS),
             Topic::Prediction => self.node.readers(topic).saturating_sub(OWN_READERS),
-            Topic::Sensitivity | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => self.node.readers(topic),
+            // The replay itself receives no samples.
+            Topic::Waveform => self.rig.waveform_readers(),
+            Topic::Sensitivity | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics | Topic::Heard => {
+                self.node.readers(topic)
+            }
         }
     }
 }

@@ -12,12 +12,13 @@ use thiserror::Error;
 use super::Ros2Options;
 use crate::bus::received::Counts;
 use crate::msgs::{
-    self, CdrError, DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration,
+    self, CdrError, DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration,
+    Waveform,
 };
 use crate::system::clock::Reading;
 
 /// Longest frame that the node accepts from its ROS 2 side, bytes.
-pub(super) const MAX_FROM_SIDE: usize = 1 << 16;
+pub(super) const MAX_FROM_SIDE: usize = 1 << 17;
 /// Longest frame that the ROS 2 side accepts from its node, bytes.
 pub(super) const MAX_TO_SIDE: usize = 1 << 24;
 const LENGTH_BYTES: usize = 4;
@@ -32,6 +33,7 @@ pub(super) enum ToSide<'a> {
     SessionEvent(Cow<'a, SessionEvent>),
     Sensitivity(Cow<'a, Sensitivity>),
     Diagnostics(Cow<'a, DiagnosticArray>),
+    Heard(Cow<'a, Heard>),
 }
 
 /// How the ROS 2 side joins the network.
@@ -57,6 +59,10 @@ pub(super) enum FromSide {
         at: Reading,
         message: Vibration,
     },
+    Waveform {
+        at: Reading,
+        message: Waveform,
+    },
     /// A peer set a parameter to a value that passed validation.
     Parameter {
         name: String,
@@ -73,6 +79,8 @@ pub(super) struct Status {
     pub sensitivity_readers: u64,
     pub operating_point_writers: u64,
     pub counts: Counts,
+    /// Counts of the blocks of samples.
+    pub waveform_counts: Counts,
     /// Messages that DDS refused to publish, and the latest reason.
     pub refused: u64,
     pub last_refusal: String,

@@ -24,7 +24,9 @@ use crate::msgs::topic;
 /// Samples that may wait for the thread that reads a subscription; RustDDS acknowledges samples beyond it and drops
 /// them. After a loss a reliable subscription delivers nothing until the sample is retransmitted, and then everything
 /// at once. Fast DDS retransmits with its next heartbeat, by default after 3 s: at 2 kHz, 6000 samples wait for that.
-const MAX_WAITING: i32 = 8192;
+pub(super) const MAX_WAITING: i32 = 8192;
+/// As [`MAX_WAITING`], of blocks of samples: at most 64 MiB.
+pub(super) const MAX_BLOCKS_WAITING: i32 = 1024;
 /// Messages that a reader may leave unacknowledged before publishing fails. A killed reader is only forgotten after its
 /// lease, usually less than a minute. RustDDS's default of 8192 would be exhausted after 16 s at 500 Hz, for all
 /// readers.
@@ -116,7 +118,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         sink: impl FnMut(Received<M>) + Send + 'static,
         aside: Option<Hearing>,
     ) -> Result<(), Ros2Error> {
-        let subscriptions = Arc::new(self.subscribe::<M>(topic, &kind)?);
+        let subscriptions = Arc::new(self.subscribe::<M>(topic, &kind, MAX_WAITING)?);
         let failed = |reason: String| Ros2Error::Topic { name: topic.to_owned(), reason };
         let spinner = self.node.spinner().map_err(|e| failed(e.to_string()))?;
 
@@ -150,16 +152,18 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
     }
 
     /// Adds a subscription to another topic, whose messages have no sequence numbers, to the thread of
-    /// [`Link::listen`]. Its messages are not counted.
+    /// [`Link::listen`]. At most `max_waiting` messages wait for it.
     pub(super) fn aside<N: DeserializeOwned + Send + Sync + 'static>(
         &mut self,
         topic: &'static str,
         kind: MessageTypeName,
+        max_waiting: i32,
         sink: impl FnMut(Received<N>) + Send + 'static,
+        counters: Arc<Counters>,
     ) -> Result<Hearing, Ros2Error> {
-        let subscriptions = self.subscribe::<N>(topic, &kind)?;
+        let subscriptions = self.subscribe::<N>(topic, &kind, max_waiting)?;
         Ok(Box::pin(async move {
-            hear(&subscriptions, |_| 0, sink, &Counters::default()).await;
+            hear(&subscriptions, |_| 0, sink, &counters).await;
         }))
     }
 
@@ -167,10 +171,11 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         &mut self,
         topic: &'static str,
         kind: &MessageTypeName,
+        max_waiting: i32,
     ) -> Result<Subscriptions<N>, Ros2Error> {
-        let requested = qos(Durability::Volatile, RELIABLE, MAX_WAITING).build();
+        let requested = qos(Durability::Volatile, RELIABLE, max_waiting).build();
         let (reliable, name) = self.topic(topic, kind, &requested)?;
-        let least = qos(Durability::Volatile, Reliability::BestEffort, MAX_WAITING).build();
+        let least = qos(Durability::Volatile, Reliability::BestEffort, max_waiting).build();
         let (best_effort, _) = self.topic(topic, kind, &least)?;
         self.conflicts.subscribed(&best_effort, &name);
         let failed =

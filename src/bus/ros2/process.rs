@@ -21,7 +21,9 @@ use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide,
 use super::{NOTE, Ros2Error, Ros2Options};
 use crate::bus::Bus;
 use crate::bus::received::{Counts, Received};
-use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, topic};
+use crate::msgs::{
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, Waveform, topic,
+};
 
 /// The command that runs the ROS 2 side of a node.
 pub const COMMAND: &str = "ros2-side";
@@ -55,6 +57,7 @@ type ParameterSink = Box<dyn FnMut(&str, f64) + Send>;
 pub struct Sinks {
     pub input: Box<dyn FnMut(Received<OperatingPoint>) + Send>,
     pub vibration: Box<dyn FnMut(Received<Vibration>) + Send>,
+    pub waveform: Box<dyn FnMut(Received<Waveform>) + Send>,
     /// A peer set a parameter.
     pub parameter: ParameterSink,
     /// The ROS 2 side failed, and why; it is being restarted.
@@ -76,7 +79,7 @@ pub struct Health {
     pub process_id: u32,
 }
 
-/// The ROS 2 side of a node: receives operating points and the measured vibration, and publishes all other topics.
+/// The ROS 2 side of a node: receives operating points, the measured vibration and samples, and publishes all other topics.
 pub struct Ros2Process {
     /// `None` once it has to end.
     queue: Option<Sender<Vec<u8>>>,
@@ -97,6 +100,7 @@ struct Seen {
     status: Status,
     /// Counts of the previous processes.
     counts_before: Counts,
+    waveform_counts_before: Counts,
     refused_before: u64,
     full_name: String,
     /// The rig message, sent to every new process for its late subscribers.
@@ -198,6 +202,14 @@ impl Ros2Process {
         self.send(topic::DIAGNOSTICS, &ToSide::Diagnostics(Cow::Borrowed(diagnostics)))
     }
 
+    /// Publishes a squeal found in sound.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn publish_heard(&self, heard: &Heard) -> Result<(), Ros2Error> {
+        self.send(topic::HEARD, &ToSide::Heard(Cow::Borrowed(heard)))
+    }
+
     /// Number of readers of the predictions, including killed ones whose lease has not expired.
     pub fn prediction_readers(&self) -> usize {
         self.shared.seen().status.prediction_readers as usize
@@ -217,6 +229,12 @@ impl Ros2Process {
     pub fn counts(&self) -> Counts {
         let seen = self.shared.seen();
         seen.counts_before.plus(seen.status.counts)
+    }
+
+    /// Counts of blocks of samples so far, over all processes.
+    pub fn waveform_counts(&self) -> Counts {
+        let seen = self.shared.seen();
+        seen.waveform_counts_before.plus(seen.status.waveform_counts)
     }
 
     /// The current state of the ROS 2 side.
@@ -302,6 +320,7 @@ impl Supervisor {
         let mut seen = self.shared.seen();
         let status = std::mem::take(&mut seen.status);
         seen.counts_before = seen.counts_before.plus(status.counts);
+        seen.waveform_counts_before = seen.waveform_counts_before.plus(status.waveform_counts);
         seen.refused_before += status.refused;
         seen.health.up = false;
         seen.health.falls += 1;
@@ -392,6 +411,7 @@ impl Supervisor {
             FromSide::Refused(_) => {}
             FromSide::Input { at, message } => (self.sinks.input)(Received { bus: Bus::Ros2, at, message }),
             FromSide::Vibration { at, message } => (self.sinks.vibration)(Received { bus: Bus::Ros2, at, message }),
+            FromSide::Waveform { at, message } => (self.sinks.waveform)(Received { bus: Bus::Ros2, at, message }),
             FromSide::Parameter { name, value } => {
                 if let Some(parameter) = self.start.parameters.iter_mut().find(|(known, _)| *known == name) {
                     parameter.1 = value;

@@ -9,7 +9,7 @@ use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::process;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -20,7 +20,7 @@ use serde::Serialize;
 use super::frame::{Frames, FromSide, MAX_TO_SIDE, Next, Start, Status, ToSide, encode};
 use super::{Parameters, Ros2, Ros2Error};
 use crate::bus::received::Received;
-use crate::msgs::Prediction;
+use crate::msgs::{MAX_WAVEFORM_SAMPLES, Prediction};
 use crate::system::memory;
 
 /// Limit on the private memory of this process, bytes (`RLIMIT_DATA`). An allocation beyond it aborts the process.
@@ -32,6 +32,10 @@ const RESIDENT_LIMIT: usize = 128 << 20;
 const QUEUE: usize = 8192;
 /// Largest CDR form of an input or vibration that is passed to the node, bytes. Larger ones count as malformed.
 const MAX_INPUT: usize = 4096;
+/// Largest CDR form of a block of samples that is passed to the node, bytes: its samples and 1024 bytes of text.
+const MAX_BLOCK: usize = 4 * MAX_WAVEFORM_SAMPLES + 1024;
+/// Blocks of samples beyond this are lost while the node is held up, bytes in the queue to it.
+const MAX_BYTES_QUEUED: usize = 32 << 20;
 /// Interval between checks of the numbers of readers and writers.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// Interval between status frames while nothing changes.
@@ -61,9 +65,16 @@ pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Er
     }
     contain()?;
     let (queue, queued) = bounded(QUEUE);
-    let node = ToNode { queue, lost: Arc::default(), malformed: Arc::default() };
-    let to_node = socket.try_clone()?;
-    let writer = thread::Builder::new().name("to node".to_owned()).spawn(move || write(&to_node, &queued))?;
+    let node = ToNode {
+        queue,
+        lost: Arc::default(),
+        malformed: Arc::default(),
+        blocks: Arc::default(),
+        bytes_queued: Arc::default(),
+    };
+    let (to_node, bytes_queued) = (socket.try_clone()?, node.bytes_queued.clone());
+    let writer =
+        thread::Builder::new().name("to node".to_owned()).spawn(move || write(&to_node, &queued, &bytes_queued))?;
     let mut frames = Frames::new(socket.try_clone()?, MAX_TO_SIDE);
     let start = loop {
         match frames.next::<ToSide>().map_err(|error| Ros2Error::Side(error.to_string()))? {
@@ -110,7 +121,7 @@ fn contain() -> io::Result<()> {
 }
 
 fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNode) -> Result<Ros2, Ros2Error> {
-    let (inputs, vibrations, parameters) = (node.clone(), node.clone(), node.clone());
+    let (inputs, vibrations, waveforms, parameters) = (node.clone(), node.clone(), node.clone(), node.clone());
     let parameters = Parameters {
         values: start.parameters,
         validate: Box::new(validate),
@@ -124,6 +135,7 @@ fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNo
         MAX_UNANSWERED,
         move |Received { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }),
         move |Received { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }),
+        Some(Box::new(move |Received { at, message, .. }| waveforms.send_block(&FromSide::Waveform { at, message }))),
     )
 }
 
@@ -134,6 +146,16 @@ struct ToNode {
     lost: Arc<AtomicU64>,
     /// Messages that cannot be encoded as a frame, or only as one that is too long.
     malformed: Arc<AtomicU64>,
+    /// The same of blocks of samples.
+    blocks: Arc<Blocks>,
+    bytes_queued: Arc<AtomicUsize>,
+}
+
+/// Blocks of samples that were not passed to the node.
+#[derive(Default)]
+struct Blocks {
+    lost: AtomicU64,
+    malformed: AtomicU64,
 }
 
 impl ToNode {
@@ -148,18 +170,38 @@ impl ToNode {
 
     fn send_up_to(&self, limit: usize, frame: &impl Serialize) {
         match encode(frame) {
-            Ok(bytes) if bytes.len() <= limit => {
-                let sent = self.queue.try_send(bytes).is_ok();
-                self.lost.fetch_add(u64::from(!sent), Ordering::Relaxed);
-            }
+            Ok(bytes) if bytes.len() <= limit => self.queue(bytes, &self.lost),
             _ => drop(self.malformed.fetch_add(1, Ordering::Relaxed)),
+        }
+    }
+
+    /// Sends a block of samples. Blocks must not fill the memory of this process.
+    fn send_block(&self, frame: &impl Serialize) {
+        match encode(frame) {
+            Ok(bytes) if bytes.len() > MAX_BLOCK => drop(self.blocks.malformed.fetch_add(1, Ordering::Relaxed)),
+            Ok(bytes) if self.bytes_queued.load(Ordering::Relaxed) + bytes.len() <= MAX_BYTES_QUEUED => {
+                self.queue(bytes, &self.blocks.lost);
+            }
+            Ok(_) => drop(self.blocks.lost.fetch_add(1, Ordering::Relaxed)),
+            Err(_) => drop(self.blocks.malformed.fetch_add(1, Ordering::Relaxed)),
+        }
+    }
+
+    fn queue(&self, bytes: Vec<u8>, lost: &AtomicU64) {
+        let length = bytes.len();
+        // Before it is queued: the writer subtracts it.
+        self.bytes_queued.fetch_add(length, Ordering::Relaxed);
+        if self.queue.try_send(bytes).is_err() {
+            self.bytes_queued.fetch_sub(length, Ordering::Relaxed);
+            lost.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
 
 /// Writes the queued frames until all senders are gone. Ends the process if the node has gone.
-fn write(mut socket: &UnixStream, queued: &Receiver<Vec<u8>>) {
+fn write(mut socket: &UnixStream, queued: &Receiver<Vec<u8>>, bytes_queued: &AtomicUsize) {
     for bytes in queued {
+        bytes_queued.fetch_sub(bytes.len(), Ordering::Relaxed);
         if socket.write_all(&bytes).is_err() {
             process::exit(0);
         }
@@ -224,6 +266,7 @@ impl Side {
             ToSide::SessionEvent(message) => self.ros2.publish_session_event(&message),
             ToSide::Sensitivity(message) => self.ros2.publish_sensitivity(&message),
             ToSide::Diagnostics(message) => self.ros2.publish_diagnostics(&message),
+            ToSide::Heard(message) => self.ros2.publish_heard(&message),
         };
         self.count_refusal(published);
     }
@@ -284,7 +327,11 @@ impl Side {
         let mut counts = self.ros2.counts();
         counts.malformed += self.node.malformed.load(Ordering::Relaxed);
         counts.missed += self.node.lost.load(Ordering::Relaxed);
+        let mut waveform_counts = self.ros2.waveform_counts();
+        waveform_counts.malformed += self.node.blocks.malformed.load(Ordering::Relaxed);
+        waveform_counts.missed += self.node.blocks.lost.load(Ordering::Relaxed);
         Status {
+            waveform_counts,
             prediction_readers: self.ros2.prediction_readers() as u64,
             sensitivity_readers: self.ros2.sensitivity_readers() as u64,
             operating_point_writers: self.ros2.operating_point_writers() as u64,

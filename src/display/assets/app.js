@@ -119,7 +119,7 @@ function take(received) {
   if (!recording && state.events !== eventsShown) {
     once("events", async () => {
       const change = state.events;
-      events.show(await ask("events.json"));
+      events.show(...(await Promise.all(["events.json", "squeals-in-sound.json"].map(ask))));
       eventsShown = change;
     });
   }
@@ -213,12 +213,12 @@ if (recording) {
     numbers();
     history.mark(moment);
   });
-  const [whole, all, comparison] = await Promise.all(["history.json", "events.json", "comparison.json"].map(ask));
+  const [whole, all, sound, comparison] = await Promise.all(["history.json", "events.json", "squeals-in-sound.json", "comparison.json"].map(ask));
   history.load(whole);
   const measured = comparison?.measured ?? [];
   timeline.paint(whole, measured);
-  events.show(all, comparison);
-  timeline.events = [...all, ...measured.filter((squeal) => squeal.verdict !== "hit")].sort((a, b) => a.onset_s - b.onset_s);
+  events.show(all, sound, comparison);
+  timeline.events = [...all, ...sound, ...measured.filter((squeal) => squeal.verdict !== "hit")].sort((a, b) => a.onset_s - b.onset_s);
   new ResizeObserver(() => timeline.paint(whole, measured)).observe(at("track-levels"));
   timeline.go(about.span_s[0]);
 } else {

@@ -33,6 +33,12 @@ function ofMoment(event, { name, moment: { decimals, from_onset } }) {
   return from_onset && event.peak && known(from) && known(value) ? `${text(from)} → ${text(value)}` : text(value ?? from);
 }
 
+/** Channel, level and growth of a squeal found in samples. */
+function describe({ channel, level_db, level_unit, growth_rate_per_s }) {
+  const growth = known(growth_rate_per_s) ? `, growth ${fixed(growth_rate_per_s, 1)} 1/s` : "";
+  return `${channel}: ${fixed(level_db, 1)} ${level_unit}${growth}`;
+}
+
 export class Events {
   constructor(about, jump) {
     this.body = document.querySelector("#events tbody");
@@ -44,17 +50,19 @@ export class Events {
     this.notes = (about.notes ?? []).slice(0, MOST_NOTES).map((note) => ({ ...note, kind: note.what, class: "aside" }));
   }
 
-  /** `comparison` is `null` without measurements. */
-  show(events, comparison = null) {
+  /** `sound` are the squeals found in samples; `comparison` is `null` without measurements. */
+  show(events, sound = [], comparison = null) {
+    const heard = sound.map((squeal) => ({ ...squeal, number: undefined, kind: `in sound: ${squeal.verdict}`, class: squeal.verdict === "miss" ? "missed" : "aside", reason: describe(squeal) }));
     const measured = (comparison?.measured ?? []).map((squeal) => ({ ...squeal, kind: VERDICTS[squeal.verdict], class: squeal.verdict === "hit" ? "aside" : "missed" }));
     const alarms = new Set(comparison?.false_alarms);
     const judged = events.map((event) => (alarms.has(event.number) ? { ...event, note: "false alarm" } : event));
-    const shown = [...judged, ...this.notes, ...measured].sort((a, b) => a.onset_s - b.onset_s).slice(-MOST).reverse();
+    const shown = [...judged, ...this.notes, ...measured, ...heard].sort((a, b) => a.onset_s - b.onset_s).slice(-MOST).reverse();
     const counted = ["SQUEAL", "FAULT", "NO DATA"].map((kind) => [kind.toLowerCase(), events.filter((event) => event.kind === kind).length]);
     const counts = counted.filter(([, count]) => count).map(([kind, count]) => `${count} × ${kind}`).join(", ");
     const summary = events.length ? `${counts}${events.length > MOST ? `, the last ${MOST} shown` : ""}` : "none so far";
     const verdict = comparison && `; measured: ${measured.filter((squeal) => squeal.verdict === "hit").length} hits, ${measured.filter((squeal) => squeal.verdict !== "hit").length} misses, ${alarms.size} false alarms`;
-    this.note.textContent = summary + (verdict ?? "");
+    const inSound = sound.length ? `; in sound: ${sound.length}` : "";
+    this.note.textContent = summary + (verdict ?? "") + inSound;
     this.body.replaceChildren(...shown.map((event) => this.#row(event)));
   }
 

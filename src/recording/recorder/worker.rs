@@ -58,7 +58,9 @@ impl InForce {
             | Payload::Prediction(_)
             | Payload::Sensitivity(_)
             | Payload::Diagnostics(_)
-            | Payload::Vibration(_) => None,
+            | Payload::Vibration(_)
+            | Payload::Waveform(_)
+            | Payload::Heard(_) => None,
         }
     }
 }
@@ -172,8 +174,8 @@ impl Worker {
                 return;
             }
         };
-        // A prediction stays in the file of its input.
-        if topic != Topic::Prediction && self.split_is_due(message.log_time_ns) {
+        // A prediction stays in the file of its input. Samples come from another thread, possibly between the two.
+        if !matches!(topic, Topic::Prediction | Topic::Waveform) && self.split_is_due(message.log_time_ns) {
             self.finish_file();
             if self.shared.condition().state == State::Recording {
                 self.resume();
@@ -353,7 +355,8 @@ impl Worker {
             ("split_index", self.next_split.to_string()),
             ("started_utc", now.to_string()),
         ];
-        let metadata = entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
+        let metadata = entries.into_iter().map(|(key, value)| (key.to_owned(), value));
+        let metadata = metadata.chain(self.config.metadata.iter().cloned()).collect();
         file.write_metadata(&Metadata { name: METADATA_NAME.to_owned(), metadata })?;
         for rig_file in &self.config.rig_files {
             file.attach(&Attachment {

@@ -1,5 +1,7 @@
 //! What a detector finds in a stream, and what it counts.
 
+use std::fmt;
+
 use crate::sound::Growth;
 
 /// Most interruptions that are named; later ones are counted.
@@ -67,6 +69,19 @@ pub enum Interruption {
     Overlap { at_ns: i64, samples: u64 },
     /// The stamps went back by more than a second; squeals end there.
     Restart { after_ns: i64, at_ns: i64 },
+}
+
+impl fmt::Display for Interruption {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let s = |ns: i64| ns as f64 * 1e-9;
+        match *self {
+            Self::Gap { after_ns, samples } => write!(f, "{samples} samples are missing after {:.6} s", s(after_ns)),
+            Self::Overlap { at_ns, samples } => write!(f, "{samples} samples came twice at {:.6} s", s(at_ns)),
+            Self::Restart { after_ns, at_ns } => {
+                write!(f, "the stamps went back from {:.6} to {:.6} s", s(after_ns), s(at_ns))
+            }
+        }
+    }
 }
 
 /// Counts of what a detector received.

@@ -7,6 +7,7 @@
 mod bad_link;
 mod exchange;
 mod operation;
+mod sound;
 
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -20,7 +21,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use crate::domain::Domain;
 use crate::program::{self, PATIENCE, cache_folder, promised};
 use serde_json::Value;
-use squealcast::msgs::{Header, OperatingPoint, Prediction, RigInfo, Sensitivity, Time, Vibration};
+use squealcast::msgs::{Header, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, Time, Vibration, Waveform};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
 use tempfile::TempDir;
@@ -138,6 +139,11 @@ struct Node {
 impl Node {
     /// Starts `squealcast run RIG`.
     fn start(rig: &str, record: bool) -> Self {
+        Self::start_with(rig, record, &[])
+    }
+
+    /// The same with more arguments.
+    fn start_with(rig: &str, record: bool, more: &[&str]) -> Self {
         let folder = TempDir::new().expect("a folder");
         let (domain, prefix) = names();
         let mut arguments = vec!["run", rig, "--loopback"].into_iter().map(str::to_owned).collect::<Vec<_>>();
@@ -145,6 +151,7 @@ impl Node {
         if record {
             arguments.extend(["--record".to_owned(), folder.path().join("recordings").display().to_string()]);
         }
+        arguments.extend(more.iter().map(|&argument| argument.to_owned()));
         let program = Path::new(env!("CARGO_BIN_EXE_squealcast"));
         Self { process: start(program, &arguments, folder.path()), domain, prefix, folder }
     }
@@ -261,6 +268,8 @@ struct Content {
     rigs: Vec<RigInfo>,
     sensitivities: Vec<Sensitivity>,
     vibrations: Vec<Vibration>,
+    waveforms: Vec<Waveform>,
+    heard: Vec<Heard>,
     /// FAULTs for silence with inputs before and after.
     silences_between: usize,
     /// The values of the last diagnostics.
@@ -293,6 +302,8 @@ impl Content {
                 }
                 Recorded::Known(Payload::SessionEvent(_)) => {}
                 Recorded::Known(Payload::Vibration(vibration)) => content.vibrations.push(vibration),
+                Recorded::Known(Payload::Waveform(waveform)) => content.waveforms.push(waveform),
+                Recorded::Known(Payload::Heard(heard)) => content.heard.push(heard),
                 Recorded::Known(Payload::Sensitivity(sensitivity)) => content.sensitivities.push(sensitivity),
                 other => panic!("{other:?}"),
             }
