@@ -328,7 +328,7 @@ impl Polish<'_> {
         let merging = mirror_pair(outer, ids);
         let (kind, ids) = match (kind, &merging) {
             (WindowKind::Divergence, Some(pair)) => (WindowKind::Coalescence, pair.as_slice()),
-            _ => (kind, ids),
+            (WindowKind::Coalescence | WindowKind::ZeroGrowth | WindowKind::Divergence, _) => (kind, ids),
         };
         let f_inside =
             if merging.is_some() { quantity(kind, ids, inner).map_or(f_inside, |(f, _)| f) } else { f_inside };
@@ -419,7 +419,7 @@ fn quantity(kind: WindowKind, ids: &[u32], node: &Node) -> Option<(f64, f64)> {
         }
         (WindowKind::ZeroGrowth, &[id]) => root(id).map(|r| (r.lambda.re, r.frequency_hz())),
         (WindowKind::Divergence, &[id]) => root(id).map(|r| (r.square.re, 0.0)),
-        _ => None,
+        (WindowKind::Coalescence | WindowKind::ZeroGrowth | WindowKind::Divergence, _) => None,
     }
 }
 
@@ -490,7 +490,8 @@ fn bisect((mut a, mut b): (f64, f64), mut holds: impl FnMut(f64) -> Result<bool,
 mod tests {
     use faer::mat;
 
-    use super::super::model::{ContactLaw, CustomLaw, Law, Term};
+    use super::super::law::{ContactLaw, CustomLaw, Law};
+    use super::super::model::Term;
     use super::super::operating_point::OperatingPoint;
     use super::super::test_models::{REFERENCE, hulten, nine_dof, random_rig};
     use super::*;

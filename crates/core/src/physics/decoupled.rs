@@ -6,7 +6,9 @@
 
 use faer::{Mat, c64};
 
-use super::model::{KnownTerm, Law, Model, ModelError, Parameter, Term};
+use super::law::{Law, Parameter};
+use super::model::{KnownTerm, Model, Term};
+use super::model_error::ModelError;
 use super::operating_point::OperatingPoint;
 use super::solver::ROUNDING;
 use super::spectrum::{Root, RootError, SolveError, Spectrum, Vectors, order, square_root};
@@ -186,7 +188,8 @@ fn alone(model: &Model, k: usize, of: &Spectrum, vectors: Vectors, out: &mut Vec
 
 #[cfg(test)]
 mod tests {
-    use super::super::model::{ContactLaw, ContactPairs};
+    use super::super::law::ContactLaw;
+    use super::super::model::ContactPairs;
     use super::super::solver::Solver;
     use super::super::stability_map::{MapOptions, StabilityMap};
     use super::super::test_models::REFERENCE;

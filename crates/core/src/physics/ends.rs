@@ -5,7 +5,9 @@
 //! method started from the extrapolated end converges in two or three solves.
 
 use super::critical::{Window, WindowKind};
-use super::model::{Model, ModelError, Parameter};
+use super::law::Parameter;
+use super::model::Model;
+use super::model_error::ModelError;
 use super::operating_point::OperatingPoint;
 use super::sensitivity::{of_pair, of_roots};
 use super::solver::Solver;
@@ -265,10 +267,7 @@ impl Search<'_> {
         let depends: [bool; 2] = self.model.depends_on_load_and_speed().into();
         for k in (0..2).filter(|&k| depends[k]) {
             let mut probe = map.point;
-            let at = match MOVING[k] {
-                Parameter::Load => &mut probe.normal_load_n,
-                _ => &mut probe.disc_speed_rad_s,
-            };
+            let at = MOVING[k].condition(&mut probe).expect("load and speed are conditions");
             let step = REACH * *at;
             *at += step;
             let guess = mu + end.slope[k] * step;
@@ -310,7 +309,7 @@ impl Search<'_> {
                     None => Condition::Square(a),
                 }
             }
-            _ => Condition::Static,
+            (WindowKind::Coalescence | WindowKind::ZeroGrowth | WindowKind::Divergence, _) => Condition::Static,
         })
     }
 
@@ -397,7 +396,7 @@ fn closure(here: &Situation, pair: usize) -> Option<Value> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::model::ContactLaw;
+    use super::super::law::ContactLaw;
     use super::super::stability_map::MapOptions;
     use super::super::test_models::{REFERENCE, hulten, nine_dof};
     use super::*;

@@ -21,7 +21,9 @@
 use faer::linalg::solvers::Solve;
 use faer::{Mat, MatRef};
 
-use super::model::{ContactPairs, KnownTerm, Law, Model, ModelError};
+use super::law::Law;
+use super::model::{ContactPairs, KnownTerm, Model};
+use super::model_error::ModelError;
 use crate::chebyshev;
 
 /// Maximum condition number of `I + K_c R(μ)`.
@@ -295,7 +297,8 @@ fn one_norm(matrix: &Mat<f64>) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::model::{ContactLaw, Term};
+    use super::super::law::ContactLaw;
+    use super::super::model::Term;
     use super::super::operating_point::OperatingPoint;
     use super::*;
 

@@ -5,15 +5,13 @@
 //! a scalar [`Law`] of the operating point. Contact is given as [`ContactPairs`] and converted to terms when the
 //! model is built.
 
-use std::sync::Arc;
-
 use faer::{Mat, MatRef};
 
 use super::decoupled::Division;
+use super::law::{ContactLaw, Law, Parameter};
+use super::model_error::ModelError;
 use super::operating_point::{ContactState, OperatingPoint};
 use super::steady_contact::{Response, Situation, SteadyContact, signed_friction};
-use crate::chebyshev;
-use crate::contact::StaticsError;
 
 /// A constant matrix times a scalar law of the operating point.
 #[derive(Clone, Debug)]
@@ -22,131 +20,6 @@ pub struct Term {
     pub matrix: Mat<f64>,
     /// The scalar function that multiplies the matrix.
     pub law: Law,
-}
-
-/// The scalar factor of a term, as a function of the operating point. Where its condition (contact closed, or
-/// sliding) does not hold, the factor is 0.
-#[derive(Clone, Debug)]
-pub enum Law {
-    /// `1` at every operating point.
-    Constant,
-    /// `κ(N) = (N / N_ref)^α` while the contact is closed.
-    ContactStiffness,
-    /// `s μ κ(N)` while the contact slides; `s` is the sign of the disc speed.
-    FrictionStiffness,
-    /// `1` while the contact is closed.
-    ContactDamping,
-    /// `s μ` while the contact slides.
-    FrictionDamping,
-    /// `N` while the contact slides; the matrix contains the slope `dμ/dv`.
-    FrictionSlope,
-    /// `μ N / |ω|` while the contact slides.
-    LateralFriction,
-    /// `x T_k(x / r)` with `x = s μ`, while the contact slides. A sum of such terms expands `f(x) - f(0)` of a smooth
-    /// function `f`. Undefined for `|μ| > r`.
-    FrictionChebyshev {
-        /// Degree `k` of the polynomial.
-        degree: usize,
-        /// Largest `|μ|` of the expansion, `r`.
-        range: f64,
-    },
-    /// `Ω^p` of the disc speed `Ω` with its sign, rad/s, in any contact state: gyroscopic terms (`p = 1`) and spin
-    /// terms (`p = 2`) of a disc that turns in the frame of the pad.
-    DiscSpeed {
-        /// Exponent `p`.
-        power: u8,
-    },
-    /// `Ω^p` while the contact is closed.
-    DiscSpeedInContact {
-        /// Exponent `p`.
-        power: u8,
-    },
-    /// `Ω^p x T_k(x / r)`, the product of [`Law::DiscSpeed`] and [`Law::FrictionChebyshev`].
-    DiscSpeedChebyshev {
-        /// Exponent `p`.
-        power: u8,
-        /// Degree `k` of the polynomial.
-        degree: usize,
-        /// Largest `|μ|` of the expansion, `r`.
-        range: f64,
-    },
-    /// Any other function, given as an expression in the rig file.
-    Custom(CustomLaw),
-}
-
-/// A law supplied by the caller, with the conditions it depends on.
-#[derive(Clone)]
-pub struct CustomLaw {
-    /// The expression as written in the rig file.
-    pub text: String,
-    /// Evaluates the law. It receives a friction coefficient of 0 where the contact does not slide.
-    pub evaluate: Arc<dyn Fn(&OperatingPoint) -> f64 + Send + Sync>,
-    /// Whether its value changes with the normal load.
-    pub depends_on_load: bool,
-    /// Whether its value changes with the disc speed.
-    pub depends_on_speed: bool,
-    /// Whether its value changes with the friction coefficient.
-    pub depends_on_friction: bool,
-}
-
-impl std::fmt::Debug for CustomLaw {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_tuple("CustomLaw").field(&self.text).finish()
-    }
-}
-
-impl Law {
-    /// Value of the law at `p` for the contact parameters `contact` and the contact state `state`.
-    pub fn value(&self, contact: &ContactLaw, state: ContactState, p: &OperatingPoint) -> f64 {
-        let closed = state != ContactState::Open;
-        let sliding = state == ContactState::Sliding;
-        let when = |holds: bool, value: f64| if holds { value } else { 0.0 };
-        let (load, mu) = (p.normal_load_n, p.friction_coefficient);
-        let stiffening = || match contact.exponent {
-            0.0 => 1.0,
-            exponent => (load / contact.reference_n).powf(exponent),
-        };
-        match self {
-            Self::Constant => 1.0,
-            Self::ContactStiffness => when(closed, stiffening()),
-            Self::FrictionStiffness => when(sliding, p.disc_speed_rad_s.signum() * mu * stiffening()),
-            Self::ContactDamping => when(closed, 1.0),
-            Self::FrictionDamping => when(sliding, p.disc_speed_rad_s.signum() * mu),
-            Self::FrictionSlope => when(sliding, load),
-            Self::LateralFriction => when(sliding, mu * load / p.disc_speed_rad_s.abs()),
-            Self::FrictionChebyshev { degree, range } => {
-                let x = p.disc_speed_rad_s.signum() * mu;
-                when(sliding, chebyshev::odd_at_zero(x, *degree, *range))
-            }
-            Self::DiscSpeed { power } => p.disc_speed_rad_s.powi(i32::from(*power)),
-            Self::DiscSpeedInContact { power } => when(closed, p.disc_speed_rad_s.powi(i32::from(*power))),
-            Self::DiscSpeedChebyshev { power, degree, range } => {
-                let x = p.disc_speed_rad_s.signum() * mu;
-                let turning = p.disc_speed_rad_s.powi(i32::from(*power));
-                when(sliding, turning * chebyshev::odd_at_zero(x, *degree, *range))
-            }
-            Self::Custom(custom) => (custom.evaluate)(&if sliding { *p } else { p.with_friction(0.0) }),
-        }
-    }
-}
-
-/// Parameters of contact and friction: how both depend on load and speed.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ContactLaw {
-    /// `α` in `k = k_ref (N / N_ref)^α`: 0 for a linear spring, 1/3 for Hertzian, 1 for exponential contact.
-    pub exponent: f64,
-    /// `N_ref`, N.
-    pub reference_n: f64,
-    /// `dμ/dv`, s/m; negative where friction falls with speed.
-    pub slope_s_per_m: f64,
-    /// Whether the friction force follows the direction of the sliding velocity, and so damps motion along `b`.
-    pub lateral_damping: bool,
-}
-
-impl Default for ContactLaw {
-    fn default() -> Self {
-        Self { exponent: 0.0, reference_n: 500.0, slope_s_per_m: 0.0, lateral_damping: false }
-    }
 }
 
 /// Contact pairs in modal coordinates. The rows map coordinates to the relative displacement, pad minus disc, along
@@ -184,166 +57,6 @@ impl ContactPairs {
         self.check_radius()?;
         Ok(self.radius_m.iter().map(|radius_m| radius_m.recip()).collect())
     }
-}
-
-/// The parameter of a derivative.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Parameter {
-    /// The friction coefficient.
-    Friction,
-    /// The normal load, N.
-    Load,
-    /// The disc speed, rad/s.
-    Speed,
-    /// The logarithm of a common factor on the stiffness of all contact pairs, so that derivatives are per relative
-    /// change.
-    ContactStiffness,
-    /// The logarithm of a common factor on the damping of all contact pairs.
-    ContactDamping,
-}
-
-impl Parameter {
-    /// All parameters, in the order in which derivatives are listed.
-    pub const ALL: [Self; 5] = [Self::Friction, Self::Load, Self::Speed, Self::ContactStiffness, Self::ContactDamping];
-}
-
-/// Why a model could not be built or evaluated.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum ModelError {
-    /// A matrix has the wrong shape.
-    #[error("{what} is {rows}x{columns}, expected {expected}x{expected}")]
-    Shape {
-        /// Which matrix.
-        what: String,
-        /// Number of rows found.
-        rows: usize,
-        /// Number of columns found.
-        columns: usize,
-        /// Number of rows and columns expected.
-        expected: usize,
-    },
-    /// A matrix has an entry that is no finite number.
-    #[error("{what}: entry ({row}, {column}) is {value}, expected a finite number")]
-    NotFinite {
-        /// Which matrix.
-        what: String,
-        /// Row of the entry, from 0.
-        row: usize,
-        /// Column of the entry, from 0.
-        column: usize,
-        /// The entry.
-        value: f64,
-    },
-    /// A law has no finite value at an operating point.
-    #[error(
-        "{what} is {value} at {normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}; expected a finite number"
-    )]
-    LawNotFinite {
-        /// Which law.
-        what: String,
-        /// The value found.
-        value: f64,
-        /// Normal load, N.
-        normal_load_n: f64,
-        /// Disc speed, rad/s.
-        disc_speed_rad_s: f64,
-        /// Friction coefficient.
-        friction_coefficient: f64,
-    },
-    /// A list does not have one value for each contact pair.
-    #[error("{what} has {found} values, expected one for each of {expected} contact pairs")]
-    PairCount {
-        /// Which list.
-        what: &'static str,
-        /// The number found.
-        found: usize,
-        /// Number of contact pairs.
-        expected: usize,
-    },
-    /// Residual flexibility beside a contact stiffness that depends on the load.
-    #[error(
-        "residual flexibility with [load] exponent {exponent}, expected 0: it requires a contact stiffness that \
-         does not depend on the load"
-    )]
-    FlexibleLoadExponent {
-        /// [`ContactLaw::exponent`].
-        exponent: f64,
-    },
-    /// The contact flexibility is nearly singular.
-    #[error(
-        "contact flexibility at friction coefficient {friction_coefficient} has condition number {condition:.1e}, \
-         limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient exclude it"
-    )]
-    IllConditioned {
-        /// Friction coefficient.
-        friction_coefficient: f64,
-        /// Its condition number.
-        condition: f64,
-        /// Largest condition number accepted.
-        limit: f64,
-    },
-    /// The contact flexibility is not resolved by Chebyshev polynomials in the friction coefficient.
-    #[error(
-        "contact flexibility over friction coefficients up to {range} leaves {value:.1e} to the highest of {degrees} \
-         Chebyshev polynomials, limit {limit:.1e}; a smaller search.mu_max and limits.friction_coefficient help"
-    )]
-    FlexibilityFit {
-        /// Largest friction coefficient of the expansion.
-        range: f64,
-        /// Number of polynomials.
-        degrees: usize,
-        /// Size of the highest coefficient, relative.
-        value: f64,
-        /// Largest such size accepted.
-        limit: f64,
-    },
-    /// A contact pair has no lever arm, which lateral damping needs.
-    #[error("contact pair {pair}: radius_m is {radius_m}, expected more than 0 for lateral damping")]
-    Radius {
-        /// Index of the pair.
-        pair: usize,
-        /// Its distance from the axis, m.
-        radius_m: f64,
-    },
-    /// Damping of a pair that is not proportional to its stiffness.
-    #[error(
-        "contact pair {pair}: damping {damping} N·s/m with stiffness {stiffness} N/m; with a contact state the damping \
-         of a pair is proportional to its stiffness"
-    )]
-    StateDamping {
-        /// Index of the pair.
-        pair: usize,
-        /// Its stiffness, N/m.
-        stiffness: f64,
-        /// Its damping, N·s/m.
-        damping: f64,
-    },
-    /// Residual inertia together with a contact state.
-    #[error("residual inertia with a contact state, expected residual flexibility only")]
-    StateInertia,
-    /// A load exponent together with a contact state.
-    #[error(
-        "[load] exponent {exponent} with a contact state, expected 0: the law of the contact state gives the stiffness"
-    )]
-    StateLoadExponent {
-        /// [`ContactLaw::exponent`].
-        exponent: f64,
-    },
-    /// There is no contact state at the operating point.
-    #[error("contact state: {0}")]
-    State(#[source] StaticsError),
-    /// An operating point with a value that is no finite number.
-    #[error(
-        "operating point ({normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}) is not finite"
-    )]
-    PointNotFinite {
-        /// Normal load, N.
-        normal_load_n: f64,
-        /// Disc speed, rad/s.
-        disc_speed_rad_s: f64,
-        /// Friction coefficient.
-        friction_coefficient: f64,
-    },
 }
 
 /// A term, with the known symmetry of its matrix.
@@ -593,18 +306,22 @@ impl Model {
     /// flexibility.
     pub fn is_linear_in_contact(&self) -> bool {
         let mut terms = self.stiffness.iter().chain(&self.damping);
-        let expands = |law: &Law| matches!(law, Law::FrictionChebyshev { .. } | Law::DiscSpeedChebyshev { .. });
-        self.has_contact && !terms.any(|known| expands(&known.term.law))
+        self.has_contact && terms.all(|known| known.term.law.is_linear_in_contact())
     }
 
     /// The contact state at `p`; a model without contact pairs is always closed.
     pub fn contact_state(&self, p: &OperatingPoint) -> ContactState {
-        if self.has_contact { p.contact_state() } else { p.state_closed() }
+        p.state_of_contact(self.has_contact)
     }
 
     /// Value of `law` at `p`.
     pub(super) fn coefficient(&self, law: &Law, p: &OperatingPoint) -> f64 {
-        law.value(&self.contact_law, self.contact_state(p), p)
+        law.value(&self.contact_law, self.has_contact, p)
+    }
+
+    /// Derivative of the value of `law` at `p` with respect to `parameter`; see [`Law::derivative`].
+    pub(super) fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
+        law.derivative(&self.contact_law, self.has_contact, p, parameter)
     }
 
     /// Writes `K(p)` and `C(p)`, both `n×n`, and returns their properties.
@@ -722,96 +439,6 @@ impl Model {
         Ok(())
     }
 
-    /// Derivative of the value of `law` at `p` with respect to `parameter`: per unit of the friction coefficient, per
-    /// N, per rad/s, or per relative change of contact stiffness or damping.
-    pub(super) fn derivative(&self, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
-        use Parameter::{ContactDamping, ContactStiffness, Friction, Load, Speed};
-        let value = self.coefficient(law, p);
-        // The factor of the friction coefficient; evaluated at `μ = 1` because `μ` may be zero.
-        let per_friction = || self.coefficient(law, &p.with_friction(1.0));
-        // The value is 0 where nothing slides, and load or speed may be zero there.
-        let ratio = |value: f64, by: f64| if value == 0.0 { 0.0 } else { value / by };
-        match law {
-            Law::Constant => 0.0,
-            Law::ContactStiffness => match parameter {
-                Load => ratio(value * self.contact_law.exponent, p.normal_load_n),
-                ContactStiffness => value,
-                Friction | Speed | ContactDamping => 0.0,
-            },
-            Law::FrictionStiffness => match parameter {
-                Friction => per_friction(),
-                Load => ratio(value * self.contact_law.exponent, p.normal_load_n),
-                ContactStiffness => value,
-                Speed | ContactDamping => 0.0,
-            },
-            Law::ContactDamping => match parameter {
-                ContactDamping => value,
-                Friction | Load | Speed | ContactStiffness => 0.0,
-            },
-            Law::FrictionDamping => match parameter {
-                Friction => per_friction(),
-                ContactDamping => value,
-                Load | Speed | ContactStiffness => 0.0,
-            },
-            Law::FrictionSlope => match parameter {
-                Load => ratio(value, p.normal_load_n),
-                Friction | Speed | ContactStiffness | ContactDamping => 0.0,
-            },
-            Law::LateralFriction => match parameter {
-                Friction => per_friction(),
-                Load => ratio(value, p.normal_load_n),
-                Speed => ratio(-value, p.disc_speed_rad_s),
-                ContactStiffness | ContactDamping => 0.0,
-            },
-            Law::FrictionChebyshev { degree, range } => match parameter {
-                Friction if value.is_finite() && p.contact_state() == ContactState::Sliding => {
-                    let sign = p.disc_speed_rad_s.signum();
-                    sign * chebyshev::odd_at_zero_slope(sign * p.friction_coefficient, *degree, *range)
-                }
-                Friction | Load | Speed | ContactStiffness | ContactDamping => 0.0,
-            },
-            Law::DiscSpeed { power } => match parameter {
-                Speed => power_slope(p.disc_speed_rad_s, *power),
-                Friction | Load | ContactStiffness | ContactDamping => 0.0,
-            },
-            Law::DiscSpeedInContact { power } => match parameter {
-                Speed if self.contact_state(p) != ContactState::Open => power_slope(p.disc_speed_rad_s, *power),
-                Friction | Load | Speed | ContactStiffness | ContactDamping => 0.0,
-            },
-            Law::DiscSpeedChebyshev { power, degree, range } => {
-                let expansion = Law::FrictionChebyshev { degree: *degree, range: *range };
-                match parameter {
-                    Speed => power_slope(p.disc_speed_rad_s, *power) * self.coefficient(&expansion, p),
-                    Friction => p.disc_speed_rad_s.powi(i32::from(*power)) * self.derivative(&expansion, p, Friction),
-                    Load | ContactStiffness | ContactDamping => 0.0,
-                }
-            }
-            Law::Custom(custom) => self.custom_derivative(custom, law, p, parameter),
-        }
-    }
-
-    /// Derivative of a custom law by a central difference with a relative step of 1e-6.
-    fn custom_derivative(&self, custom: &CustomLaw, law: &Law, p: &OperatingPoint, parameter: Parameter) -> f64 {
-        let (depends, at, least) = match parameter {
-            Parameter::Friction => (custom.depends_on_friction, p.friction_coefficient, 1.0),
-            Parameter::Load => (custom.depends_on_load, p.normal_load_n, 1e-3),
-            Parameter::Speed => (custom.depends_on_speed, p.disc_speed_rad_s, 1e-3),
-            Parameter::ContactStiffness | Parameter::ContactDamping => return 0.0,
-        };
-        if !depends {
-            return 0.0;
-        }
-        let step = 1e-6 * at.abs().max(least);
-        let moved = |to: f64| match parameter {
-            Parameter::Load => OperatingPoint { normal_load_n: to, ..*p },
-            Parameter::Speed => OperatingPoint { disc_speed_rad_s: to, ..*p },
-            _ => p.with_friction(to),
-        };
-        let (up, down) = (self.coefficient(law, &moved(at + step)), self.coefficient(law, &moved(at - step)));
-        // A law may be undefined for negative friction coefficients; the difference is then one-sided.
-        if down.is_finite() { (up - down) / (2.0 * step) } else { (up - self.coefficient(law, p)) / step }
-    }
-
     /// Whether any damping term has a nonzero coefficient at `p`.
     pub fn is_damped(&self, p: &OperatingPoint) -> bool {
         self.damping.iter().any(|known| self.coefficient(&known.term.law, p) != 0.0)
@@ -848,43 +475,19 @@ impl Model {
         let mut load = self.steady.is_some();
         let mut speed = self.steady.as_ref().is_some_and(|contact| contact.depends_on_speed());
         for known in self.stiffness.iter().chain(&self.damping) {
-            match &known.term.law {
-                Law::Constant | Law::ContactDamping | Law::FrictionDamping | Law::FrictionChebyshev { .. } => {}
-                Law::ContactStiffness | Law::FrictionStiffness => load |= self.contact_law.exponent != 0.0,
-                Law::FrictionSlope => load = true,
-                Law::LateralFriction => (load, speed) = (true, true),
-                Law::DiscSpeed { .. } | Law::DiscSpeedInContact { .. } | Law::DiscSpeedChebyshev { .. } => speed = true,
-                Law::Custom(custom) => {
-                    load |= custom.depends_on_load;
-                    speed |= custom.depends_on_speed;
-                }
-            }
+            let (by_load, by_speed) = known.term.law.depends_on_load_and_speed(&self.contact_law);
+            (load, speed) = (load | by_load, speed | by_speed);
         }
         (load, speed)
     }
 
     /// Whether the model depends on load and speed through their ratio only.
     pub fn depends_on_load_over_speed_only(&self) -> bool {
-        let exponent = self.contact_law.exponent;
-        let constant = |law: &Law| match law {
-            Law::Constant | Law::ContactDamping | Law::FrictionDamping | Law::FrictionChebyshev { .. } => true,
-            Law::ContactStiffness | Law::FrictionStiffness => exponent == 0.0,
-            Law::FrictionSlope | Law::LateralFriction => false,
-            Law::DiscSpeed { .. } | Law::DiscSpeedInContact { .. } | Law::DiscSpeedChebyshev { .. } => false,
-            Law::Custom(custom) => !custom.depends_on_load && !custom.depends_on_speed,
-        };
+        let constant = |law: &Law| law.depends_on_load_and_speed(&self.contact_law) == (false, false);
         let rest = || self.stiffness.iter().chain(&self.damping).filter(|known| !constant(&known.term.law));
         self.steady.is_none()
             && rest().count() > 0
             && rest().all(|known| matches!(known.term.law, Law::LateralFriction))
-    }
-}
-
-/// Derivative of `Ω^p` with respect to `Ω`.
-fn power_slope(speed: f64, power: u8) -> f64 {
-    match power {
-        0 => 0.0,
-        power => f64::from(power) * speed.powi(i32::from(power) - 1),
     }
 }
 

@@ -268,7 +268,8 @@ mod tests {
 
     use faer::Mat;
 
-    use super::super::model::{ContactLaw, CustomLaw, Law, Model, Term};
+    use super::super::law::{ContactLaw, CustomLaw, Law};
+    use super::super::model::{Model, Term};
     use super::super::operating_point::OperatingPoint;
     use super::super::solver::Solver;
     use super::super::spectrum::Vectors;

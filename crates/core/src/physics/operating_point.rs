@@ -44,6 +44,11 @@ impl OperatingPoint {
         Self { normal_load_n: 1.0, ..*self }.contact_state()
     }
 
+    /// State of the contact of a model: that of [`Self::contact_state`] if it has contact pairs, else always closed.
+    pub fn state_of_contact(&self, has_contact: bool) -> ContactState {
+        if has_contact { self.contact_state() } else { self.state_closed() }
+    }
+
     /// The same load and speed with another friction coefficient.
     pub fn with_friction(self, friction_coefficient: f64) -> Self {
         Self { friction_coefficient, ..self }

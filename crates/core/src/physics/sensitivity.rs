@@ -19,7 +19,9 @@
 use faer::prelude::Solve;
 use faer::{Mat, MatRef, c64};
 
-use super::model::{Model, ModelError, Parameter};
+use super::law::Parameter;
+use super::model::Model;
+use super::model_error::ModelError;
 use super::solver::{ROUNDING, displacement_scale};
 use super::spectrum::Spectrum;
 
@@ -439,7 +441,8 @@ fn times(matrix: &Mat<f64>, v: MatRef<'_, c64>) -> Mat<c64> {
 mod tests {
     use faer::mat;
 
-    use super::super::model::{ContactLaw, ContactPairs, Law, Term};
+    use super::super::law::{ContactLaw, Law};
+    use super::super::model::{ContactPairs, Term};
     use super::super::operating_point::OperatingPoint;
     use super::super::solver::Solver;
     use super::super::spectrum::Vectors;
@@ -505,12 +508,9 @@ mod tests {
     }
 
     fn moved(p: &OperatingPoint, parameter: Parameter, by: f64) -> OperatingPoint {
-        match parameter {
-            Parameter::Friction => p.with_friction(p.friction_coefficient + by),
-            Parameter::Load => OperatingPoint { normal_load_n: p.normal_load_n + by, ..*p },
-            Parameter::Speed => OperatingPoint { disc_speed_rad_s: p.disc_speed_rad_s + by, ..*p },
-            _ => *p,
-        }
+        let mut moved = *p;
+        parameter.condition(&mut moved).into_iter().for_each(|condition| *condition += by);
+        moved
     }
 
     /// Comparison with central differences of the roots, with every dependence on load and speed, damped and

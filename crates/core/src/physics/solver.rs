@@ -48,6 +48,24 @@ enum Problem {
     Damped,
 }
 
+impl Problem {
+    /// Whether the eigenvalues are roots `λ` of the state space, `2n×2n`; otherwise they are `-λ²` of `K`, `n×n`.
+    fn is_damped(self) -> bool {
+        match self {
+            Self::Damped => true,
+            Self::Symmetric | Self::Undamped => false,
+        }
+    }
+
+    /// Whether the left vectors are the right ones.
+    fn is_symmetric(self) -> bool {
+        match self {
+            Self::Symmetric => true,
+            Self::Undamped | Self::Damped => false,
+        }
+    }
+}
+
 /// A root before sorting, with the columns of its vectors.
 struct Raw {
     root: Root,
@@ -145,13 +163,13 @@ impl Solver {
             self.read_left(&mut raw, problem);
         }
         raw.sort_by(|a, b| order(&a.root, &b.root));
-        bound_errors(&mut raw, problem == Problem::Damped, matrix_norm);
+        bound_errors(&mut raw, problem.is_damped(), matrix_norm);
         let (shapes, left) = self.vectors(&raw, problem);
         Ok(Spectrum {
             point: here.point,
             state: here.state.clone(),
             mode_count: raw.iter().filter(|r| r.root.oscillates()).count(),
-            undamped: problem != Problem::Damped,
+            undamped: !problem.is_damped(),
             matrix_norm,
             shapes,
             left,
@@ -168,7 +186,7 @@ impl Solver {
 
     /// Left vectors of the problem that was solved, packed; for a symmetric problem these are the right vectors.
     fn left_vectors(&self, problem: Problem) -> &Mat<f64> {
-        if problem == Problem::Symmetric { &self.dense.right } else { &self.dense.left }
+        if problem.is_symmetric() { &self.dense.right } else { &self.dense.left }
     }
 
     /// Writes the state matrix `[0 S; -K S⁻¹ -C]`.
@@ -195,7 +213,7 @@ impl Solver {
         // whose square is zero up to rounding.
         let mut zero = rounding * stiffness_norm;
         let near_origin = self.dense.values.iter().filter(|value| value.norm_sqr() <= zero).count();
-        if problem == Problem::Damped && near_origin == 1 {
+        if problem.is_damped() && near_origin == 1 {
             // A simple root near the origin, as where a static root crosses zero, is much more accurate.
             zero = (rounding * matrix_norm).powi(2);
         }
@@ -205,7 +223,7 @@ impl Solver {
                 Problem::Damped if value.im < 0.0 => continue, // represented by its conjugate
                 Problem::Damped => (value, value * value),
                 // The subtraction from zero turns the -0 of a real root into 0.
-                _ => (square_root(c64::ZERO - value), c64::ZERO - value),
+                Problem::Symmetric | Problem::Undamped => (square_root(c64::ZERO - value), c64::ZERO - value),
             };
             let lambda = if square.norm() <= zero { c64::ZERO } else { lambda };
             let (residual, pad_participation) = (f64::NAN, f64::NAN);
@@ -218,7 +236,7 @@ impl Solver {
     /// Extracts the displacements of the right vectors and multiplies them by the matrices.
     fn multiply(&mut self, problem: Problem, vectors: Vectors) {
         let n = self.stiffness.nrows();
-        let damped = problem == Problem::Damped;
+        let damped = problem.is_damped();
         let columns = self.dense.right.ncols();
         if self.shapes.ncols() != columns {
             self.shapes = Mat::zeros(n, columns);
@@ -262,7 +280,7 @@ impl Solver {
     fn judge(&self, raw: &mut [Raw], problem: Problem, stiffness_norm: f64, model: &Model) -> Result<(), SolveError> {
         let n = self.stiffness.nrows();
         let of_pad = model.pad_mass().map(|mass| mass * &self.shapes);
-        let damped = problem == Problem::Damped;
+        let damped = problem.is_damped();
         let damping_norm = if damped { self.damping.norm_l2() } else { 0.0 };
         for (j, entry) in raw.iter_mut().enumerate() {
             let [x, kx, cx] =
@@ -315,9 +333,8 @@ impl Solver {
             let (state, whole) = (packed(&self.dense.right), packed(self.left_vectors(problem)));
             let [cx, slope_kx, slope_cx] = [1, 2, 3].map(|k| packed(&self.products[k]));
             let product = whole.dot(state);
-            let condition =
-                if problem == Problem::Symmetric { 1.0 } else { whole.norm() * state.norm() / product.norm() };
-            entry.left = Some(if problem == Problem::Damped {
+            let condition = if problem.is_symmetric() { 1.0 } else { whole.norm() * state.norm() / product.norm() };
+            entry.left = Some(if problem.is_damped() {
                 let (y, lambda) = (whole.rows(n..), entry.root.lambda);
                 let weight = 2.0 * lambda * y.dot(packed(&self.shapes)) + y.dot(cx);
                 let change = lambda * y.dot(slope_cx) + y.dot(slope_kx);
@@ -340,7 +357,7 @@ impl Solver {
             shapes.col_as_slice_mut(j).iter_mut().enumerate().for_each(|(i, out)| *out = share * x.at(i));
             let Some(Left { weight, .. }) = entry.left else { continue };
             let whole = Packed::new(self.left_vectors(problem), entry.packing);
-            let y = if problem == Problem::Damped { whole.rows(n..) } else { whole };
+            let y = if problem.is_damped() { whole.rows(n..) } else { whole };
             let share = entry.length / weight.conj();
             left.col_as_slice_mut(j).iter_mut().enumerate().for_each(|(i, out)| *out = share * y.at(i));
         }
@@ -410,7 +427,8 @@ fn bound_errors(raw: &mut [Raw], damped: bool, matrix_norm: f64) {
 mod tests {
     use faer::mat;
 
-    use super::super::model::{ContactLaw, Law, Term};
+    use super::super::law::{ContactLaw, Law};
+    use super::super::model::Term;
     use super::super::test_models::{REFERENCE, nine_dof};
     use super::*;
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use faer::{Mat, c64};
 
-use super::model::ModelError;
+use super::model_error::ModelError;
 use super::operating_point::OperatingPoint;
 use super::steady_contact::Situation;
 use crate::contact::SteadyState;

@@ -6,7 +6,8 @@ use faer::c64;
 
 use super::critical::{self, Window};
 use super::ends::{Ends, NearestEnd};
-use super::model::{Model, ModelError};
+use super::model::Model;
+use super::model_error::ModelError;
 use super::numbering::Numbering;
 use super::operating_point::OperatingPoint;
 use super::solver::Solver;

@@ -28,7 +28,9 @@ use faer::linalg::solvers::{PartialPivLu, Solve};
 use faer::{Accum, Mat, MatRef, Par, c64};
 
 use super::flexible_contact::ResidualFlexibility;
-use super::model::{ContactLaw, ContactPairs, Model, ModelError, Parameter};
+use super::law::{ContactLaw, Parameter};
+use super::model::{ContactPairs, Model};
+use super::model_error::ModelError;
 use super::operating_point::{ContactState, OperatingPoint};
 use super::spectrum::Spectrum;
 use crate::contact::{Smoothness, Statics, SteadyState};

@@ -8,7 +8,9 @@ use super::chart::Chart;
 use super::chart::build::{ChartError, ChartOptions, build};
 use super::ends::{Bounded, Ends};
 use super::flexible_contact::ResidualFlexibility;
-use super::model::{ContactLaw, ContactPairs, Law, Model, ModelError, Parameter, Term};
+use super::law::{ContactLaw, Law, Parameter};
+use super::model::{ContactPairs, Model, Term};
+use super::model_error::ModelError;
 use super::operating_point::OperatingPoint;
 use super::solver::Solver;
 use super::spectrum::{SolveError, Vectors};
@@ -193,10 +195,10 @@ fn matrices_follow_load_friction_and_speed() {
                 for (parameter, step) in
                     [(Parameter::Friction, 1e-5), (Parameter::Load, 1e-5 * p.normal_load_n), (Parameter::Speed, 1e-4)]
                 {
-                    let moved = |by: f64| match parameter {
-                        Parameter::Friction => p.with_friction(p.friction_coefficient + by),
-                        Parameter::Load => point(p.normal_load_n + by, p.disc_speed_rad_s, p.friction_coefficient),
-                        _ => point(p.normal_load_n, p.disc_speed_rad_s + by, p.friction_coefficient),
+                    let moved = |by: f64| {
+                        let mut moved = p;
+                        *parameter.condition(&mut moved).expect("a condition") += by;
+                        moved
                     };
                     let (mut k, mut c) = (Mat::zeros(MODES, MODES), Mat::zeros(MODES, MODES));
                     model.assemble_derivative(&p, parameter, &mut k, &mut c).expect("there is a state");

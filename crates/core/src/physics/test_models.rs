@@ -2,7 +2,8 @@
 
 use faer::{Mat, Side, mat};
 
-use super::model::{ContactLaw, ContactPairs, Law, Model, Term};
+use super::law::{ContactLaw, Law};
+use super::model::{ContactPairs, Model, Term};
 use super::operating_point::OperatingPoint;
 use crate::proof::synthetic::Uniform;
 

@@ -2,7 +2,8 @@
 
 use faer::Mat;
 
-use super::model::{ContactLaw, Law, Model, Parameter, Term};
+use super::law::{ContactLaw, Law, Parameter};
+use super::model::{Model, Term};
 use super::operating_point::OperatingPoint;
 use super::solver::Solver;
 use super::spectrum::Vectors;

@@ -165,31 +165,22 @@ impl FullModel {
     /// Whether the model depends on load and on speed, apart from opening of the contact, stopping and reversal of
     /// sliding: `(load, speed)`.
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
-        let (mut load, mut speed) = (false, false);
-        for term in self.stiffness.iter().chain(&self.damping) {
-            match &term.law {
-                Law::Custom(custom) => {
-                    load |= custom.depends_on_load;
-                    speed |= custom.depends_on_speed;
-                }
-                Law::DiscSpeed { .. } | Law::DiscSpeedInContact { .. } | Law::DiscSpeedChebyshev { .. } => speed = true,
-                // Of the contact, whose laws count below.
-                Law::Constant
-                | Law::ContactStiffness
-                | Law::FrictionStiffness
-                | Law::ContactDamping
-                | Law::FrictionDamping
-                | Law::FrictionSlope
-                | Law::LateralFriction
-                | Law::FrictionChebyshev { .. } => {}
-            }
+        let of_terms = self.stiffness.iter().chain(&self.damping).map(|term| &term.law);
+        of_terms.chain(&self.contact_laws()).fold((false, false), |(load, speed), law| {
+            let (by_load, by_speed) = law.depends_on_load_and_speed(&self.contact_law);
+            (load | by_load, speed | by_speed)
+        })
+    }
+
+    /// The laws of the contact that are not zero at every operating point.
+    fn contact_laws(&self) -> Vec<Law> {
+        if self.contact.is_none() {
+            return vec![];
         }
-        if self.contact.is_some() {
-            let law = &self.contact_law;
-            load |= law.exponent != 0.0 || law.slope_s_per_m != 0.0 || law.lateral_damping;
-            speed |= law.lateral_damping;
-        }
-        (load, speed)
+        let mut laws = vec![Law::ContactStiffness, Law::FrictionStiffness, Law::ContactDamping, Law::FrictionDamping];
+        laws.extend((self.contact_law.slope_s_per_m != 0.0).then_some(Law::FrictionSlope));
+        laws.extend(self.contact_law.lateral_damping.then_some(Law::LateralFriction));
+        laws
     }
 
     /// Whether `C` vanishes at every operating point.
@@ -202,8 +193,7 @@ impl FullModel {
 
     /// Value of `law` at `p`; a model without contact pairs is always closed.
     fn value(&self, law: &Law, p: &OperatingPoint) -> f64 {
-        let state = if self.contact.is_some() { p.contact_state() } else { p.state_closed() };
-        law.value(&self.contact_law, state, p)
+        law.value(&self.contact_law, self.contact.is_some(), p)
     }
 
     /// Assembles `M`, `C(p)` and `K(p)`, `n×n`, both triangles stored. `C` is without the damping of modes, which would

@@ -168,7 +168,9 @@ fn domain(model: &Model, options: &ChartOptions) -> Result<(Vec<Axis>, Corner, C
         };
         (low[k], high[k]) = match axis {
             Axis::LoadOverSpeed => (corner(&options.low, &options.high), corner(&options.high, &options.low)),
-            _ => (corner(&options.low, &options.low), corner(&options.high, &options.high)),
+            Axis::Friction | Axis::Load | Axis::Speed => {
+                (corner(&options.low, &options.low), corner(&options.high, &options.high))
+            }
         };
         if !(low[k].is_finite() && high[k].is_finite() && low[k] < high[k]) {
             let (what, limit) = match axis {
@@ -386,7 +388,8 @@ mod tests {
 
     use super::*;
     use crate::physics::chart::NotCharted;
-    use crate::physics::model::{ContactLaw, Law, Term};
+    use crate::physics::law::{ContactLaw, Law};
+    use crate::physics::model::Term;
     use crate::physics::spectrum::Vectors;
     use crate::physics::test_models::nine_dof;
     use crate::proof::held_out::{HoldOut, hold_out};

@@ -20,7 +20,7 @@ mod words;
 
 use faer::c64;
 
-use super::model::Parameter;
+use super::law::Parameter;
 use super::numbering::Census;
 use super::operating_point::OperatingPoint;
 use super::spectrum::{Root, RootError, magnitude, square_root};
@@ -76,6 +76,14 @@ impl Axis {
             Self::Load => (Parameter::Load, p.normal_load_n),
             Self::Speed => (Parameter::Speed, p.disc_speed_rad_s * p.disc_speed_rad_s),
             Self::LoadOverSpeed => (Parameter::Load, p.disc_speed_rad_s),
+        }
+    }
+
+    /// Whether the coordinate depends on the speed, beyond whose range in the box laws may be undefined.
+    fn involves_speed(self) -> bool {
+        match self {
+            Self::Speed | Self::LoadOverSpeed => true,
+            Self::Friction | Self::Load => false,
         }
     }
 

@@ -170,7 +170,7 @@ impl Sampler<'_> {
             let step = 0.5 * STATE_STEP * (self.high[b] - self.low[b]);
             let beside = [-step, step].map(|step| {
                 let mut beside = *x;
-                if self.axes[b] == Axis::Speed {
+                if self.axes[b].involves_speed() {
                     beside[b] = x[b].clamp(self.low[b] + step.abs(), self.high[b] - step.abs());
                 }
                 beside[b] += step;
@@ -263,7 +263,7 @@ impl Sampler<'_> {
     fn second_difference(&self, x: &[f64; MAX_AXES], [a, b]: [usize; 2]) -> [Difference; 2] {
         let step = |k: usize| 0.5 * WIDE_STEP * (self.high[k] - self.low[k]);
         let mut centre = *x;
-        for k in [a, b].into_iter().filter(|&k| matches!(self.axes[k], Axis::Speed | Axis::LoadOverSpeed)) {
+        for k in [a, b].into_iter().filter(|&k| self.axes[k].involves_speed()) {
             centre[k] = x[k].clamp(self.low[k] + step(k), self.high[k] - step(k));
         }
         let at = |along_a: f64, along_b: f64| {
@@ -380,7 +380,7 @@ pub fn follow(samples: &[&Sample], units: &[[f64; MAX_AXES]], start: usize) -> O
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::physics::model::ContactLaw;
+    use crate::physics::law::ContactLaw;
     use crate::proof::synthetic::{Synthetic, rig};
 
     /// Curvatures compared with central differences of slopes with step `h = 1e-4`. The differences have errors of

@@ -9,7 +9,8 @@ use faer::Mat;
 
 use super::{Axis, MAX_AXES, NotCharted};
 use crate::chebyshev::{coefficients, nodes, polynomials};
-use crate::physics::model::{Model, ModelError};
+use crate::physics::model::Model;
+use crate::physics::model_error::ModelError;
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::traces::Exact;
 use crate::sampling::radical_inverse;

@@ -10,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 29] = [
+pub const BUILDER: [&str; 31] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -25,7 +25,9 @@ pub const BUILDER: [&str; 29] = [
     include_str!("../decoupled.rs"),
     include_str!("../dense_eigen.rs"),
     include_str!("../flexible_contact.rs"),
+    include_str!("../law.rs"),
     include_str!("../model.rs"),
+    include_str!("../model_error.rs"),
     include_str!("../operating_point.rs"),
     include_str!("../solver.rs"),
     include_str!("../spectrum.rs"),
