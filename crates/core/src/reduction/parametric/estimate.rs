@@ -1,0 +1,117 @@
+//! Error estimates of the reduced roots: the product of the norms of the right and the left residual.
+
+use faer::{Mat, c64};
+
+use super::super::ReductionError;
+use super::super::full_model::Projected;
+use super::request::ParametricStep;
+use super::sampling::{Building, Estimates, ROOTS_TOGETHER};
+use crate::physics::{Model, OperatingPoint, Spectrum, Vectors};
+
+/// `S⁻¹ B`.
+type Inverse<'a> = dyn Fn(Mat<f64>) -> Mat<f64> + 'a;
+
+impl Building<'_, '_> {
+    /// Point with the largest estimate, all estimates there, and the largest one; `None` without points.
+    pub fn worst_estimate(
+        &mut self,
+        model: &Model,
+        projected: &Projected,
+        points: &[OperatingPoint],
+        progress: &mut dyn FnMut(ParametricStep),
+    ) -> Result<Option<(OperatingPoint, Estimates, f64)>, ReductionError> {
+        let sigma = self.metric.sigma;
+        self.solver.factor_at(sigma)?;
+        let shifted = self.solver.factors_at(sigma);
+        let coupled = shifted.map(|shifted| {
+            let low_rank = self.full.low_rank(&self.metric.middle);
+            let weights = low_rank.stiffness.clone();
+            shifted.couple::<f64>(&low_rank, weights, false)
+        });
+        let llt =
+            match &self.pencil {
+                Some(pencil) => Some(pencil.llt(sigma)?.ok_or_else(|| {
+                    failed("the symmetric stiffness with its shift is not positive definite".to_owned())
+                })?),
+                None => None,
+            };
+        let inverse = |mut b: Mat<f64>| match (&coupled, &llt) {
+            (Some(coupled), _) => coupled.solve(b.as_ref()),
+            (None, Some(llt)) => {
+                llt.solve(b.as_mut());
+                b
+            }
+            (None, None) => unreachable!("a model without parts has a pencil"),
+        };
+        let mut worst: Option<(OperatingPoint, Estimates, f64)> = None;
+        for (done, point) in points.iter().enumerate() {
+            progress(ParametricStep::Estimating { done, of: points.len() });
+            let spectrum = self.solve(model, point, Vectors::Both)?;
+            let estimates = self.estimates(&inverse, projected, &spectrum);
+            let largest = estimates.iter().map(|(_, estimate)| *estimate).fold(0.0, f64::max);
+            if worst.as_ref().is_none_or(|(_, _, before)| largest > *before) {
+                worst = Some((*point, estimates, largest));
+            }
+        }
+        Ok(worst)
+    }
+
+    /// Error estimate of every counted reduced root.
+    fn estimates(&self, inverse: &Inverse<'_>, projected: &Projected, spectrum: &Spectrum) -> Estimates {
+        let counts = |k: &usize| self.request.counted.counts(spectrum.roots[*k].lambda);
+        let wanted: Vec<usize> = (0..spectrum.mode_count).filter(counts).collect();
+        let norms = [&spectrum.shapes, &spectrum.left].map(|shapes| -> Vec<f64> {
+            let left = std::ptr::eq(shapes, &spectrum.left);
+            let chunks = wanted.chunks(ROOTS_TOGETHER);
+            chunks.flat_map(|roots| self.residual_norms(inverse, projected, spectrum, shapes, roots, left)).collect()
+        });
+        let estimate = |(j, &k): (usize, &usize)| {
+            let lambda = spectrum.roots[k].lambda;
+            // Left vectors are normalised to `yᴴ Q' x = 1` for a damped spectrum; for an undamped one `yᴴ Q' x = 2λ`.
+            let slope = if spectrum.undamped { 2.0 * lambda.norm() } else { 1.0 };
+            (lambda, norms[0][j] * norms[1][j] / (slope * lambda.norm()))
+        };
+        wanted.iter().enumerate().map(estimate).collect()
+    }
+
+    /// `S⁻¹`-norms of the residuals `Q V z` or, for left vectors, `Qᴴ V w`, one per root.
+    fn residual_norms(
+        &self,
+        inverse: &Inverse<'_>,
+        projected: &Projected,
+        spectrum: &Spectrum,
+        shapes: &Mat<c64>,
+        roots: &[usize],
+        left: bool,
+    ) -> Vec<f64> {
+        let (size, p) = (projected.omega_squared.len(), &spectrum.point);
+        // Real and imaginary parts.
+        let parts = Mat::from_fn(size, 2 * roots.len(), |i, j| {
+            let value = shapes[(i, roots[j / 2])];
+            if j % 2 == 0 { value.re } else { value.im }
+        });
+        let vectors = &projected.basis * &parts;
+        let of_mass = self.full.mass_times(vectors.as_ref());
+        let of_damping = self.full.damping_times(p, vectors.as_ref(), left);
+        let mut residuals = self.full.stiffness_times(p, vectors.as_ref(), left);
+        for (j, &k) in roots.iter().enumerate() {
+            // yᴴ Q = (Qᴴ y)ᴴ.
+            let lambda = if left { spectrum.roots[k].lambda.conj() } else { spectrum.roots[k].lambda };
+            for i in 0..residuals.nrows() {
+                let at = |matrix: &Mat<f64>| c64::new(matrix[(i, 2 * j)], matrix[(i, 2 * j + 1)]);
+                let value = lambda * (lambda * at(&of_mass) + at(&of_damping)) + at(&residuals);
+                residuals[(i, 2 * j)] = value.re;
+                residuals[(i, 2 * j + 1)] = value.im;
+            }
+        }
+        let solved = inverse(residuals.clone());
+        let square = |j: usize| residuals.col(j).transpose() * solved.col(j);
+        // A negative square is a rounding error. NaN becomes infinity, because taking a maximum would ignore NaN.
+        let size = |square: f64| if square.is_nan() { f64::INFINITY } else { square.max(0.0).sqrt() };
+        (0..roots.len()).map(|j| size(square(2 * j) + square(2 * j + 1))).collect()
+    }
+}
+
+fn failed(reason: String) -> ReductionError {
+    ReductionError::Factorisation { what: "parametric basis".to_owned(), reason }
+}

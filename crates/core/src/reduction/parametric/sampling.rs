@@ -1,0 +1,252 @@
+//! Greedy sampling: the full model is solved at the point with the largest error estimate, and its right and left
+//! vectors extend the span.
+
+use faer::{Mat, MatRef, c64};
+
+use super::super::dense::symmetric_eigen;
+use super::super::full_model::{FullModel, Projected};
+use super::super::matching::Counted;
+use super::super::pencil::Pencil;
+use super::super::{FullSolver, FullSpectrum, FullVectors, ReductionError};
+use super::metric::Metric;
+use super::request::{ParametricRequest, ParametricStep};
+use crate::physics::{Model, OperatingPoint, SolveError, Solver, Spectrum, Vectors};
+
+/// Fraction of the tolerance that the estimate must meet at training points, so that held-out points meet the
+/// tolerance.
+const TRAINING_SHARE: f64 = 0.3;
+/// Factor on the end of the band up to which vectors are taken: roots slightly beyond it may enter the band elsewhere
+/// in the box.
+pub const BAND_MARGIN: f64 = 1.02;
+/// Factor on a negative growth floor down to which vectors are taken, for the same reason.
+const FLOOR_MARGIN: f64 = 1.5;
+/// A vector is not added if its component outside the span is below this times the square root of the tolerance.
+const NEGLIGIBLE: f64 = 0.01;
+/// Components of a vector below this, relative to its length, are rounding errors: the square root of the resolution of
+/// a Gram matrix.
+const ROUNDED: f64 = 1e-7;
+/// Number of roots whose residuals are computed at a time.
+pub const ROOTS_TOGETHER: usize = 8;
+/// Number of copies of their columns held meanwhile: the vectors, three products in two memory layouts, two of the
+/// residuals, and three during the solve.
+const ESTIMATING: usize = 12;
+
+/// Reduced roots, each with the estimate of its relative error `|Δλ|/|λ|`.
+pub type Estimates = Vec<(c64, f64)>;
+
+/// A parametric basis under construction.
+pub struct Building<'a, 'm> {
+    pub full: &'a FullModel,
+    pub solver: &'a mut FullSolver<'m>,
+    pub request: &'a ParametricRequest,
+    pub metric: Metric<'a>,
+    /// Factorises `S` for models that are not just parts joined by contact; `None` for those that are.
+    pub pencil: Option<Pencil<'a>>,
+    /// Estimated number of roots in the band.
+    pub most_roots: usize,
+    /// `S`-orthonormal vectors, `n×r`.
+    pub span: Mat<f64>,
+    /// Coefficients in `span` of the vectors of each sampled point, one block per point. Rows of vectors that joined
+    /// the span later are absent and count as 0.
+    pub snapshots: Vec<Mat<f64>>,
+    pub sampled: Vec<OperatingPoint>,
+    /// All oscillating roots in the band at the sampled points.
+    pub known: Vec<(OperatingPoint, Vec<c64>)>,
+    pub true_over_estimate: f64,
+}
+
+impl Building<'_, '_> {
+    pub fn model(&self, projected: &Projected) -> Result<Model, ReductionError> {
+        projected.model(self.full.contact_law).map_err(|error| solve_failed(error.into()))
+    }
+
+    pub fn solve(&self, model: &Model, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, ReductionError> {
+        Solver::new(model.dimension()).solve(model, p, vectors).map_err(solve_failed)
+    }
+
+    /// Checks the memory limit for one more sample; returns the bytes needed in all.
+    ///
+    /// A sample adds four columns per root: real and imaginary parts of the right and the left vector. During a solve
+    /// of the full model or an estimate, memory holds the span, the basis of the reduced model and, while the latter is
+    /// computed, a copy. Adding columns takes five copies of them and a second copy of the span, which grows by
+    /// reallocation. The truncation takes the span, the basis of the reduced model and two candidate bases.
+    pub fn make_room(&mut self) -> Result<usize, ReductionError> {
+        let column = size_of::<f64>() * self.full.dimension();
+        let columns = 4 * self.most_roots;
+        let span = self.span.ncols() + columns;
+        let extended = 2 * span + 5 * columns;
+        let estimated = 2 * span + ESTIMATING * 4 * ROOTS_TOGETHER;
+        let (held_by_caller, other) = (3 * span * column, (4 * span).max(extended).max(estimated) * column);
+        self.solver.make_room(FullVectors::Both, self.most_roots, held_by_caller, other)
+    }
+
+    /// Solves the full model at `point` and adds its vectors to the span. `estimates` are the reduced roots at that
+    /// point with their error estimates, if known; they calibrate the estimate.
+    pub fn sample(
+        &mut self,
+        point: OperatingPoint,
+        estimates: Option<&[(c64, f64)]>,
+        progress: &mut dyn FnMut(ParametricStep),
+    ) -> Result<(), ReductionError> {
+        let counted = self.request.counted;
+        self.make_room()?;
+        progress(ParametricStep::Sampling { point, sample: self.sampled.len() + 1 });
+        let wanted = Counted {
+            band_rad_s: BAND_MARGIN * counted.band_rad_s,
+            growth_floor_per_s: counted.growth_floor_per_s - (FLOOR_MARGIN - 1.0) * counted.growth_floor_per_s.abs(),
+        };
+        let report = &mut |step| progress(ParametricStep::Solving(step));
+        let spectrum = self.solver.roots(&point, wanted.band_rad_s, FullVectors::Both, report)?;
+        let roots: Vec<c64> = spectrum.roots.iter().map(|root| root.lambda).collect();
+        let chosen: Vec<usize> = (0..roots.len()).filter(|&k| wanted.counts(roots[k])).collect();
+        let counting: Vec<c64> = chosen.iter().map(|&k| roots[k]).collect();
+        let mut ratio = f64::NAN;
+        for (reduced, estimate) in estimates.unwrap_or_default() {
+            let nearest =
+                counting.iter().map(|root| (root - reduced).norm() / root.norm()).fold(f64::INFINITY, f64::min);
+            // Errors at the level of rounding, and wrong pairs, do not calibrate the estimate.
+            if nearest > 1e-11 && nearest < 1e-2 && *estimate > 0.0 {
+                ratio = ratio.max(nearest / estimate);
+            }
+        }
+        self.most_roots = self.most_roots.max(chosen.len());
+        let columns = self.columns(&point, &spectrum, &chosen);
+        drop(spectrum);
+        self.extend(columns)?;
+        if ratio.is_finite() {
+            self.true_over_estimate = self.true_over_estimate.max(ratio);
+        }
+        self.sampled.push(point);
+        self.known.push((point, roots.into_iter().filter(|lambda| lambda.im > 0.0).collect()));
+        progress(ParametricStep::Sampled {
+            roots: counting.len(),
+            vectors: self.span.ncols(),
+            true_over_estimate: ratio,
+        });
+        Ok(())
+    }
+
+    /// Real and imaginary parts of right and left vectors, `n×(4·chosen)`. They are scaled so that a component `d`
+    /// omitted from both moves the root by about `dᵀ S d` times `|λ|`.
+    fn columns(&self, p: &OperatingPoint, spectrum: &FullSpectrum, chosen: &[usize]) -> Mat<f64> {
+        let n = self.full.dimension();
+        let mut columns = Mat::<f64>::zeros(n, 4 * chosen.len());
+        for (k, &root) in chosen.iter().enumerate() {
+            let lambda = spectrum.roots[root].lambda;
+            // Real and imaginary parts of x, then of y.
+            let of_root = Mat::<f64>::from_fn(n, 4, |i, j| {
+                let value = if j < 2 { spectrum.right[(i, root)] } else { spectrum.left[(i, root)] };
+                if j % 2 == 0 { value.re } else { value.im }
+            });
+            let of_mass = self.full.mass_times(of_root.as_ref());
+            let of_damping = self.full.damping_times(p, of_root.as_ref(), false);
+            let at = |m: &Mat<f64>, i: usize, side: usize| c64::new(m[(i, 2 * side)], m[(i, 2 * side + 1)]);
+            let slope: c64 = (0..n)
+                .map(|i| at(&of_root, i, 1).conj() * (lambda * 2.0 * at(&of_mass, i, 0) + at(&of_damping, i, 0)))
+                .sum();
+            let length = |side: usize| -> f64 {
+                (0..n).map(|i| (at(&of_root, i, side).conj() * at(&of_mass, i, side)).re).sum::<f64>().sqrt()
+            };
+            let lengths = [length(0), length(1)];
+            // `|y|_M |x|_M / |yᴴ Q' x|` is `1/(2|λ|)` for a real mode and unbounded where two roots merge, hence the
+            // cap.
+            let condition = (lengths[0] * lengths[1] / (slope.norm() * lambda.norm())).sqrt().min(10.0 / lambda.norm());
+            for (side, length) in lengths.into_iter().enumerate() {
+                let scaled = faer::Scale(condition / length) * of_root.subcols(2 * side, 2);
+                columns.subcols_mut(4 * k + 2 * side, 2).copy_from(scaled);
+            }
+        }
+        columns
+    }
+
+    /// Extends the span by the components of `columns` outside it, and stores the coefficients of `columns`.
+    fn extend(&mut self, columns: Mat<f64>) -> Result<(), ReductionError> {
+        let held = self.span.ncols();
+        let mut coefficients = Mat::<f64>::zeros(held, columns.ncols());
+        let mut rest = columns;
+        for _ in 0..2 {
+            let step = self.span.transpose() * self.metric.times(rest.as_ref());
+            rest -= &self.span * &step;
+            coefficients += step;
+        }
+        let weighted = self.metric.times(rest.as_ref());
+        let gram = rest.transpose() * &weighted;
+        let gram = Mat::from_fn(gram.nrows(), gram.ncols(), |i, j| 0.5 * (gram[(i, j)] + gram[(j, i)]));
+        let (squares, vectors) = symmetric_eigen("parametric basis", gram.as_ref())?;
+        let least = (NEGLIGIBLE * self.request.tolerance.sqrt()).max(ROUNDED);
+        let kept: Vec<usize> = (0..squares.len()).rev().filter(|&k| squares[k] > least * least).collect();
+        if kept.is_empty() {
+            self.snapshots.push(coefficients);
+            return Ok(());
+        }
+        let turn = Mat::from_fn(vectors.nrows(), kept.len(), |i, k| vectors[(i, kept[k])] / squares[kept[k]].sqrt());
+        let mut added = &rest * &turn;
+        drop(rest);
+        // The Gram matrix leaves rounding errors of orthogonality; two passes remove them.
+        for _ in 0..2 {
+            let step = self.span.transpose() * self.metric.times(added.as_ref());
+            added -= &self.span * &step;
+            let gram = self.metric.gram(&added);
+            super::super::whiten("parametric basis", gram.as_ref())?.right(&mut added);
+        }
+        let more = added.transpose() * &weighted;
+        let all = Mat::from_fn(held + kept.len(), coefficients.ncols(), |i, j| {
+            if i < held { coefficients[(i, j)] } else { more[(i - held, j)] }
+        });
+        self.snapshots.push(all);
+        drop(weighted);
+        let before = std::mem::replace(&mut self.span, Mat::new());
+        self.span = hstack(before.as_ref(), added.as_ref());
+        Ok(())
+    }
+
+    /// Samples points until the scaled estimate holds at all training points; returns the model projected on the whole
+    /// span.
+    pub fn enrich(
+        &mut self,
+        training: &[OperatingPoint],
+        progress: &mut dyn FnMut(ParametricStep),
+    ) -> Result<Projected, ReductionError> {
+        loop {
+            let projected = self.full.project(self.span.as_ref())?;
+            let model = self.model(&projected)?;
+            let points: Vec<OperatingPoint> =
+                training.iter().filter(|point| !self.sampled.contains(point)).copied().collect();
+            let worst = self.worst_estimate(&model, &projected, &points, progress)?;
+            let Some((point, estimates, largest)) = worst else { return Ok(projected) };
+            let scaled = largest * self.true_over_estimate;
+            progress(ParametricStep::Estimated { worst: scaled, vectors: self.span.ncols() });
+            if scaled <= TRAINING_SHARE * self.request.tolerance {
+                return Ok(projected);
+            }
+            if self.sampled.len() == self.request.most_samples {
+                return Err(ReductionError::Tolerance {
+                    what: "parametric basis (estimated)".to_owned(),
+                    value: scaled,
+                    limit: TRAINING_SHARE * self.request.tolerance,
+                    vectors: self.span.ncols(),
+                    samples: self.sampled.len(),
+                });
+            }
+            drop(projected);
+            self.sample(point, Some(&estimates), progress)?;
+        }
+    }
+}
+
+/// The roots with `ω > 0`.
+pub fn oscillating(spectrum: &Spectrum) -> Vec<c64> {
+    spectrum.modes().iter().map(|root| root.lambda).collect()
+}
+
+fn solve_failed(source: SolveError) -> ReductionError {
+    ReductionError::Solve { what: "parametric basis".to_owned(), source: Box::new(source) }
+}
+
+/// `[a b]`.
+fn hstack(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
+    let mut both = Mat::zeros(a.nrows(), a.ncols() + b.ncols());
+    both.subcols_mut(0, a.ncols()).copy_from(a);
+    both.subcols_mut(a.ncols(), b.ncols()).copy_from(b);
+    both
+}
