@@ -288,6 +288,50 @@ impl Operator {
         vector
     }
 
+    /// The right vectors of all `groups`, orthonormal within each group, and for a damped model their conjugates; and the
+    /// column of the first vector of each group.
+    fn basis(&self, spectrum: &Spectrum, groups: &[Group]) -> Result<(Mat<c64>, Vec<usize>), SensitivityError> {
+        let mut basis: Vec<Vec<c64>> = vec![];
+        let mut places = vec![];
+        for group in groups {
+            places.push(basis.len());
+            basis.push(self.vector(spectrum, group.first));
+            if let Some(second) = group.second {
+                let mut vector = self.vector(spectrum, second);
+                let first = &basis[basis.len() - 1];
+                let mut off = orthogonalise(&mut vector, first);
+                if off < 1e-12 && self.scale.is_some() {
+                    // A double root at the origin has a single shape; a state with velocity only gives the second vector.
+                    let n = spectrum.shapes.nrows();
+                    let shape = (0..n).map(|i| spectrum.shapes[(i, second)]);
+                    vector = std::iter::repeat_n(c64::ZERO, n).chain(shape).collect();
+                    off = orthogonalise(&mut vector, first);
+                }
+                if off < 1e-12 {
+                    return Err(SensitivityError::Singular { root: second });
+                }
+                basis.push(vector);
+            }
+        }
+        if self.scale.is_some() {
+            // The complex conjugates of the modes complete the basis.
+            let mut conjugates = vec![];
+            for (group, &place) in groups.iter().zip(&places) {
+                let members = if group.second.is_some() { 2 } else { 1 };
+                if group.first < spectrum.mode_count {
+                    let conjugate = |v: &Vec<c64>| v.iter().map(|x| x.conj()).collect::<Vec<c64>>();
+                    conjugates.extend(basis[place..place + members].iter().map(conjugate));
+                }
+            }
+            basis.extend(conjugates);
+        }
+        let size = basis.first().map_or(0, Vec::len);
+        if basis.len() != size {
+            return Err(SensitivityError::Roots { found: basis.len(), expected: size });
+        }
+        Ok((Mat::from_fn(size, size, |i, j| basis[j][i]), places))
+    }
+
     /// `A V`.
     fn apply(&self, v: MatRef<'_, c64>) -> Mat<c64> {
         let n = self.stiffness.nrows();
@@ -320,45 +364,8 @@ fn blocks(
     wanted: &[Group],
 ) -> Result<Vec<Block>, SensitivityError> {
     let operator = Operator::new(model, spectrum)?;
-    let mut basis: Vec<Vec<c64>> = vec![];
-    let mut places = vec![];
-    for group in groups {
-        places.push(basis.len());
-        basis.push(operator.vector(spectrum, group.first));
-        if let Some(second) = group.second {
-            let mut vector = operator.vector(spectrum, second);
-            let first = &basis[basis.len() - 1];
-            let mut off = orthogonalise(&mut vector, first);
-            if off < 1e-12 && operator.scale.is_some() {
-                // A double root at the origin has a single shape; a state with velocity only gives the second vector.
-                let n = spectrum.shapes.nrows();
-                let shape = (0..n).map(|i| spectrum.shapes[(i, second)]);
-                vector = std::iter::repeat_n(c64::ZERO, n).chain(shape).collect();
-                off = orthogonalise(&mut vector, first);
-            }
-            if off < 1e-12 {
-                return Err(SensitivityError::Singular { root: second });
-            }
-            basis.push(vector);
-        }
-    }
-    if operator.scale.is_some() {
-        // The complex conjugates of the modes complete the basis.
-        let mut conjugates = vec![];
-        for (group, &place) in groups.iter().zip(&places) {
-            let members = if group.second.is_some() { 2 } else { 1 };
-            if group.first < spectrum.mode_count {
-                let conjugate = |v: &Vec<c64>| v.iter().map(|x| x.conj()).collect::<Vec<c64>>();
-                conjugates.extend(basis[place..place + members].iter().map(conjugate));
-            }
-        }
-        basis.extend(conjugates);
-    }
-    let size = basis.first().map_or(0, Vec::len);
-    if basis.len() != size {
-        return Err(SensitivityError::Roots { found: basis.len(), expected: size });
-    }
-    let right = Mat::from_fn(size, size, |i, j| basis[j][i]);
+    let (right, places) = operator.basis(spectrum, groups)?;
+    let size = right.nrows();
     let columns: Vec<usize> = wanted
         .iter()
         .flat_map(|group| {

@@ -81,17 +81,7 @@ impl Analysed<'_> {
     ) -> Result<Residual, ReductionError> {
         let pencil = &self.pencil;
         let (what, mass, n) = (pencil.what, pencil.mass, pencil.dimension());
-        let last = modes.omega_squared.last().copied().unwrap_or(0.0);
-        let diagonal = |matrix: &SparseMatrix, k: usize| matrix.get(k, k).copied().unwrap_or(0.0);
-        let largest = (0..n).map(|k| diagonal(pencil.stiffness, k) / diagonal(mass, k)).fold(0.0, f64::max);
-        if last <= RIGID * largest {
-            return Err(ReductionError::OnlyRigid { what: what.to_owned(), modes: modes.omega_squared.len() });
-        }
-        let limit = -super::SEMIDEFINITE_TOLERANCE * last.abs();
-        if let Some((mode, &value)) = modes.omega_squared.iter().enumerate().find(|(_, square)| **square < limit) {
-            return Err(ReductionError::NegativeStiffness { what: format!("{what}.stiffness"), mode, value, limit });
-        }
-        let shift = SHIFT * last;
+        let shift = self.shift(modes)?;
         let factor = pencil.llt(shift)?.ok_or(ReductionError::NoShift { what: what.to_owned(), value: shift })?;
         progress(Progress::Factored { shift });
         let free: Vec<usize> = rows.iter().flatten().copied().collect();
@@ -133,40 +123,66 @@ impl Analysed<'_> {
             progress(Progress::Loaded { solved, loads: free.len() });
         }
         drop(factor);
-        for (chunk, right) in answers.iter().enumerate() {
-            let right = times(mass, Mat::from_fn(n, right.ncols(), |i, j| f64::from(right[(i, j)])).as_ref());
-            for (other, left) in answers.iter().enumerate().skip(chunk) {
-                let product = product_of(left, &right);
-                for j in 0..product.ncols() {
-                    for i in 0..product.nrows() {
-                        let (i, j, value) = (other * TOGETHER + i, chunk * TOGETHER + j, product[(i, j)]);
-                        inertia[(i, j)] = value;
-                        inertia[(j, i)] = value;
-                    }
+        if inertia_by == InertiaBy::KeptAnswers {
+            inertia = inertia_of_answers(mass, &answers, free.len());
+        }
+        let shifted = |i: usize, j: usize| flexibility[(i, j)] + shift * inertia[(i, j)];
+        Ok(Residual { flexibility: over_rows(rows, &shifted), inertia: over_rows(rows, &|i, j| inertia[(i, j)]) })
+    }
+
+    /// The shift of the factor, from the highest of the kept modes.
+    fn shift(&self, modes: &SparseModes) -> Result<f64, ReductionError> {
+        let (what, mass, stiffness) = (self.pencil.what, self.pencil.mass, self.pencil.stiffness);
+        let last = modes.omega_squared.last().copied().unwrap_or(0.0);
+        let diagonal = |matrix: &SparseMatrix, k: usize| matrix.get(k, k).copied().unwrap_or(0.0);
+        let largest =
+            (0..self.pencil.dimension()).map(|k| diagonal(stiffness, k) / diagonal(mass, k)).fold(0.0, f64::max);
+        if last <= RIGID * largest {
+            return Err(ReductionError::OnlyRigid { what: what.to_owned(), modes: modes.omega_squared.len() });
+        }
+        let limit = -super::SEMIDEFINITE_TOLERANCE * last.abs();
+        if let Some((mode, &value)) = modes.omega_squared.iter().enumerate().find(|(_, square)| **square < limit) {
+            return Err(ReductionError::NegativeStiffness { what: format!("{what}.stiffness"), mode, value, limit });
+        }
+        Ok(SHIFT * last)
+    }
+}
+
+/// Residual inertia between `loads` loads from the answers to them, `Xᵀ M X`.
+fn inertia_of_answers(mass: &SparseMatrix, answers: &[Mat<f32>], loads: usize) -> Mat<f64> {
+    let mut inertia = Mat::zeros(loads, loads);
+    for (chunk, right) in answers.iter().enumerate() {
+        let right = times(mass, Mat::from_fn(mass.nrows(), right.ncols(), |i, j| f64::from(right[(i, j)])).as_ref());
+        for (other, left) in answers.iter().enumerate().skip(chunk) {
+            let product = product_of(left, &right);
+            for j in 0..product.ncols() {
+                for i in 0..product.nrows() {
+                    let (i, j, value) = (other * TOGETHER + i, chunk * TOGETHER + j, product[(i, j)]);
+                    inertia[(i, j)] = value;
+                    inertia[(j, i)] = value;
                 }
             }
         }
-        let mut position = 0;
-        let place: Vec<Option<usize>> = rows
-            .iter()
-            .map(|row| {
-                row.map(|_| {
-                    position += 1;
-                    position - 1
-                })
-            })
-            .collect();
-        let full = |entry: &dyn Fn(usize, usize) -> f64| {
-            Mat::from_fn(rows.len(), rows.len(), |i, j| match (place[i], place[j]) {
-                (Some(i), Some(j)) => 0.5 * (entry(i, j) + entry(j, i)),
-                _ => 0.0,
-            })
-        };
-        Ok(Residual {
-            flexibility: full(&|i, j| flexibility[(i, j)] + shift * inertia[(i, j)]),
-            inertia: full(&|i, j| inertia[(i, j)]),
-        })
     }
+    inertia
+}
+
+/// The symmetric part of `entry` between the degrees of freedom `rows`; 0 for fixed ones (`None`), which have no entry.
+fn over_rows(rows: &[Option<usize>], entry: &dyn Fn(usize, usize) -> f64) -> Mat<f64> {
+    let mut position = 0;
+    let place: Vec<Option<usize>> = rows
+        .iter()
+        .map(|row| {
+            row.map(|_| {
+                position += 1;
+                position - 1
+            })
+        })
+        .collect();
+    Mat::from_fn(rows.len(), rows.len(), |i, j| match (place[i], place[j]) {
+        (Some(i), Some(j)) => 0.5 * (entry(i, j) + entry(j, i)),
+        (None, _) | (_, None) => 0.0,
+    })
 }
 
 /// `leftᵀ right`, computed in double precision.

@@ -33,6 +33,11 @@ pub struct Branches<'a> {
 }
 
 impl Branches<'_> {
+    /// Number of real functions per symmetric function: those of `λ²` of an undamped model are real.
+    fn parts(&self) -> usize {
+        if self.undamped { 1 } else { 2 }
+    }
+
     /// Value of a branch: `λ²` of an undamped model, `λ` of a damped one.
     fn z(&self, sample: usize, branch: usize) -> c64 {
         self.samples[sample].z[self.roots[sample][branch]]
@@ -57,6 +62,22 @@ impl Branches<'_> {
     fn condition(&self, sample: usize, branch: usize) -> f64 {
         self.samples[sample].conditions[self.roots[sample][branch]]
     }
+}
+
+/// The symmetric functions of a cluster at the samples.
+struct Sampled {
+    /// Values and derivatives: rows by sample and derivative, columns by function and its real and imaginary part.
+    data: Mat<f64>,
+    /// Largest distance of a member from the mean.
+    radius: f64,
+    /// Largest imaginary part, relative, of a function of an undamped model.
+    stray: f64,
+    /// Whether the derivatives of all members are sound, by sample.
+    sound: Vec<bool>,
+    /// Allowed error of every function.
+    allowed: Vec<f64>,
+    /// Largest condition number of a single root; 1 for a cluster of several.
+    condition: f64,
 }
 
 impl Builder<'_> {
@@ -102,8 +123,44 @@ impl Builder<'_> {
 
     /// Expands the symmetric functions of the branches `members`.
     fn expand(&self, branches: &Branches<'_>, fit: &Fit, members: &[usize]) -> Expansion {
+        let (size, parts) = (members.len(), branches.parts());
+        let Sampled { data, radius, stray, sound, allowed, condition } = self.sampled(branches, members);
+        let mut expansion = Expansion { channels: vec![], errors: vec![0.0; size], degree: 0, failing: Some(0) };
+        // Complex functions in an undamped model: the conjugate of a member is not in the cluster.
+        if stray > 1e-6 {
+            return expansion;
+        }
+        let fitted = if sound.iter().all(|&sound| sound) {
+            fit.expand(data)
+        } else {
+            match Fit::new(&self.chart.basis, &branches.units, &sound) {
+                Some(fit) => fit.expand(data),
+                None => return expansion,
+            }
+        };
+        let mut failing: Option<(f64, usize)> = None;
+        for k in 0..size {
+            let floor = branches.rounding * size as f64 * condition * radius.max(branches.rounding).powi(k as i32);
+            for fitted in &fitted[k * parts..(k + 1) * parts] {
+                let missing = SAFETY * fitted.missing;
+                expansion.errors[k] += missing + floor;
+                let excess = missing / (allowed[k] / parts as f64 + 8.0 * floor);
+                if excess.is_nan() || excess > 1.0 && failing.is_none_or(|(worst, _)| excess > worst) {
+                    failing = Some((excess, fitted.worst_axis));
+                }
+            }
+        }
+        expansion.channels = fitted.into_iter().map(|fitted| fitted.coefficients).collect();
+        let degree = self.truncate(&mut expansion, &allowed, parts);
+        expansion.degree = degree;
+        expansion.failing = failing.map(|(_, axis)| axis);
+        expansion
+    }
+
+    /// The symmetric functions of the branches `members` and their derivatives at the samples.
+    fn sampled(&self, branches: &Branches<'_>, members: &[usize]) -> Sampled {
         let (axes, size, count) = (self.chart.axes.len(), members.len(), branches.samples.len());
-        let parts = if branches.undamped { 1 } else { 2 };
+        let parts = branches.parts();
         // A relative error of `λ` counts twice in `λ²`.
         let tolerance = self.options.tolerance / parts as f64;
         let per_point = Basis::orders(axes).len();
@@ -141,46 +198,24 @@ impl Builder<'_> {
                 }
             }
         }
-        let mut expansion = Expansion { channels: vec![], errors: vec![0.0; size], degree: 0, failing: Some(0) };
-        // Complex functions in an undamped model: the conjugate of a member is not in the cluster.
-        if stray > 1e-6 {
-            return expansion;
-        }
-        let fitted = if sound.iter().all(|&sound| sound) {
-            fit.expand(data)
-        } else {
-            match Fit::new(&self.chart.basis, &branches.units, &sound) {
-                Some(fit) => fit.expand(data),
-                None => return expansion,
-            }
-        };
-        let mut failing: Option<(f64, usize)> = None;
-        for k in 0..size {
-            let floor = branches.rounding * size as f64 * condition * radius.max(branches.rounding).powi(k as i32);
-            for fitted in &fitted[k * parts..(k + 1) * parts] {
-                let missing = SAFETY * fitted.missing;
-                expansion.errors[k] += missing + floor;
-                let excess = missing / (allowed[k] / parts as f64 + 8.0 * floor);
-                if excess.is_nan() || excess > 1.0 && failing.is_none_or(|(worst, _)| excess > worst) {
-                    failing = Some((excess, fitted.worst_axis));
-                }
-            }
-        }
-        expansion.channels = fitted.into_iter().map(|fitted| fitted.coefficients).collect();
-        // Truncation at a common degree for all functions of the cluster. The sum of the magnitudes of the dropped
-        // coefficients bounds the error. The bound is attained if one of them dominates: errors equal to their bound
-        // have been observed. The dropped sum is at most 0.1 of the allowed error.
+        Sampled { data, radius, stray, sound, allowed, condition }
+    }
+
+    /// Truncates all functions of a cluster at a common degree, adds what is dropped to their error bounds, and returns
+    /// the degree. The sum of the magnitudes of the dropped coefficients bounds the error. The bound is attained if one
+    /// of them dominates: errors equal to their bound have been observed. The dropped sum is at most 0.1 of the allowed
+    /// error.
+    fn truncate(&self, expansion: &mut Expansion, allowed: &[f64], parts: usize) -> usize {
+        let columns = expansion.channels.len();
         let basis = &self.chart.basis;
         let beyond = |column: usize, degree: usize| basis.beyond(&expansion.channels[column], degree);
         let enough =
-            |degree: &usize| (0..size * parts).all(|column| beyond(column, *degree) <= 0.1 * allowed[column / parts]);
+            |degree: &usize| (0..columns).all(|column| beyond(column, *degree) <= 0.1 * allowed[column / parts]);
         let degree = (0..basis.degree()).find(enough).unwrap_or(basis.degree());
-        for column in 0..size * parts {
+        for column in 0..columns {
             expansion.errors[column / parts] += basis.beyond(&expansion.channels[column], degree);
         }
-        expansion.degree = degree;
-        expansion.failing = failing.map(|(_, axis)| axis);
-        expansion
+        degree
     }
 
     /// Expands the remainders of the traces and the pad participations, and arranges all coefficients as a leaf. The
@@ -192,6 +227,42 @@ impl Builder<'_> {
         low: &[f64; MAX_AXES],
         high: &[f64; MAX_AXES],
     ) -> Result<Leaf, usize> {
+        let (remainders, remainder_errors) = self.expand_remainders(branches, &settled)?;
+        let shares = self.shares(branches, &settled);
+        let (clusters, functions, auxiliary) = self.arrange(settled, remainders, shares);
+        Ok(Leaf { low: *low, high: *high, clusters, tracked: branches.count, functions, auxiliary, remainder_errors })
+    }
+
+    /// Coefficients and error bounds of the remainders of both traces. The error is the axis to split along.
+    fn expand_remainders(
+        &self,
+        branches: &Branches<'_>,
+        settled: &[(Vec<usize>, Expansion)],
+    ) -> Result<(Vec<Vec<f64>>, [f64; 2]), usize> {
+        let (rest, largest) = self.remainders(branches, settled);
+        let sound: Vec<bool> = (0..branches.samples.len())
+            .map(|node| {
+                let members = || settled.iter().flat_map(|(members, _)| members);
+                members().all(|&k| branches.condition(node, k) < 1e5 && branches.has_curvature(node, k))
+            })
+            .collect();
+        let Some(fit) = Fit::new(&self.chart.basis, &branches.units, &sound) else { return Err(0) };
+        let mut remainders = vec![];
+        let mut remainder_errors = [0.0; 2];
+        for (k, fitted) in fit.expand(rest).into_iter().enumerate() {
+            let floor = 64.0 * f64::EPSILON * largest[k] * self.sampler.model.dimension() as f64;
+            remainder_errors[k] = SAFETY * fitted.missing + floor;
+            if remainder_errors[k].is_nan() || remainder_errors[k] > 1e-6 * largest[k] + 2.0 * floor {
+                return Err(fitted.worst_axis);
+            }
+            remainders.push(fitted.coefficients);
+        }
+        Ok((remainders, remainder_errors))
+    }
+
+    /// What both traces and their derivatives leave after the charted roots, with a column for each trace, and the
+    /// largest magnitude of each trace.
+    fn remainders(&self, branches: &Branches<'_>, settled: &[(Vec<usize>, Expansion)]) -> (Mat<f64>, [f64; 2]) {
         let axes = self.chart.axes.len();
         let weight = if branches.undamped { 1.0 } else { 2.0 };
         let per_point = Basis::orders(axes).len();
@@ -227,24 +298,16 @@ impl Builder<'_> {
                 }
             }
         }
-        let sound: Vec<bool> = (0..branches.samples.len())
-            .map(|node| {
-                let members = || settled.iter().flat_map(|(members, _)| members);
-                members().all(|&k| branches.condition(node, k) < 1e5 && branches.has_curvature(node, k))
-            })
-            .collect();
-        let Some(fit) = Fit::new(&self.chart.basis, &branches.units, &sound) else { return Err(0) };
-        let mut remainders = vec![];
-        let mut remainder_errors = [0.0; 2];
-        for (k, fitted) in fit.expand(rest).into_iter().enumerate() {
-            let floor = 64.0 * f64::EPSILON * largest[k] * self.sampler.model.dimension() as f64;
-            remainder_errors[k] = SAFETY * fitted.missing + floor;
-            if remainder_errors[k].is_nan() || remainder_errors[k] > 1e-6 * largest[k] + 2.0 * floor {
-                return Err(fitted.worst_axis);
-            }
-            remainders.push(fitted.coefficients);
-        }
-        let shares = self.shares(branches, &settled);
+        (rest, largest)
+    }
+
+    /// Arranges clusters and channels: those of the symmetric functions, and those of remainders and pad participations.
+    fn arrange(
+        &self,
+        settled: Vec<(Vec<usize>, Expansion)>,
+        remainders: Vec<Vec<f64>>,
+        shares: Vec<Option<(usize, Vec<f64>)>>,
+    ) -> (Vec<Cluster>, Channels, Channels) {
         let degree = self.chart.basis.degree();
         let mut auxiliary: Vec<(usize, Option<usize>, Vec<f64>)> =
             remainders.into_iter().map(|coefficients| (degree, None, coefficients)).collect();
@@ -275,15 +338,7 @@ impl Builder<'_> {
         let mut clusters: Vec<_> = lowest.into_iter().zip(clusters).collect();
         clusters.sort_by_key(|(lowest, _)| *lowest);
         let clusters = clusters.into_iter().map(|(_, cluster)| cluster).collect();
-        Ok(Leaf {
-            low: *low,
-            high: *high,
-            clusters,
-            tracked: branches.count,
-            functions: Channels::new(&self.chart.basis, &columns),
-            auxiliary: Channels::new(&self.chart.basis, &auxiliary),
-            remainder_errors,
-        })
+        (clusters, Channels::new(&self.chart.basis, &columns), Channels::new(&self.chart.basis, &auxiliary))
     }
 
     /// Degree and coefficients of the pad participation of every single root, where they converge. Slopes of
