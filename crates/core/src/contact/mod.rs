@@ -13,6 +13,7 @@
 mod law;
 mod path;
 mod response;
+mod shape;
 mod spline;
 mod statics;
 #[cfg(test)]
@@ -20,5 +21,6 @@ mod tests;
 
 pub use law::{LawError, LawValue, PressureLaw, Smoothness};
 pub use response::{FreeModes, ResponseError, RigidMotions, StaticResponse, TruncatedResponse};
+pub use shape::ShapeError;
 pub use spline::{PressureTable, TableError};
 pub use statics::{MeasuredLoad, PathEnd, StateSlope, Statics, StaticsError, StaticsParts, SteadyState};

@@ -2,6 +2,8 @@
 
 use faer::{Mat, MatRef};
 
+use super::shape::{ShapeError, check_shape};
+
 /// `ω²` up to this share of the largest one belong to rigid motions: a rounding error of the modes.
 const RIGID: f64 = 1e-11;
 
@@ -58,19 +60,8 @@ pub struct TruncatedResponse<'a> {
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ResponseError {
     /// A matrix or list has the wrong shape.
-    #[error("{what} is {rows}x{columns}, expected {expected_rows}x{expected_columns}")]
-    Shape {
-        /// Which matrix or list.
-        what: &'static str,
-        /// Number of rows found.
-        rows: usize,
-        /// Number of columns found.
-        columns: usize,
-        /// Number of rows expected.
-        expected_rows: usize,
-        /// Number of columns expected.
-        expected_columns: usize,
-    },
+    #[error(transparent)]
+    Shape(#[from] ShapeError),
     /// A mode has a negative squared frequency beyond rounding.
     #[error("mode {mode}: squared frequency is {value:e}, expected a finite number of at least -{limit:e}")]
     Frequency {
@@ -108,10 +99,8 @@ impl StaticResponse {
                 ("residual gap per load", (truncated.gap_per_load.len(), 1), (c, 1)),
             ]);
         }
-        for (what, (rows, columns), (expected_rows, expected_columns)) in shapes {
-            if (rows, columns) != (expected_rows, expected_columns) {
-                return Err(ResponseError::Shape { what, rows, columns, expected_rows, expected_columns });
-            }
+        for (what, found, expected) in shapes {
+            check_shape(what, found, expected)?;
         }
         let largest = modes.omega_squared.iter().fold(0.0f64, |largest, value| largest.max(value.abs()));
         let limit = RIGID * largest;

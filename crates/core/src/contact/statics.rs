@@ -5,6 +5,7 @@ use faer::{Mat, MatRef};
 use super::law::{LawError, LawValue, PressureLaw};
 use super::path;
 use super::response::StaticResponse;
+use super::shape::{ShapeError, check_shape};
 
 /// Which force a rig measures as its normal load.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -67,19 +68,8 @@ pub enum StaticsError {
     #[error("contact law: {0}")]
     Law(#[from] LawError),
     /// A matrix or list has the wrong shape.
-    #[error("{what} is {rows}x{columns}, expected {expected_rows}x{expected_columns}")]
-    Shape {
-        /// Which matrix or list.
-        what: &'static str,
-        /// Number of rows found.
-        rows: usize,
-        /// Number of columns found.
-        columns: usize,
-        /// Number of rows expected.
-        expected_rows: usize,
-        /// Number of columns expected.
-        expected_columns: usize,
-    },
+    #[error(transparent)]
+    Shape(#[from] ShapeError),
     /// An entry is outside its range.
     #[error("{what}, entry ({row}, {column}), is {value}, expected {limit}")]
     Value {
@@ -223,11 +213,7 @@ impl Statics {
             ("sliding per rigid motion", &rigid.sliding, c, r),
             ("load on rigid motions", &rigid_load, r, 1),
         ] {
-            if matrix.shape() != (rows, columns) {
-                let (expected_rows, expected_columns) = (rows, columns);
-                let (rows, columns) = matrix.shape();
-                return Err(StaticsError::Shape { what, rows, columns, expected_rows, expected_columns });
-            }
+            check_shape(what, matrix.shape(), (rows, columns))?;
             for j in 0..columns {
                 for i in 0..rows {
                     let value = matrix[(i, j)];

@@ -16,6 +16,7 @@ mod leaf;
 pub(crate) mod pairing;
 mod samples;
 mod totals;
+mod tree;
 mod words;
 
 use faer::c64;
@@ -29,6 +30,7 @@ use channels::Channels;
 use cluster::MAX_SIZE;
 use fit::Basis;
 use totals::Totals;
+use tree::Branch;
 
 #[cfg(any(test, feature = "proof"))]
 pub(crate) use leaf::MERGING;
@@ -117,23 +119,6 @@ pub enum NotCharted {
         /// Largest difference that the error bounds allow.
         limit: f64,
     },
-}
-
-/// A node of the tree of boxes.
-#[derive(Clone, Debug)]
-enum Branch {
-    /// Split along an axis at a coordinate; `below` and `above` are indices of branches.
-    Split {
-        axis: usize,
-        at: f64,
-        below: usize,
-        above: usize,
-    },
-    Leaf(usize),
-    /// Not converged: a dense solve is needed there.
-    Dense,
-    /// Not tried yet: a dense solve is needed there until it is.
-    Pending,
 }
 
 /// Roots of a leaf that are expanded together.
@@ -334,7 +319,7 @@ impl Chart {
 
     /// Whether `p` lies in a leaf.
     pub fn covers(&self, p: &OperatingPoint) -> bool {
-        self.coordinates(p).is_ok_and(|x| self.find(&x).is_ok())
+        self.coordinates(p).is_ok_and(|x| tree::find(&self.branches, &x).is_some())
     }
 
     /// Coordinates of `p` in the box of the chart.
@@ -348,18 +333,6 @@ impl Chart {
             }
         }
         Ok(x)
-    }
-
-    /// Index of the leaf that contains the coordinates `x`.
-    fn find(&self, x: &[f64; MAX_AXES]) -> Result<usize, NotCharted> {
-        let mut at = 0;
-        loop {
-            match self.branches[at] {
-                Branch::Split { axis, at: middle, below, above } => at = if x[axis] < middle { below } else { above },
-                Branch::Leaf(leaf) => return Ok(leaf),
-                Branch::Dense | Branch::Pending => return Err(NotCharted::NotConverged),
-            }
-        }
     }
 
     /// Appends the values of the charted roots at `p` to `out`, in no particular order: `λ²` of an undamped model,
@@ -397,7 +370,7 @@ impl Chart {
     /// The leaf that contains `p`. `scratch` then holds the basis polynomials and the symmetric functions at `p`.
     fn expand(&self, p: &OperatingPoint, scratch: &mut Scratch) -> Result<&Leaf, NotCharted> {
         let x = self.coordinates(p)?;
-        let leaf = &self.leaves[self.find(&x)?];
+        let leaf = &self.leaves[tree::find(&self.branches, &x).ok_or(NotCharted::NotConverged)?];
         let mut unit = [0.0; MAX_AXES];
         for (k, unit) in unit[..self.axes.len()].iter_mut().enumerate() {
             *unit = 2.0 * (x[k] - leaf.low[k]) / (leaf.high[k] - leaf.low[k]) - 1.0;

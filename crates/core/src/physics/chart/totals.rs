@@ -7,6 +7,7 @@
 
 use faer::Mat;
 
+use super::tree::{self, Branch};
 use super::{Axis, MAX_AXES, NotCharted};
 use crate::chebyshev::{coefficients, nodes, polynomials};
 use crate::physics::model::Model;
@@ -28,20 +29,6 @@ const SAFETY: f64 = 4.0;
 /// Number of points at which each expansion is checked.
 const HELD_OUT: usize = 3;
 
-/// A box of the tree.
-#[derive(Clone, Debug, PartialEq)]
-enum Part {
-    Split {
-        axis: usize,
-        at: f64,
-        below: usize,
-        above: usize,
-    },
-    Leaf(usize),
-    /// Not expanded: there is no state somewhere, or the expansion does not converge.
-    Missing,
-}
-
 /// Expansions over a box.
 #[derive(Clone, Debug, PartialEq)]
 struct Expanded {
@@ -58,7 +45,7 @@ struct Expanded {
 pub(super) struct Totals {
     axes: usize,
     dimension: usize,
-    parts: Vec<Part>,
+    branches: Vec<Branch>,
     leaves: Vec<Expanded>,
 }
 
@@ -78,27 +65,27 @@ impl Totals {
     /// Expands the totals of a model. `go_on` is asked before every box; `None` if it returns false.
     pub fn build(domain: &Domain<'_>, go_on: &mut dyn FnMut() -> bool) -> Option<Self> {
         let (axes, dimension) = (domain.axes.len(), domain.model.dimension());
-        let mut totals = Self { axes, dimension, parts: vec![Part::Missing], leaves: vec![] };
+        let mut totals = Self { axes, dimension, branches: vec![Branch::Dense], leaves: vec![] };
         let mut open = vec![(0, domain.low, domain.high)];
         while let Some((slot, low, high)) = open.pop() {
             if !go_on() {
                 return None;
             }
-            totals.parts[slot] = match domain.expand(&low, &high) {
+            totals.branches[slot] = match domain.expand(&low, &high) {
                 Ok(leaf) => {
                     totals.leaves.push(leaf);
-                    Part::Leaf(totals.leaves.len() - 1)
+                    Branch::Leaf(totals.leaves.len() - 1)
                 }
                 Err(axis) if domain.share(&low, &high) > domain.smallest_share => {
                     let at = 0.5 * (low[axis] + high[axis]);
                     let (mut middle_low, mut middle_high) = (low, high);
                     (middle_low[axis], middle_high[axis]) = (at, at);
-                    let below = totals.parts.len();
-                    totals.parts.extend([Part::Missing, Part::Missing]);
+                    let below = totals.branches.len();
+                    totals.branches.extend([Branch::Dense, Branch::Dense]);
                     open.extend([(below, low, middle_high), (below + 1, middle_low, high)]);
-                    Part::Split { axis, at, below, above: below + 1 }
+                    Branch::Split { axis, at, below, above: below + 1 }
                 }
-                Err(_) => Part::Missing,
+                Err(_) => Branch::Dense,
             };
         }
         Some(totals)
@@ -114,26 +101,15 @@ impl Totals {
     /// # Errors
     /// [`NotCharted::NotConverged`] where they are not expanded.
     pub fn at(&self, x: &[f64; MAX_AXES]) -> Result<Exact, NotCharted> {
-        let mut slot = 0;
-        let leaf = loop {
-            match self.parts[slot] {
-                Part::Split { axis, at, below, above } => slot = if x[axis] < at { below } else { above },
-                Part::Leaf(leaf) => break &self.leaves[leaf],
-                Part::Missing => return Err(NotCharted::NotConverged),
-            }
-        };
+        let leaf = &self.leaves[tree::find(&self.branches, x).ok_or(NotCharted::NotConverged)?];
         Ok(leaf.at(x, self.axes, self.dimension))
     }
 
     /// The complete content.
     pub fn words(&self) -> Vec<u64> {
-        let mut words = vec![self.axes as u64, self.dimension as u64, self.parts.len() as u64];
-        for part in &self.parts {
-            words.extend(match *part {
-                Part::Split { axis, at, below, above } => [axis as u64, at.to_bits(), below as u64, above as u64],
-                Part::Leaf(leaf) => [u64::MAX, leaf as u64, 0, 0],
-                Part::Missing => [u64::MAX, u64::MAX, 0, 0],
-            });
+        let mut words = vec![self.axes as u64, self.dimension as u64, self.branches.len() as u64];
+        for branch in &self.branches {
+            words.extend(branch.words());
         }
         words.push(self.leaves.len() as u64);
         for leaf in &self.leaves {
@@ -151,22 +127,11 @@ impl Totals {
         if axes == 0 || axes > MAX_AXES || count == 0 || count > words.len() / 4 {
             return None;
         }
-        let mut parts = vec![];
+        let mut branches = vec![];
         for k in 0..count {
-            let (part, rest) = words.split_first_chunk::<4>()?;
+            let (branch, rest) = words.split_first_chunk::<4>()?;
             words = rest;
-            parts.push(match part {
-                [u64::MAX, u64::MAX, 0, 0] => Part::Missing,
-                [u64::MAX, leaf, 0, 0] => Part::Leaf(number(leaf)?),
-                [axis, at, below, above] => {
-                    let (axis, below, above) = (number(axis)?, number(below)?, number(above)?);
-                    let behind = |other: usize| other > k && other < count;
-                    if axis >= axes || !behind(below) || !behind(above) {
-                        return None;
-                    }
-                    Part::Split { axis, at: f64::from_bits(*at), below, above }
-                }
-            });
+            branches.push(Branch::from_words(*branch, k, count, axes)?);
         }
         let (leaf_count, mut words) = words.split_first()?;
         let size = 2 * MAX_AXES + 2 + QUANTITIES * NODES[axes].pow(axes as u32);
@@ -186,8 +151,8 @@ impl Totals {
                 coefficients: numbers[2 * MAX_AXES + 2..].to_vec(),
             });
         }
-        let known = parts.iter().all(|part| !matches!(part, Part::Leaf(leaf) if *leaf >= leaves.len()));
-        known.then_some(Self { axes, dimension, parts, leaves })
+        let known = branches.iter().all(|branch| branch.is_within(leaves.len()) && *branch != Branch::Pending);
+        known.then_some(Self { axes, dimension, branches, leaves })
     }
 }
 

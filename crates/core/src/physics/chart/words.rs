@@ -10,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 31] = [
+pub const BUILDER: [&str; 33] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -21,6 +21,7 @@ pub const BUILDER: [&str; 31] = [
     include_str!("pairing.rs"),
     include_str!("samples.rs"),
     include_str!("totals.rs"),
+    include_str!("tree.rs"),
     include_str!("words.rs"),
     include_str!("../decoupled.rs"),
     include_str!("../dense_eigen.rs"),
@@ -37,6 +38,7 @@ pub const BUILDER: [&str; 31] = [
     include_str!("../../contact/mod.rs"),
     include_str!("../../contact/path.rs"),
     include_str!("../../contact/response.rs"),
+    include_str!("../../contact/shape.rs"),
     include_str!("../../contact/spline.rs"),
     include_str!("../../contact/statics.rs"),
     include_str!("../tracking.rs"),
@@ -55,12 +57,7 @@ impl Chart {
         words.extend(self.low.iter().chain(&self.high).map(|x| x.to_bits()));
         words.push(self.branches.len() as u64);
         for branch in &self.branches {
-            words.extend(match *branch {
-                Branch::Split { axis, at, below, above } => [axis as u64, at.to_bits(), below as u64, above as u64],
-                Branch::Leaf(leaf) => [u64::MAX, leaf as u64, 0, 0],
-                Branch::Dense => [u64::MAX, u64::MAX, 0, 0],
-                Branch::Pending => [u64::MAX, u64::MAX, 1, 0],
-            });
+            words.extend(branch.words());
         }
         words.push(self.leaves.len() as u64);
         for leaf in &self.leaves {
@@ -96,10 +93,10 @@ impl Chart {
         }
         let (low, high) = (words.numbers()?, words.numbers()?);
         let count = words.count(words.0.len())?;
-        let branches: Vec<Branch> = (0..count).map(|k| words.branch(k, count)).collect::<Option<_>>()?;
+        let branches: Vec<Branch> = (0..count).map(|k| words.branch(k, count, axes.len())).collect::<Option<_>>()?;
         let leaves: Vec<Leaf> =
             (0..words.count(words.0.len())?).map(|_| words.leaf(&basis, undamped)).collect::<Option<_>>()?;
-        let known = branches.iter().all(|branch| !matches!(branch, Branch::Leaf(leaf) if *leaf >= leaves.len()));
+        let known = branches.iter().all(|branch| branch.is_within(leaves.len()));
         let totals = match words.0 {
             [] => None,
             words => Some(Totals::from_words(words).filter(|totals| totals.axes() == axes.len())?),
@@ -139,25 +136,8 @@ impl Reader<'_> {
         AXES.get(self.count(AXES.len())?).copied()
     }
 
-    /// Branch `k` of `count`. The branches it splits into must follow it.
-    fn branch(&mut self, k: usize, count: usize) -> Option<Branch> {
-        let words: [u64; 4] = [self.next()?, self.next()?, self.next()?, self.next()?];
-        Some(match words {
-            [u64::MAX, u64::MAX, 0, 0] => Branch::Dense,
-            [u64::MAX, u64::MAX, 1, 0] => Branch::Pending,
-            [u64::MAX, leaf, 0, 0] => Branch::Leaf(usize::try_from(leaf).ok()?),
-            [axis, at, below, above] => {
-                let (below, above) = (usize::try_from(below).ok()?, usize::try_from(above).ok()?);
-                let axis = usize::try_from(axis).ok().filter(|&axis| axis < MAX_AXES)?;
-                let behind = |other: usize| other > k && other < count;
-                (behind(below) && behind(above)).then_some(Branch::Split {
-                    axis,
-                    at: f64::from_bits(at),
-                    below,
-                    above,
-                })?
-            }
-        })
+    fn branch(&mut self, k: usize, count: usize, axes: usize) -> Option<Branch> {
+        Branch::from_words([self.next()?, self.next()?, self.next()?, self.next()?], k, count, axes)
     }
 
     fn leaf(&mut self, basis: &Basis, undamped: bool) -> Option<Leaf> {
