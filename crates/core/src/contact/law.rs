@@ -29,7 +29,7 @@ pub enum PressureLaw {
         /// `σ`, m; 0 for the law with a sharp onset.
         roughness_m: f64,
     },
-    /// `p = p_0 e^{δ/σ}`: rough surfaces. Analytic; a pair is never quite open.
+    /// `p = p_0 e^{δ/σ}`: rough surfaces. Analytic; every pair carries a force, however small, at any closure.
     Exponential {
         /// `p_0`, Pa: pressure at closure 0, positive.
         pressure: f64,
@@ -121,7 +121,7 @@ impl PressureLaw {
         }
     }
 
-    /// Whether a pair carries no force below some closure. Without such an onset a pair is never quite open.
+    /// Whether the force of a pair is exactly 0 below some closure. Otherwise every pair carries a force at any closure.
     pub fn opens(&self) -> bool {
         match *self {
             Self::Linear { .. } => true,
@@ -162,7 +162,8 @@ impl PressureLaw {
                 LawValue {
                     pressure: stiffness * reference_m * ratio.powf(exponent),
                     tangent: tangent * slope,
-                    // Far below a rounded onset the curvature is huge and the slope tiny: in this order nothing overflows.
+                    // Far below a rounded onset one factor is very large and another very small; multiplied in this order,
+                    // nothing overflows.
                     curvature: curvature * slope * slope + tangent * bend,
                 }
             }

@@ -1,8 +1,8 @@
-//! Newton steps for one state, and the path of states from `μ = 0`.
+//! Newton's method for one state of steady sliding, and continuation of states from `μ = 0`.
 //!
-//! Newton's direction is taken in the closures. The step along it is taken in `u_k = δ_k + f_k N_k`, the approach of a pair
-//! in series with a typical spring `1/f_k`: both an exponential and a sharp onset are nearly linear in it, so that long
-//! steps neither overflow nor open every pair.
+//! Newton's direction is computed for the closures. The step along it is taken in other variables, `u_k = δ_k + f_k N_k`:
+//! the approach of a pair in series with a spring of typical flexibility `f_k`. The force is nearly linear in `u_k` for an
+//! exponential law as for a law with a sharp onset, so long steps neither overflow nor open every pair.
 
 use faer::Mat;
 use faer::linalg::solvers::{PartialPivLu, Solve};
@@ -12,24 +12,24 @@ use super::statics::{MeasuredLoad, PathEnd, StateSlope, Statics, StaticsError, S
 
 /// Largest residual of a state, relative to the largest terms of the equations.
 const LIMIT: f64 = 1e-11;
-/// A residual at which no further step is taken.
+/// Residual at the level of rounding errors, at which Newton's method stops.
 const ROUNDING: f64 = 1e-15;
-/// Below this residual steps are taken in the closures at full length.
+/// Below this residual the steps have full length and are taken in the closures.
 const POLISH: f64 = 1e-9;
-/// Below this residual the Jacobian no longer changes.
+/// Below this residual the Jacobian is not computed again.
 const SETTLED: f64 = 1e-12;
-/// Most steps with the Jacobian of an anchor, and the reduction of the residual by one below which they end.
+/// Largest number of steps with the Jacobian of an anchor, and the factor by which each of them must reduce the residual.
 const MOST_CHORDS: usize = 12;
 const CONTRACTION: f64 = 0.3;
 /// Change of the friction coefficient that counts as much as a change of the load by a factor of e.
 const FRICTION_SCALE: f64 = 0.1;
-/// Most Newton steps, and most halvings of one.
+/// Largest number of Newton steps, and of halvings of one step.
 const MOST_STEPS: usize = 60;
 const MOST_HALVINGS: usize = 25;
-/// Stiffness of bilateral springs, relative to that of the pairs, that stand in for open pairs while the state without
-/// friction is approached; the last entry is the problem itself.
+/// Stiffness, relative to that of the pairs, of additional bilateral springs. The state without friction is solved with
+/// each of them in turn, from the state before; the last entry, 0, is the problem itself.
 const SUPPORTS: [&[f64]; 2] = [&[1.0, 0.0], &[1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-5, 1e-7, 0.0]];
-/// Longest step in the friction coefficient, and the shortest before the path is taken to end.
+/// Longest step in the friction coefficient, and the step below which the states are considered to end.
 const LONGEST: f64 = 0.1;
 const SHORTEST: f64 = 1e-13;
 /// Largest difference between predicted and found forces of a step, relative to their sum: larger ones could lead to
@@ -141,7 +141,7 @@ impl<'a> Equations<'a> {
         }
     }
 
-    /// Whether the pad is pushed on its back, if it is pushed at all.
+    /// Whether the force on the back presses the pad on the disc; without a load, any force is accepted.
     fn pushes(&self, point: &Point) -> bool {
         self.load <= 0.0 || self.back_force(point) > 0.0
     }
@@ -284,7 +284,7 @@ impl<'a> Equations<'a> {
             }
             times_columns(self.flexibility.as_ref(), &increments, &jacobian.closed, &mut moved);
             for k in 0..c {
-                // An open pair follows the others.
+                // The closure of an open pair follows from the other unknowns.
                 let mut value = right[(k, column)] - moved[k];
                 for other in 0..others {
                     let per = if other < rigid {
@@ -323,7 +323,7 @@ impl<'a> Equations<'a> {
                 }
                 let f = self.scales.flexibility[k];
                 let support = self.support * self.scales.stiffness[k];
-                // With the additional spring f is shared by it: δ (1 + f k_s) + f N.
+                // The additional spring adds its force to that of the pair: u = δ (1 + f k_s) + f N.
                 let stretch = 1.0 + f * support;
                 let approach = delta + f * value.pressure + t * (1.0 + f * value.tangent) * direction[k];
                 let flexibility = f * self.statics.parts.area[k] / stretch;
@@ -393,8 +393,8 @@ impl<'a> Equations<'a> {
         Point { closure, others }
     }
 
-    /// Whether a solution is the continuation of `state`: the determinant has the sign it had without friction, the pad is
-    /// pushed, and the forces are those predicted.
+    /// Whether a solution is the continuation of `state`: the determinant has the sign it had without friction, the force
+    /// on the back presses the pad on the disc, and the contact forces are close to the predicted ones.
     fn is_near(
         &self,
         state: &SteadyState,
@@ -606,7 +606,7 @@ fn classify(near: &Equations<'_>, state: &SteadyState, toward: f64, sign: i8) ->
     if state.rigid.is_empty() {
         return PathEnd::Turns;
     }
-    // A singular Jacobian beyond the last kink, or one that becomes singular while forces stay put: a part tips.
+    // A part tips if the Jacobian is singular beyond the last kink, or becomes singular at bounded forces.
     let beyond = 1e3 * SHORTEST * toward;
     let equations = Equations::new(statics, state.load_n, state.friction + beyond, 0.0, scales);
     let at = equations.evaluate(equations.predicted(state, [0.0, beyond]));
@@ -622,14 +622,14 @@ fn classify(near: &Equations<'_>, state: &SteadyState, toward: f64, sign: i8) ->
     if least <= 1e-9 * most { PathEnd::Tips } else { PathEnd::Turns }
 }
 
-/// A state that others are started from.
+/// A known state, at which the solution of nearby states starts.
 #[derive(Clone, Debug)]
 pub(super) struct Anchor {
     state: SteadyState,
     jacobian: Jacobian,
 }
 
-/// Anchors at the given conditions; those without a state are left out. At each load, one path leads through all friction
+/// Anchors at the given conditions; conditions without a state are omitted. At each load, one path leads through all friction
 /// coefficients of a sign.
 pub(super) fn anchors(statics: &Statics, loads_n: &[f64], s_mus: &[f64]) -> Vec<Anchor> {
     let mut anchors = vec![];
@@ -657,7 +657,7 @@ pub(super) fn anchors(statics: &Statics, loads_n: &[f64], s_mus: &[f64]) -> Vec<
     anchors
 }
 
-/// The state near the nearest of `anchors`; `None` if it cannot be told to be the one continued from `μ = 0`.
+/// The state, started from the nearest of `anchors`; `None` if it is not certain to be the one continued from `μ = 0`.
 pub(super) fn from_anchor(statics: &Statics, anchors: &[Anchor], load: f64, s_mu: f64) -> Option<SteadyState> {
     let away = |anchor: &Anchor| {
         let [by_load, by_friction] =

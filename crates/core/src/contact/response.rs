@@ -20,8 +20,8 @@ pub struct StaticResponse {
     pub rigid: RigidMotions,
 }
 
-/// Rigid motions `Φ_r` of free-floating parts, `r` in number: unknown amplitudes `ρ`, one balance of forces each. With
-/// `r = 0` every part is supported.
+/// Rigid motions `Φ_r` of free-floating parts, `r` in number. Each has an unknown amplitude in `ρ` and one equation of
+/// balance. With `r = 0` every part is supported.
 #[derive(Clone, Debug)]
 pub struct RigidMotions {
     /// `B_n Φ_r`, `c×r`: change of the gaps.
@@ -56,7 +56,7 @@ pub struct TruncatedResponse<'a> {
     pub gap_per_load: &'a [f64],
 }
 
-/// Why modes have no static response.
+/// Why the static response cannot be computed from modes.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ResponseError {
     /// A matrix or list has the wrong shape.

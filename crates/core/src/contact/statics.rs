@@ -16,7 +16,7 @@ pub enum MeasuredLoad {
     Contact,
 }
 
-/// What the statics of `c` contact pairs are made of.
+/// Input of the statics of `c` contact pairs.
 #[derive(Clone, Debug)]
 pub struct StaticsParts {
     /// Contact law of all pairs.
@@ -39,13 +39,14 @@ pub struct Statics {
     anchors: Vec<path::Anchor>,
 }
 
-/// How the states that follow from frictionless contact end.
+/// Why the states that continue frictionless contact end at some friction coefficient.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PathEnd {
-    /// Contact forces grow without limit, or the force on the back that belongs to the contact force vanishes.
+    /// At a given force on the back, the contact forces grow without limit; at a given contact force, the force on the
+    /// back vanishes.
     Jams,
-    /// The state turns back to smaller friction coefficients: beyond, there is no neighbouring state, and before it more
-    /// than one.
+    /// A turning point: from it the states continue towards smaller friction coefficients. Just below it there are two
+    /// states, just above it there is none nearby.
     Turns,
     /// The closed pairs no longer support a free-floating part.
     Tips,
@@ -102,7 +103,7 @@ pub enum StaticsError {
     NoStateAtRest {
         /// The load, N.
         load_n: f64,
-        /// What Newton steps leave of the forces, relative.
+        /// Residual of the forces, relative.
         residual: f64,
         /// Largest residual accepted.
         limit: f64,
@@ -168,7 +169,7 @@ pub struct SteadyState {
     pub curvature_n_per_m2: Vec<f64>,
     /// `ρ`, `r`: amplitudes of rigid motions.
     pub rigid: Vec<f64>,
-    /// What the equations leave, relative to the largest of their terms.
+    /// Residual of the equations, relative to the largest of their terms.
     pub residual: f64,
     /// Per N of the measured load.
     pub per_load: StateSlope,
@@ -234,10 +235,10 @@ impl Statics {
         Ok(Self { parts, total_area, anchors: vec![] })
     }
 
-    /// Solves the states at all combinations of `loads_n` (N, positive) and `s_mus`, and starts later states from the
-    /// nearest of them. States do not change but for rounding, and remain pure functions of statics, load and friction
-    /// coefficient; they are found in a few solves with kept factors instead of a path from `s_mu = 0`. Combinations without
-    /// a state are left out.
+    /// Solves the states at all combinations of `loads_n` (N, positive) and `s_mus`, the anchors. Later solutions start at
+    /// the nearest anchor: a few solves with its factors replace the path from `s_mu = 0`. This changes states by rounding
+    /// errors only, and they remain pure functions of statics, load and friction coefficient. Combinations without a state
+    /// are omitted.
     #[must_use]
     pub fn with_anchors(mut self, loads_n: &[f64], s_mus: &[f64]) -> Self {
         let loads: Vec<f64> = loads_n.iter().copied().filter(|load| load.is_finite() && *load > 0.0).collect();
@@ -256,7 +257,7 @@ impl Statics {
         self.parts.area.len()
     }
 
-    /// What the statics were made of.
+    /// Input of the statics.
     pub fn parts(&self) -> &StaticsParts {
         &self.parts
     }

@@ -221,8 +221,8 @@ fn imbalance(statics: &Statics, state: &SteadyState) -> f64 {
 proptest::proptest! {
     #![proptest_config(proptest::prelude::ProptestConfig::with_cases(200))]
 
-    /// Every state that is returned balances: a sum of `c` terms is accurate to a few `c` roundings, and forces to
-    /// `k δ/N` of them.
+    /// Every returned state balances. A sum of `c` terms is accurate to a few `c` rounding errors; forces magnify these by
+    /// `k δ/N`.
     #[test]
     fn every_state_balances_forces_and_moments(
         seed in 0u64..1_000_000, c in 1usize..12, law in 0usize..7, floating: bool, contact: bool,
@@ -359,7 +359,7 @@ fn a_second_pair_closes_at_the_load_of_its_gap() {
     assert!((states[3].force_n[1] - 0.5 * closes).abs() < 1e-12 * closes);
 }
 
-/// States started from anchors are those continued from `s_mu = 0`, and the same bits whenever asked.
+/// States started from anchors are those continued from `s_mu = 0`, and repeated solutions have the same bits.
 #[test]
 fn anchors_change_states_by_rounding_only() {
     for (index, law) in laws().into_iter().enumerate() {

@@ -1,8 +1,8 @@
-//! Bricks that turn about an axis, described at points fixed in space.
+//! Bricks that rotate about an axis, in coordinates fixed in space (an Eulerian description).
 //!
-//! The velocity of a particle of a body of revolution that turns with `Ω` is `u_t + Ω D u`, where `D u = (v·∇) u` is the
+//! The velocity of a particle of a body of revolution that rotates with `Ω` is `u_t + Ω D u`, where `D u = (v·∇) u` is the
 //! derivative of the Cartesian components of the displacement along the circumference, and `v = a × (x - x_0)` is the
-//! velocity of the turn at 1 rad/s. With shape functions `N`, and the stress `Ω² σ` of the centrifugal load,
+//! velocity of the rotation at 1 rad/s. With shape functions `N`, and the stress `Ω² σ` of the centrifugal load,
 //!
 //! ```text
 //! M ü + 2 Ω H u̇ + (K + Ω² (K_σ - L)) u = 0
@@ -10,10 +10,10 @@
 //! K u_0 = ∫ ρ Nᵀ r dV,   σ = C ε(u_0)                  r: vector from the axis
 //! ```
 //!
-//! `K_σ` is of the same order as `L`. Without it, a rigid turn of a free body about the axis would have the stiffness
+//! `K_σ` is of the same order as `L`. Without it, a rigid rotation of a free body about the axis would have the stiffness
 //! `-Ω² I`, with its moment of inertia `I`; with it, the stiffness vanishes, because `∫ (σ : (1 - a aᵀ)) dV = ∫ ρ r² dV`.
 //!
-//! Incompatible modes follow the corners as they do in the mass matrix. The skew part of `∫ ρ Nᵀ D N` is taken brick by
+//! Incompatible modes are eliminated in terms of the corner displacements, as in the mass matrix. The skew part of `∫ ρ Nᵀ D N` is taken brick by
 //! brick; the symmetric part is a surface integral that vanishes on a closed ring and is a discretisation error on a
 //! polygon.
 
@@ -29,7 +29,7 @@ use crate::reduction::{ReductionError, SparseMatrix, balanced_displacement};
 pub struct Axis {
     /// A point of the axis, m.
     pub point_m: [f64; 3],
-    /// Of length 1; the turn is right-handed about it.
+    /// Direction, of length 1; the rotation is right-handed about it.
     pub direction: [f64; 3],
 }
 
@@ -65,7 +65,7 @@ struct BrickTurning {
 }
 
 impl Axis {
-    /// Velocity of the turn at 1 rad/s, m/s: `a × (x - x_0)`.
+    /// Velocity of the rotation at 1 rad/s, m/s: `a × (x - x_0)`.
     fn velocity(&self, at_m: [f64; 3]) -> [f64; 3] {
         let [x, y, z] = [0, 1, 2].map(|axis| at_m[axis] - self.point_m[axis]);
         let [a, b, c] = self.direction;
@@ -245,7 +245,7 @@ mod tests {
         let angles = stations(&[0.0, TAU], TAU / around as f64);
         let lines = [stations(&[0.05, 0.12], 0.07 / radial as f64), vec![-0.5 * thick, 0.5 * thick], angles];
         let closed = Extent { filled: &|_| true, closed: true };
-        // The turn is right-handed about y: from z to x.
+        // The rotation is right-handed about y: from z to x.
         mesh.add_block(steel, lines, closed, &[], |[r, y, angle]| [r * angle.cos(), y, r * angle.sin()]);
         Structure { mesh, ..Structure::default() }
     }
@@ -268,7 +268,7 @@ mod tests {
     /// On linear displacement fields, which bricks represent exactly, the forms follow from the mass and the moments of
     /// inertia of the polygonal ring, which the mass matrix has too.
     #[test]
-    fn linear_motions_have_their_exact_forms_and_a_rigid_turn_feels_nothing() {
+    fn linear_motions_have_their_exact_forms_and_rigid_rotations_no_stiffness() {
         let structure = ring(0.02, 3, 24);
         let Assembled { mass, stiffness, rows } = structure.assemble().unwrap();
         let Turning { gyroscopic, spin, stiffening } = structure.turning(&AXIS).unwrap();
@@ -281,12 +281,12 @@ mod tests {
         // A translation does not change along the circumference.
         let total = form(&along(0), &mass, &along(0));
         assert!(form(&along(0), &spin, &along(0)).abs() < 1e-12 * total);
-        // A rigid turn `a × x`: D u = a × (a × x), the inward radius.
+        // A rigid rotation `a × x`: D u = a × (a × x), the inward radius.
         let inertia = form(&turn, &mass, &turn);
         assert!((form(&turn, &spin, &turn) / inertia - 1.0).abs() < 1e-12);
-        // Radial motion changes into the turn, D r = a × r, and the turn into inward motion.
+        // `D` maps radial motion to rotation, D r = a × r, and rotation to inward motion.
         assert!((form(&turn, &gyroscopic, &outward) / inertia - 1.0).abs() < 1e-12);
-        // The stress of the centrifugal load cancels the spin term of a rigid turn: ∫ σ:(1 - a aᵀ) = ∫ ρ r². Limited by
+        // The stress of the centrifugal load cancels the spin term of a rigid rotation: ∫ σ:(1 - a aᵀ) = ∫ ρ r². Limited by
         // the displacement, which settles to 1e-12 of its largest entry and passes through K.
         let rigid = form(&turn, &stiffening, &turn);
         assert!((rigid / inertia - 1.0).abs() < 1e-9, "{}", rigid / inertia - 1.0);
@@ -395,7 +395,7 @@ mod tests {
         for (root, expected) in split.iter().zip([omega - 120.0, omega + 120.0]) {
             assert!((root.im - expected).abs() < 0.01 * 120.0 && root.re.abs() < 1e-9 * omega, "{root} {expected}");
         }
-        // `K - Ω² L` turns indefinite at the critical speed of one of the waves.
+        // `K - Ω² L` becomes indefinite at the critical speed of one of the waves.
         let definite = |speed: f64, spin: &Mat<f64>| {
             let k = Mat::from_fn(14, 14, |i, j| squares[(i, j)] - 0.5 * speed * speed * (spin[(i, j)] + spin[(j, i)]));
             k.llt(faer::Side::Lower).is_ok()

@@ -11,8 +11,8 @@
 //! ```
 //!
 //! An open pair has `k = 0`: its row and column of `A D` are zero, so only closed pairs act. The damping coefficient
-//! of a pair is proportional to its tangent stiffness, `C_c = diag(k c_ref / k_ref)`: a spring that opens takes its
-//! damper with it, and the ratio of both is a property of the material.
+//! of a pair is proportional to its tangent stiffness, `C_c = diag(k c_ref / k_ref)`: a damper
+//! vanishes with the spring of its pair, and the ratio of both is a property of the material.
 //!
 //! Derivatives follow from those of `N`, `k` and `x`:
 //!
@@ -204,7 +204,7 @@ impl Flexible<'_> {
     }
 }
 
-/// What value and derivatives of the contact terms have in common.
+/// Quantities that the contact terms and their derivatives share.
 pub(super) struct Response<'a> {
     contact: &'a SteadyContact,
     state: &'a SteadyState,
@@ -220,7 +220,7 @@ pub(super) struct Response<'a> {
 }
 
 impl SteadyContact {
-    /// The contact with a part of the coordinates; the statics keep all of them.
+    /// The contact restricted to the coordinates `places`. The statics are not restricted.
     pub(super) fn part(&self, places: &[usize]) -> Self {
         let columns = |m: &Mat<f64>| Mat::from_fn(m.nrows(), places.len(), |i, j| m[(i, places[j])]);
         Self {
@@ -231,12 +231,12 @@ impl SteadyContact {
         }
     }
 
-    /// Whether coordinate `k` does not touch the contact.
+    /// Whether coordinate `k` moves no contact pair.
     pub(super) fn is_free_of(&self, k: usize) -> bool {
         [&self.normal, &self.sliding, &self.lateral].iter().all(|rows| (0..rows.nrows()).all(|i| rows[(i, k)] == 0.0))
     }
 
-    /// Whether any pair is damped, of itself or by friction, at `p`.
+    /// Whether dampers or friction damp any pair at `p`.
     pub(super) fn is_damped(&self, p: &OperatingPoint) -> bool {
         let (closed, sliding) = match p.contact_state() {
             ContactState::Open => (false, false),
@@ -253,12 +253,12 @@ impl SteadyContact {
         !self.inverse_radius.is_empty()
     }
 
-    /// Whether the springs themselves are damped.
+    /// Whether any pair has a damper.
     fn has_dampers(&self) -> bool {
         self.relaxation_s.iter().any(|&s| s != 0.0)
     }
 
-    /// What value and derivatives of the contact terms at `p` follow from.
+    /// Quantities from which the contact terms at `p` and their derivatives follow.
     pub(super) fn response<'a>(&'a self, p: &OperatingPoint, state: &'a SteadyState) -> Response<'a> {
         let x = signed_friction(p);
         let stiffness = &state.tangent_n_per_m;
@@ -352,7 +352,7 @@ impl SteadyContact {
             let dampers = response.dampers();
             let mut damping = response.damping(&stiffness);
             if parameter == Parameter::ContactStiffness {
-                // The dampers stay as they are: `k_ref` changes with `k`.
+                // The damping does not change, because `k_ref` changes in proportion to `k`.
                 damping.iter_mut().zip(response.damping(response.stiffness)).for_each(|(slope, value)| *slope -= value);
             }
             let slopes = response.dampers_slope(dx, &stiffness, &damping, &dampers);
@@ -474,9 +474,9 @@ fn add(out: &mut Mat<f64>, m: &Mat<f64>, symmetric: bool) {
 
 /// How far roots may jump between two spectra of a map, because contact pairs open or close in between.
 ///
-/// A spring `k` that appears or vanishes at pair `k` changes `K` by `F_kᵀ k B_n,k`. To first order this moves `λ²` by
-/// `|yᴴ F_kᵀ| k |B_n,k x|`; the sum of these over all pairs that change bounds every jump in the interval, also where
-/// they cancel.
+/// If pair `i` with stiffness `k_i` opens or closes, `K` changes by `F_iᵀ k_i B_n,i`. To first order this moves `λ²` by
+/// `|yᴴ F_iᵀ| k_i |B_n,i x|`. The sum over all pairs that change bounds every jump in the interval, and also several jumps
+/// that cancel.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Jumps {
     pairs: usize,
@@ -527,7 +527,7 @@ impl SteadyContact {
         self.statics.parts().law.smoothness() == Smoothness::Analytic
     }
 
-    /// The sum over the `changed` pairs, with their stiffness, of the change of `λ²` of each root.
+    /// For each root, the sum of its changes of `λ²` over the `changed` pairs, each given with its stiffness.
     fn reach(&self, spectrum: &Spectrum, changed: &[(usize, f64)]) -> Vec<f64> {
         let x = signed_friction(&spectrum.point);
         let n = self.normal.ncols();

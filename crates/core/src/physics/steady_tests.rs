@@ -126,7 +126,7 @@ fn map(model: &Model, p: &OperatingPoint, mu_max: f64) -> StabilityMap {
 /// always closed, with the open pairs left out. Tolerance with residual flexibility: the expansion of that model is
 /// truncated at 1e-9.
 #[test]
-fn open_pairs_are_as_if_left_out() {
+fn open_pairs_act_like_absent_pairs() {
     let (mut open, mut closed) = (0, 0);
     for seed in 0..20 {
         let rig = Rig::new(seed, 1e-2, ContactLaw::default(), 30.0);
@@ -335,7 +335,7 @@ fn ends_follow_the_load_through_the_state() {
     assert!(carried_ends > 20 && jumps > 0 && moved > 1e-5, "{carried_ends} ends, {jumps} jumps, moved by {moved}");
 }
 
-/// Without a state there is a reason and no root, and the map ends there.
+/// Where there is no contact state, a solve fails with the reason, and the stability map ends.
 #[test]
 fn nothing_is_predicted_without_a_state() {
     let mut ended = 0;
@@ -390,7 +390,7 @@ fn charts_hold_through_the_state() {
 
 /// A lost root violates the chart's own traces.
 #[test]
-fn a_lost_root_is_told_by_the_traces_of_the_chart() {
+fn a_lost_root_violates_the_traces_of_the_chart() {
     let model = Rig::new(1, 0.0, ContactLaw::default(), 20.0).model(&ROUGH, false);
     let options = chart_options(20.0);
     let chart = build(&model, &options, &|_| true).expect("it can be charted");
@@ -421,7 +421,7 @@ fn identities_hold_through_the_state() {
 }
 
 #[test]
-fn what_is_inconsistent_is_refused() {
+fn inconsistent_input_is_refused() {
     let rig = Rig::new(1, 1e-2, ContactLaw::default(), 0.0);
     let with = |change: &dyn Fn(&mut ContactPairs, &mut ResidualFlexibility)| {
         let (mut pairs, mut residual) = (rig.pairs.clone(), rig.residual.clone());

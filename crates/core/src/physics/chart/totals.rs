@@ -1,9 +1,9 @@
-//! Traces and norms of the matrices of a model whose contact follows a state, as expansions of their own.
+//! Chebyshev expansions of the traces and norms of the matrices of a model with a contact state.
 //!
-//! Without a contact state the traces at a point follow from the laws of the terms in a few operations. With a state
-//! they take the state, which takes longer than a charted prediction. They are therefore expanded over boxes, apart
-//! from the roots: at other points, from matrices without eigenvalues, with their own errors. A root that is missing
-//! or counted twice is thus still detected.
+//! Without a contact state, the traces at an operating point follow from the laws of the terms in a few operations. With
+//! one, the state would have to be solved first, which takes longer than a charted prediction. The traces are therefore
+//! expanded over boxes as well, but independently of the roots: from other points, from the matrices alone without an
+//! eigenvalue problem, and with error bounds of their own. A root that is missing or counted twice is still detected.
 
 use faer::Mat;
 
@@ -20,7 +20,7 @@ use crate::sampling::radical_inverse;
 const QUANTITIES: usize = 4;
 /// Number of nodes along each axis, by the number of axes.
 const NODES: [usize; MAX_AXES + 1] = [1, 17, 13, 9];
-/// Most nodes along an axis.
+/// Largest number of nodes along an axis.
 const MOST_NODES: usize = 17;
 /// Largest estimated error of an expansion, relative to the quantity.
 const TOLERANCE: f64 = 1e-10;
@@ -49,20 +49,20 @@ pub(super) struct Totals {
     leaves: Vec<Expanded>,
 }
 
-/// What the expansions are made from.
+/// The model and the box of the expansions.
 pub(super) struct Domain<'a> {
     pub model: &'a Model,
     pub axes: &'a [Axis],
     pub low: [f64; MAX_AXES],
     pub high: [f64; MAX_AXES],
-    /// Supplies the conditions that no axis sets.
+    /// The conditions that have no axis are those of this point.
     pub base: OperatingPoint,
     /// Boxes with a smaller share of the coordinates are not split.
     pub smallest_share: f64,
 }
 
 impl Totals {
-    /// Expands the totals of a model. `go_on` is asked before every box; `None` if it returns false.
+    /// Expands the totals of a model. `go_on` is called before every box; `None` once it returns false.
     pub fn build(domain: &Domain<'_>, go_on: &mut dyn FnMut() -> bool) -> Option<Self> {
         let (axes, dimension) = (domain.axes.len(), domain.model.dimension());
         let mut totals = Self { axes, dimension, branches: vec![Branch::Dense], leaves: vec![] };
