@@ -61,7 +61,7 @@ pub enum ModelError {
          does not depend on the load"
     )]
     FlexibleLoadExponent {
-        /// [`ContactLaw::exponent`].
+        /// [`ContactLaw::exponent`](crate::physics::ContactLaw::exponent).
         exponent: f64,
     },
     /// The contact flexibility is nearly singular.
@@ -121,7 +121,7 @@ pub enum ModelError {
         "[load] exponent {exponent} with a contact state, expected 0: the law of the contact state gives the stiffness"
     )]
     StateLoadExponent {
-        /// [`ContactLaw::exponent`].
+        /// [`ContactLaw::exponent`](crate::physics::ContactLaw::exponent).
         exponent: f64,
     },
     /// There is no contact state at the operating point.
