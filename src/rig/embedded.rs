@@ -26,8 +26,9 @@ macro_rules! embedded {
     };
 }
 
-/// All embedded rigs. The first is the default of `run` and `demo`.
-pub const EMBEDDED: [Embedded; 9] = [
+/// All embedded rigs. The first is the default of `run` and `demo`. A static: of a constant, the program would hold a copy of
+/// all files for each use.
+pub static EMBEDDED: [Embedded; 9] = [
     embedded!(
         "tribometer",
         "pad-on-disc tribometer of 22032 degrees of freedom on a basis of 55 vectors (default)",
