@@ -26,23 +26,41 @@ const ABOVE: f64 = 1.2;
 /// First of the identities given to modes that no node of the map has.
 const UNKNOWN: u32 = 1_000_000;
 
-/// A followed root between two neighbouring nodes: its index at each node, and whether it is interpolated by a cubic
-/// through values and slopes instead of a straight line. A straight line crosses only those neighbours that it also
-/// crosses at the nodes.
+/// A followed root between two neighbouring nodes.
 #[derive(Clone, Copy, Debug)]
 struct Path {
     id: u32,
-    left: Option<u32>,
-    right: Option<u32>,
-    curved: bool,
+    course: Course,
     /// The lower of its frequencies at the two nodes, rad/s.
     lowest: f64,
+}
+
+/// The interpolated quantity of a followed root between two nodes. It is kept here, in the order in which it is read,
+/// because every prediction reads all of it.
+#[derive(Clone, Copy, Debug)]
+enum Course {
+    /// The root is followed at both nodes: its value at the left one and its change to the right one. A curved course
+    /// is the cubic through values and slopes, else it is a straight line, which crosses only those neighbours that
+    /// it also crosses at the nodes.
+    Through { from: c64, change: c64, bends: Option<[c64; 2]> },
+    /// It is followed at the left node only.
+    Left(c64),
+    /// It is followed at the right node only.
+    Right(c64),
+}
+
+/// The followed roots between two neighbouring nodes of a map.
+#[derive(Clone, Debug)]
+struct Span {
+    paths: Vec<Path>,
+    /// Number of followed roots at each of the two nodes.
+    followed: [usize; 2],
 }
 
 /// The followed roots between every two neighbouring nodes of a map.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Numbering {
-    spans: Vec<Vec<Path>>,
+    spans: Vec<Span>,
 }
 
 /// A followed root, interpolated to a friction coefficient.
@@ -81,24 +99,30 @@ impl Numbering {
         let gaps: Vec<Vec<f64>> = nodes.iter().map(|node| gaps(&node.spectrum)).collect();
         let span = |k: usize| {
             let (left, right) = (&nodes[k], nodes.get(k + 1).unwrap_or(&nodes[k]));
-            let mut at_right: Vec<Option<u32>> = vec![];
+            let mut at_right: Vec<Option<usize>> = vec![];
             for (j, id) in right.ids.iter().enumerate().filter_map(|(j, id)| Some((j, (*id)? as usize))) {
                 at_right.resize(at_right.len().max(id + 1), None);
-                at_right[id] = Some(j as u32);
+                at_right[id] = Some(j);
             }
             let mut paths: Vec<Path> = vec![];
-            let omega = |node: &Node, k: u32| node.spectrum.roots[k as usize].lambda.im;
-            for (i, id) in left.ids.iter().enumerate().filter_map(|(i, id)| Some((i as u32, (*id)?))) {
+            let omega = |node: &Node, k: usize| node.spectrum.roots[k].lambda.im;
+            for (i, id) in left.ids.iter().enumerate().filter_map(|(i, id)| Some((i, (*id)?))) {
                 let there = at_right.get_mut(id as usize).and_then(Option::take);
-                let gap = |j: u32| gaps[k][i as usize].min(gaps[(k + 1).min(nodes.len() - 1)][j as usize]);
-                let curved = there.is_some_and(|j| is_curved(left, i as usize, right, j as usize, gap(j)));
                 let lowest = there.map_or(f64::INFINITY, |j| omega(right, j)).min(omega(left, i));
-                paths.push(Path { id, left: Some(i), right: there, curved, lowest });
+                let course = there.map_or_else(
+                    || Course::Left(value(&left.spectrum, i)),
+                    |j| {
+                        let gap = gaps[k][i].min(gaps[(k + 1).min(nodes.len() - 1)][j]);
+                        Course::through(left, i, right, j, gap)
+                    },
+                );
+                paths.push(Path { id, course, lowest });
             }
             for (id, j) in at_right.iter().enumerate().filter_map(|(id, &j)| Some((id as u32, j?))) {
-                paths.push(Path { id, left: None, right: Some(j), curved: false, lowest: omega(right, j) });
+                let course = Course::Right(value(&right.spectrum, j));
+                paths.push(Path { id, course, lowest: omega(right, j) });
             }
-            paths
+            Span { paths, followed: [left, right].map(|node| node.ids.iter().flatten().count()) }
         };
         let spans = if nodes.len() == 1 { 1 } else { nodes.len().saturating_sub(1) };
         Self { spans: (0..spans).map(span).collect() }
@@ -113,29 +137,26 @@ impl Numbering {
         let after = nodes.partition_point(|node| node.mu() < mu);
         let k = after.saturating_sub(1).min(self.spans.len().saturating_sub(1));
         let (Some(left), Some(right)) = (nodes.get(k), nodes.get(k + 1).or(nodes.last())) else { return 0 };
+        let Some(span) = self.spans.get(k) else { return 0 };
         let step = right.mu() - left.mu();
         let share = if step > 0.0 { ((mu - left.mu()) / step).clamp(0.0, 1.0) } else { 0.0 };
         let undamped = left.spectrum.undamped;
-        let count = |node: &Node| node.ids.iter().flatten().count();
-        let from_left = match (count(left) == tracked, count(right) == tracked) {
-            (true, false) => true,
-            (false, true) => false,
-            _ => share <= 0.5,
+        let from_left = match span.followed.map(|count| count == tracked) {
+            [true, false] => true,
+            [false, true] => false,
+            [true, true] | [false, false] => share <= 0.5,
         };
-        let paths = self.spans.get(k).map_or(&[][..], Vec::as_slice);
         let mut count = 0;
-        for path in paths {
-            if path.lowest > highest && path.left.is_some() && path.right.is_some() {
-                count += 1;
-                continue;
-            }
-            let z = match (path.left, path.right) {
-                (Some(i), Some(j)) => {
-                    between(&left.spectrum, i as usize, &right.spectrum, j as usize, step, share, path.curved)
+        for path in &span.paths {
+            let z = match path.course {
+                Course::Through { .. } if path.lowest > highest => {
+                    count += 1;
+                    continue;
                 }
-                (Some(i), None) if from_left => value(&left.spectrum, i as usize),
-                (None, Some(j)) if !from_left => value(&right.spectrum, j as usize),
-                _ => continue,
+                Course::Through { from, change, bends } => between(from, change, bends, share),
+                Course::Left(z) if from_left => z,
+                Course::Right(z) if !from_left => z,
+                Course::Left(_) | Course::Right(_) => continue,
             };
             let lambda = if undamped { square_root(z) } else { z };
             let rank = if lambda.im > 0.0 { lambda.im } else { -lambda.re.abs() };
@@ -184,8 +205,8 @@ impl StabilityMap {
                 let (here, there) = (z(&modes[before].root), z(&modes[k].root));
                 let (off, expected) = (there - here, followed[k].z - followed[before].z);
                 let against = (off * expected.conj()).re < 0.0;
-                let apart = off.norm() > TOGETHER * there.norm();
-                if against && apart && self.in_band(&modes[before].root) == self.in_band(&modes[k].root) {
+                let apart = || off.norm() > TOGETHER * there.norm();
+                if against && apart() && self.in_band(&modes[before].root) == self.in_band(&modes[k].root) {
                     followed.swap(before, k);
                     settled = false;
                 }
@@ -230,26 +251,26 @@ fn slope(spectrum: &Spectrum, k: usize) -> c64 {
     if spectrum.undamped { of_square } else { of_square / (2.0 * spectrum.roots[k].lambda) }
 }
 
-/// A root interpolated between two nodes `step` apart, at fraction `share`: by a cubic if `curved`, else linearly.
-fn between(left: &Spectrum, i: usize, right: &Spectrum, j: usize, step: f64, share: f64, curved: bool) -> c64 {
-    let (from, to) = (value(left, i), value(right, j));
-    let line = from + share * (to - from);
-    if !curved {
-        return line;
+impl Course {
+    /// The course from root `i` of `left` to root `j` of `right`. It is curved where the cubic stays close to the straight
+    /// line compared with `gap`, the distance to the nearest neighbour.
+    fn through(left: &Node, i: usize, right: &Node, j: usize, gap: f64) -> Self {
+        let (step, left, right) = (right.mu() - left.mu(), &left.spectrum, &right.spectrum);
+        let from = value(left, i);
+        let change = value(right, j) - from;
+        let bends = [(left, i), (right, j)].map(|(spectrum, k)| step * slope(spectrum, k) - change);
+        // The maximum of `s (1 - s)²` is 4/27.
+        let stray = 4.0 / 27.0 * (bends[0].norm() + bends[1].norm());
+        Self::Through { from, change, bends: (stray <= STRAY * gap).then_some(bends) }
     }
-    let rest = 1.0 - share;
-    let bend = |spectrum: &Spectrum, k: usize| step * slope(spectrum, k) - (to - from);
-    line + share * rest * (rest * bend(left, i) - share * bend(right, j))
 }
 
-/// Whether a cubic through both ends stays close enough to the straight line between them.
-fn is_curved(left: &Node, i: usize, right: &Node, j: usize, gap: f64) -> bool {
-    let (step, left, right) = (right.mu() - left.mu(), &left.spectrum, &right.spectrum);
-    let along = value(right, j) - value(left, i);
-    let bend = |spectrum: &Spectrum, k: usize| (step * slope(spectrum, k) - along).norm();
-    // The maximum of `s (1 - s)²` is 4/27.
-    let stray = 4.0 / 27.0 * (bend(left, i) + bend(right, j));
-    stray <= STRAY * gap
+/// A root interpolated at fraction `share` between two nodes: by a cubic if there are `bends`, else linearly.
+fn between(from: c64, change: c64, bends: Option<[c64; 2]>, share: f64) -> c64 {
+    let line = from + share * change;
+    let Some([at_left, at_right]) = bends else { return line };
+    let rest = 1.0 - share;
+    line + share * rest * (rest * at_left - share * at_right)
 }
 
 /// Distance of each followed root to its nearest neighbour.
