@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::Args;
 
 use crate::bus::ros_args::RosArgs;
@@ -72,6 +72,7 @@ pub struct NodeStart {
 /// What tells a user how to do without a bus that cannot be joined.
 const SHM_FAILED: &str = "shared memory; --no-shm stays off it";
 const ROS2_FAILED: &str = "ROS 2; --no-ros stays off it";
+const NO_BUS: &str = "no bus to publish on: --no-shm and --no-ros are both given";
 
 impl Buses {
     /// How a node with these `settings` starts: the arguments of ROS 2 may name it and change settings.
@@ -117,9 +118,9 @@ impl Buses {
     /// Joins the buses as a rig, which publishes operating points and, if it measures it, the vibration.
     ///
     /// # Errors
-    /// A bus cannot be joined.
+    /// A bus cannot be joined, or all are switched off.
     pub fn join_as_rig(&self, measures_vibration: bool) -> anyhow::Result<Vec<Box<dyn Connection>>> {
-        self.join(|bus| match bus {
+        self.join_some(|bus| match bus {
             Bus::Shm => boxed(self.shm.as_ref().map(|shm| ShmConnection::of_rig(shm, measures_vibration)), SHM_FAILED),
             Bus::Ros2 => boxed(self.ros2.as_ref().map(|ros2| Ros2Source::start(ros2, |_| {})), ROS2_FAILED),
             Bus::Simulator => Ok(None),
@@ -129,9 +130,9 @@ impl Buses {
     /// Joins the buses as a replay, which publishes the messages of a rig and of its node.
     ///
     /// # Errors
-    /// A bus cannot be joined.
+    /// A bus cannot be joined, or all are switched off.
     pub fn join_as_replay(&self) -> anyhow::Result<Vec<Box<dyn Connection>>> {
-        self.join(|bus| match bus {
+        self.join_some(|bus| match bus {
             Bus::Shm => boxed(self.shm.as_ref().map(ShmConnection::of_replay), SHM_FAILED),
             Bus::Ros2 => boxed(self.ros2.as_ref().map(Ros2ReplayConnection::start), ROS2_FAILED),
             Bus::Simulator => Ok(None),
@@ -143,6 +144,16 @@ impl Buses {
         join: impl Fn(Bus) -> anyhow::Result<Option<Box<dyn Connection>>>,
     ) -> anyhow::Result<Vec<Box<dyn Connection>>> {
         Bus::ALL.into_iter().filter_map(|bus| join(bus).transpose()).collect()
+    }
+
+    /// As [`Self::join`], for a command that has nothing to do without a bus.
+    fn join_some(
+        &self,
+        join: impl Fn(Bus) -> anyhow::Result<Option<Box<dyn Connection>>>,
+    ) -> anyhow::Result<Vec<Box<dyn Connection>>> {
+        let joined = self.join(join)?;
+        ensure!(!joined.is_empty(), NO_BUS);
+        Ok(joined)
     }
 
     /// Where a node on these buses expects its inputs, and the command that simulates them.

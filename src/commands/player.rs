@@ -3,8 +3,6 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::ensure;
-
 use super::buses::Buses;
 use crate::bus::{Connection, Outgoing};
 use crate::msgs::schema::Topic;
@@ -20,11 +18,9 @@ impl Player {
     /// Joins the buses.
     ///
     /// # Errors
-    /// A bus cannot be joined, or none was requested.
+    /// A bus cannot be joined, or all are switched off.
     pub fn join(buses: &Buses) -> anyhow::Result<Self> {
-        let joined = buses.join_as_replay()?;
-        ensure!(!joined.is_empty(), "nothing to play to: both --no-shm and --no-ros are given");
-        Ok(Self(joined))
+        Ok(Self(buses.join_as_replay()?))
     }
 
     /// Number of readers of a topic on all buses joined.

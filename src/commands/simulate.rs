@@ -3,7 +3,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::ensure;
 use clap::Args;
 
 use super::buses::BusOptions;
@@ -149,7 +148,6 @@ impl Options {
 
     fn publish(&self, profile: Profile, period: Duration, ros_args: RosArgs) -> anyhow::Result<Outcome> {
         let mut buses = self.buses.resolve(ros_args)?.join_as_rig(self.vibration.tone.is_some())?;
-        ensure!(!buses.is_empty(), "nothing to publish to: both --no-shm and --no-ros are given");
         let stopped = Arc::new(AtomicBool::new(false));
         let stop = stopped.clone();
         signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;

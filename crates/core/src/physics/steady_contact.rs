@@ -92,7 +92,7 @@ impl Model {
         if statics.pairs() != count {
             return Err(ModelError::PairCount { what: "statics", found: statics.pairs(), expected: count });
         }
-        let ContactLaw { exponent, slope_s_per_m, lateral_damping, .. } = self.contact_law;
+        let ContactLaw { exponent, reference_n: _, slope_s_per_m, lateral_damping } = self.contact_law;
         if exponent != 0.0 {
             return Err(ModelError::StateLoadExponent { exponent });
         }
