@@ -669,8 +669,7 @@ mod tests {
     }
 
     /// A scan over the friction coefficient agrees with the windows of random rigs, undamped and damped: every
-    /// unstable point lies in a window, and every point well inside a window is unstable. Besides points of a grid, which is
-    /// shifted from rig to rig, points on both sides of every end are tested.
+    /// unstable point lies in a window, and every point well inside a window is unstable.
     #[test]
     fn a_scan_agrees_with_the_windows() {
         let (mut windows, mut growing) = (0, 0);
@@ -681,14 +680,8 @@ mod tests {
             assert!(map.complete);
             windows += map.windows.len();
             let mut solver = Solver::new(model.dimension());
-            let shift = f64::from(seed as u32) / 60.0;
-            let grid = (0..400).map(|k| 5e-3 * (f64::from(k) + shift) + 3.7e-5);
-            let ends = map.windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten();
-            let beside_ends = ends
-                .flat_map(|end| [-1e-3, -2e-5, 2e-5, 1e-3].map(|off| end + off))
-                .filter(|mu| (0.0..2.0).contains(mu));
-            let points: Vec<f64> = grid.chain(beside_ends).collect();
-            for mu in points {
+            for k in 0..2000 {
+                let mu = 1e-3 * f64::from(k) + 3.7e-5;
                 let spectrum = solver.solve(&model, &REFERENCE.with_friction(mu), Vectors::Right).unwrap();
                 let unstable = spectrum.roots.iter().any(|root| root.is_unstable(1e-6));
                 let inside = |slack: f64| {
@@ -702,6 +695,6 @@ mod tests {
                 growing += usize::from(unstable);
             }
         }
-        assert!(windows > 40 && growing > 800, "the rigs are worth testing: {windows} windows, {growing} points");
+        assert!(windows > 40 && growing > 4000, "the rigs are worth testing: {windows} windows, {growing} points");
     }
 }

@@ -457,9 +457,7 @@ mod tests {
             let stiffness = vec![term(free, Law::Constant), term(random, Law::FrictionStiffness)];
             let damping_term = term(Mat::<f64>::identity(6, 6) * faer::Scale(damping), Law::Constant);
             let model = Model::new(6, stiffness, vec![damping_term], ContactLaw::default(), None).unwrap();
-            // Boxes are not split below the spacing of the points: where a static root grows, none converges.
             let options = options((0.0, 500.0, 13.0), (1.5, 501.0, 14.0), None);
-            let options = ChartOptions { smallest_share: 1e-3, ..options };
             let chart = build(&model, &options, &|_| true).expect("the chart can be built");
             let (traces, mut solver) = (Traces::new(&model), Solver::new(6));
             let (mut scratch, mut modes) = (Scratch::default(), vec![]);
