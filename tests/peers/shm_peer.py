@@ -2,7 +2,7 @@
 """A rig in another language: publishes operating points over shared memory and checks the predictions.
 
 Needs `pip install 'iceoryx2==0.10.*'`. Prints one line of JSON; exit code 0 if every operating point was answered with
-its stamp and sequence number, 1 if not. The structures are those of msgs/src/shm.rs.
+its stamp and sequence number, 1 if not. The structures are those of msgs/src/shm.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 """Publishes samples of a microphone over shared memory and receives the squeal that the node finds in them.
 
 Needs `pip install 'iceoryx2==0.10.*'`. Prints one line of JSON; exit code 0 if the end of a squeal was published. The
-structures are those of msgs/src/shm.rs.
+structures are those of msgs/src/shm.
 """
 
 import ctypes

@@ -5,6 +5,10 @@ use std::mem::{align_of, offset_of, size_of};
 use proptest::prelude::*;
 
 use super::*;
+use crate::{
+    Derivatives, Heard, Mode, ModeSensitivity, OperatingPoint, PairSensitivity, Prediction, Sensitivity, Waveform,
+    heard_quantity, heard_state, heard_verdict,
+};
 
 fn prediction(modes: usize, reason: &str) -> Prediction {
     Prediction {
@@ -25,8 +29,7 @@ fn prediction(modes: usize, reason: &str) -> Prediction {
     }
 }
 
-/// Peers in other languages map these bytes: sizes and offsets must be those of the tables in the module
-/// documentation.
+/// Peers in other languages map these bytes: sizes and offsets must be those of the tables at the structures.
 #[test]
 fn layout_is_the_documented_one() {
     assert_eq!((size_of::<OperatingPointForm>(), align_of::<OperatingPointForm>()), (40, 8));
