@@ -134,6 +134,10 @@ struct Worker {
 impl Node {
     /// A node for `rig` with initial `settings`, and the inlet that hands items to it.
     pub fn new(rig: Arc<Rig>, settings: Settings, watch: Watch) -> (Self, Inlet) {
+        // Anchors of a contact state are computed with its first state, for which the first input would wait.
+        if let Some(statics) = rig.model.statics() {
+            statics.anchors();
+        }
         let (sender, queue) = bounded(QUEUE);
         let (running, lost) = (Running::default(), Arc::<AtomicU64>::default());
         let (detection, samples) = detection::Prepared::new();

@@ -28,7 +28,7 @@ const MOST_PAIRS: usize = 2000;
 /// Most points of a table of pressures.
 const MOST_POINTS: usize = 1000;
 /// Number of loads over the chart's range, at equal ratios, and of steps in the friction coefficient up to the end of the
-/// search, at which states are computed when a rig is read. Later states start from them.
+/// search, at which anchors are computed before the first prediction. Other states start from them.
 const ANCHOR_LOADS: u32 = 6;
 const ANCHOR_STEPS: u32 = 8;
 
@@ -218,7 +218,8 @@ impl StateTable {
             (None, false) => None,
             (Some(_), false) => return Err(self.no_residual("the rig has no residual flexibility")),
             (None, true) => {
-                let limit = "the change of each gap per N of the load by the truncated modes, because the rig has residual flexibility";
+                let limit = "the change of each gap per N of the load by the truncated modes, because the rig has \
+                             residual flexibility";
                 return Err(self.missing("residual_gap_m_per_n", limit));
             }
             (Some(values), true) => {
@@ -314,9 +315,10 @@ impl StateTable {
         let reference = &settings.reference;
         let [lowest, _] = settings.chart.normal_load_n;
         let load_n = if reference.normal_load_n > 0.0 { reference.normal_load_n } else { lowest };
+        // Without anchors, which cost more than the few states below.
+        let plain = |measured| Statics::new(StaticsParts { measured, ..statics.parts().clone() }).map_err(refuse);
         // By the force on the back, which follows the sign of the load vector.
-        let by_back = StaticsParts { measured: MeasuredLoad::Back, ..statics.parts().clone() };
-        let at_rest = Statics::new(by_back).and_then(|statics| statics.state(load_n, 0.0)).map_err(refuse)?;
+        let at_rest = plain(MeasuredLoad::Back)?.state(load_n, 0.0).map_err(refuse)?;
         let slope: f64 = at_rest.per_load.force.iter().sum();
         if slope.is_nan() || slope <= 0.0 {
             return Err(RigError::Range {
@@ -338,8 +340,9 @@ impl StateTable {
             ContactState::NotSliding | ContactState::Open => 0.0,
         };
         let mut line = format!("state      {} pairs", statics.pairs());
+        let plain = plain(self.measured)?;
         for (index, s_mu) in [0.0, friction].into_iter().enumerate() {
-            let closed = match statics.state(load_n, s_mu) {
+            let closed = match plain.state(load_n, s_mu) {
                 Ok(state) => format!("{} closed", state.pairs_closed()),
                 Err(StaticsError::NoEquilibrium { end, .. }) => format!("none in steady sliding, because {end},"),
                 Err(error) => return Err(refuse(error)),

@@ -1,5 +1,7 @@
 //! Statics of steady sliding: closures and forces of contact pairs that can open, by semi-smooth Newton steps.
 
+use std::sync::OnceLock;
+
 use faer::{Mat, MatRef};
 
 use super::law::{LawError, LawValue, PressureLaw};
@@ -36,7 +38,10 @@ pub struct StaticsParts {
 pub struct Statics {
     pub(super) parts: StaticsParts,
     pub(super) total_area: f64,
-    anchors: Vec<path::Anchor>,
+    /// Loads (N) and `s_mu` at which anchors are computed.
+    anchored_at: [Vec<f64>; 2],
+    /// Computed with the first state.
+    anchors: OnceLock<Vec<path::Anchor>>,
 }
 
 /// Why the states that continue frictionless contact end at some friction coefficient.
@@ -232,24 +237,30 @@ impl Statics {
             return Err(StaticsError::Condition { what: "number of contact pairs", value: 0.0, limit: "at least 1" });
         }
         let total_area = parts.area.iter().sum();
-        Ok(Self { parts, total_area, anchors: vec![] })
+        Ok(Self { parts, total_area, anchored_at: [vec![], vec![]], anchors: OnceLock::new() })
     }
 
-    /// Solves the states at all combinations of `loads_n` (N, positive) and `s_mus`, the anchors. Later solutions start at
-    /// the nearest anchor: a few solves with its factors replace the path from `s_mu = 0`. This changes states by rounding
-    /// errors only, and they remain pure functions of statics, load and friction coefficient. Combinations without a state
-    /// are omitted.
+    /// Adds anchors: the states at all combinations of `loads_n` (N, positive) and `s_mus`. Solutions start at the nearest
+    /// anchor: a few solves with its factors replace the path from `s_mu = 0`. This changes states by rounding errors only,
+    /// and they remain pure functions of statics, load and friction coefficient. Combinations without a state are omitted.
+    /// All anchors are computed together, when the first state or [`Self::anchors`] needs them.
     #[must_use]
     pub fn with_anchors(mut self, loads_n: &[f64], s_mus: &[f64]) -> Self {
         let loads: Vec<f64> = loads_n.iter().copied().filter(|load| load.is_finite() && *load > 0.0).collect();
         let s_mus: Vec<f64> = s_mus.iter().copied().filter(|s_mu| s_mu.is_finite()).collect();
-        self.anchors = path::anchors(&self, &loads, &s_mus);
+        self.anchored_at = [loads, s_mus];
+        self.anchors = OnceLock::new();
         self
     }
 
-    /// Number of anchors, see [`Self::with_anchors`].
+    /// Number of anchors, see [`Self::with_anchors`]. Computes them if they are not known yet.
     pub fn anchors(&self) -> usize {
-        self.anchors.len()
+        self.known_anchors().len()
+    }
+
+    fn known_anchors(&self) -> &[path::Anchor] {
+        let [loads_n, s_mus] = &self.anchored_at;
+        self.anchors.get_or_init(|| path::anchors(self, loads_n, s_mus))
     }
 
     /// Number of contact pairs, `c`.
@@ -279,7 +290,7 @@ impl Statics {
         if needs_load && load_n <= 0.0 {
             return Err(StaticsError::Condition { what: "load", value: load_n, limit: "more than 0" });
         }
-        let near = (load_n > 0.0).then(|| path::from_anchor(self, &self.anchors, load_n, s_mu)).flatten();
+        let near = (load_n > 0.0).then(|| path::from_anchor(self, self.known_anchors(), load_n, s_mu)).flatten();
         let found = near.map_or_else(|| path::follow(self, load_n, s_mu), Ok)?;
         if let PressureLaw::Table(table) = &self.parts.law {
             let limit_m = table.last_closure_m();
