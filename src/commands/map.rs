@@ -205,7 +205,7 @@ impl Options {
             let plane = Plane {
                 x: axis(&self.x, xs),
                 y: axis(&self.y, ys),
-                growth_rate_per_s: cells
+                rows: cells
                     .iter()
                     .map(|row| row.iter().map(|(_, cell)| cell.clone().map_or(Cell::Fault, Cell::from)).collect())
                     .collect(),

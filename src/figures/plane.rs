@@ -9,7 +9,7 @@ const CLASSES: usize = 6;
 /// Colours of the slowest and the fastest class.
 const SLOW: [f64; 3] = [254.0, 232.0, 200.0];
 const FAST: [f64; 3] = [153.0, 0.0, 13.0];
-/// Fill of operating points without steady sliding.
+/// Fill of operating points without a prediction.
 const FAULT: RGBColor = RGBColor(150, 150, 150);
 
 /// A condition along an axis.
@@ -43,7 +43,7 @@ pub struct Plane {
     pub x: Axis,
     pub y: Axis,
     /// Rows along x, one for each value of y.
-    pub growth_rate_per_s: Vec<Vec<Cell>>,
+    pub rows: Vec<Vec<Cell>>,
     /// Edges of the windows: x, y and kind.
     pub edges: Vec<(f64, f64, Edge)>,
 }
@@ -54,7 +54,7 @@ pub struct Plane {
 /// # Errors
 /// [`PlotError`] if the plotting library fails.
 pub fn draw(title: &str, plane: &Plane) -> Result<String, PlotError> {
-    let cells = || plane.growth_rate_per_s.iter().flatten();
+    let cells = || plane.rows.iter().flatten();
     let growing = || cells().filter_map(|cell| if let Cell::Growing(rate) = cell { Some(*rate) } else { None });
     let fastest = growing().fold(f64::NEG_INFINITY, f64::max);
     // At most four decades below the fastest are told apart.
@@ -73,7 +73,7 @@ pub fn draw(title: &str, plane: &Plane) -> Result<String, PlotError> {
             entries.extend((0..CLASSES).map(|k| (colour(k), format!("to {} 1/s", rounded(limit(k + 1))))));
         }
         if faults {
-            entries.push((FAULT, "no steady sliding".to_owned()));
+            entries.push((FAULT, "no prediction".to_owned()));
         }
         for (k, (fill, label)) in entries.iter().enumerate() {
             let (x, y) = ((84 + 128 * k as i32) * FINE as i32, 12 * FINE as i32);
@@ -100,7 +100,7 @@ pub fn draw(title: &str, plane: &Plane) -> Result<String, PlotError> {
         let mut chart = axes(&area, (x0, x1), (y0, y1), plane.x.label, plane.y.label)?;
         // Neighbours of one colour along x are one rectangle.
         let mut filled: Vec<(RGBColor, [(f64, f64); 2])> = vec![];
-        for (row, y) in plane.growth_rate_per_s.iter().zip(&plane.y.values) {
+        for (row, y) in plane.rows.iter().zip(&plane.y.values) {
             let (low, high) = ((y - 0.5 * dy).max(y0), (y + 0.5 * dy).min(y1));
             let mut before = None;
             for (cell, x) in row.iter().zip(&plane.x.values) {
