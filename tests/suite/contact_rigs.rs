@@ -4,7 +4,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::program::{self, folder, json, launch, npz_bytes, number, python, rig_file as file, run, text, write};
+use crate::program::side::{Side, archive};
+use crate::program::{self, folder, json, launch, number, python, rig_file as file, run, text, write};
 use faer::c64;
 use serde_json::{Value, json};
 use squealcast::physics::{OperatingPoint, Solver, Vectors};
@@ -133,71 +134,27 @@ fn a_table_gives_the_forces_of_the_law_it_was_read_off() {
     assert!(beyond.contains("beyond the last closure of the table"), "{beyond}");
 }
 
-/// Modes of a side at nodes, with a load on it.
-struct Side {
-    nodes: Vec<[f64; 3]>,
-    omega: Vec<f64>,
-    phi: Vec<Vec<f64>>,
+/// Generalised force of 1 N against the normal z, spread over the nodes.
+fn load(side: &Side) -> Vec<f64> {
+    let share = 1.0 / side.nodes.len() as f64;
+    let of_mode = |mode: usize| -(0..side.nodes.len()).map(|node| share * side.phi[3 * node + 2][mode]).sum::<f64>();
+    (0..side.omega.len()).map(of_mode).collect()
 }
 
-impl Side {
-    fn new(nodes: Vec<[f64; 3]>, modes: usize, step: f64, phase: f64) -> Self {
-        let value = |row: usize, mode: usize| (phase + 1.7 * row as f64 + 2.3 * (mode * mode) as f64).sin();
-        Self {
-            omega: (1..=modes).map(|k| step * k as f64).collect(),
-            phi: (0..3 * nodes.len()).map(|row| (0..modes).map(|mode| value(row, mode)).collect()).collect(),
-            nodes,
-        }
-    }
+/// Motion of each node along z by the modes from `kept` on, under a load of 1 N.
+fn truncated_gap(side: &Side, kept: usize) -> Vec<f64> {
+    let load = load(side);
+    let rest = kept..side.omega.len();
+    let of_node =
+        |node: usize| rest.clone().map(|k| side.phi[3 * node + 2][k] * load[k] / side.omega[k].powi(2)).sum::<f64>();
+    (0..side.nodes.len()).map(of_node).collect()
+}
 
-    /// Generalised force of 1 N against the normal z, spread over the nodes.
-    fn load(&self) -> Vec<f64> {
-        let share = 1.0 / self.nodes.len() as f64;
-        let of_mode =
-            |mode: usize| -(0..self.nodes.len()).map(|node| share * self.phi[3 * node + 2][mode]).sum::<f64>();
-        (0..self.omega.len()).map(of_mode).collect()
-    }
-
-    /// Motion of each node along z by the modes from `kept` on, under a load of 1 N.
-    fn truncated_gap(&self, kept: usize) -> Vec<f64> {
-        let load = self.load();
-        let rest = kept..self.omega.len();
-        let of_node = |node: usize| {
-            rest.clone().map(|k| self.phi[3 * node + 2][k] * load[k] / self.omega[k].powi(2)).sum::<f64>()
-        };
-        (0..self.nodes.len()).map(of_node).collect()
-    }
-
-    /// An archive of the first `kept` modes, with the residual flexibility and inertia of those up to `all`.
-    fn archive(&self, kept: usize, with_residual: bool, with_load: bool) -> Vec<u8> {
-        let (nodes, modes, rows) = (self.nodes.len() as u64, kept as u64, self.phi.len());
-        let phi: Vec<f64> = self.phi.iter().flat_map(|row| row[..kept].to_vec()).collect();
-        let nodes_m: Vec<f64> = self.nodes.iter().flatten().copied().collect();
-        let load = self.load();
-        let residual = |power: i32| -> Vec<f64> {
-            let entry = |i: usize, j: usize| -> f64 {
-                let rest = kept..self.omega.len();
-                rest.map(|k| self.phi[i][k] * self.phi[j][k] / self.omega[k].powi(power)).sum()
-            };
-            (0..rows).flat_map(|i| (0..rows).map(move |j| (i, j))).map(|(i, j)| entry(i, j)).collect()
-        };
-        let [flexibility, inertia] = [2, 4].map(residual);
-        let (of_mode, of_nodes, square) = ([modes], [nodes, 3], [3 * nodes; 2]);
-        let shape = [nodes, 3, modes];
-        let mut arrays: Vec<(&str, &[u64], &[f64])> = vec![
-            ("omega_rad_s", &of_mode, &self.omega[..kept]),
-            ("phi", &shape, &phi),
-            ("nodes_m", &of_nodes, &nodes_m),
-        ];
-        if with_residual {
-            arrays.push(("residual_flexibility", &square, &flexibility));
-            arrays.push(("residual_inertia", &square, &inertia));
-        }
-        if with_load {
-            arrays.push(("load", &of_mode, &load[..kept]));
-        }
-        npz_bytes(&arrays)
-    }
+/// An archive of the first `kept` modes with the load on them, and both residuals of the rest if requested.
+fn loaded(side: &Side, kept: usize, residual: bool) -> Vec<u8> {
+    let mut arrays = side.arrays(kept, residual, residual);
+    arrays.push(("load", vec![kept as u64], load(side)[..kept].to_vec()));
+    archive(&arrays)
 }
 
 fn pad() -> Side {
@@ -226,11 +183,11 @@ fn modal(keys: &str, more: &str, pad: Vec<u8>, disc: Vec<u8>) -> [RigFile; 3] {
 #[test]
 fn truncated_modes_keep_their_static_response() {
     let (pad, disc) = (pad(), disc());
-    let gaps = |kept: usize| format!("residual_gap_m_per_n = {:?}", pad.truncated_gap(kept));
-    let in_file = format!("load_coordinates = {:?}", pad.load());
+    let gaps = |kept: usize| format!("residual_gap_m_per_n = {:?}", truncated_gap(&pad, kept));
+    let in_file = format!("load_coordinates = {:?}", load(&pad));
     let all = modal("", &in_file, pad.archive(9, false, false), disc.archive(8, false, false));
-    let reduced = modal("", &gaps(5), pad.archive(5, true, true), disc.archive(4, true, false));
-    let selected = modal("modes = 5", &gaps(9), pad.archive(9, true, true), disc.archive(4, true, false));
+    let reduced = modal("", &gaps(5), loaded(&pad, 5, true), disc.archive(4, true, true));
+    let selected = modal("modes = 5", &gaps(9), loaded(&pad, 9, true), disc.archive(4, true, true));
     let [all, reduced, selected] = [all, reduced, selected].map(|files| Rig::from_files(&files).unwrap());
     assert!(reduced.describe().contains("without the inertial term, which a contact state does not use"));
     let mut open = 0;
@@ -247,7 +204,7 @@ fn truncated_modes_keep_their_static_response() {
     }
     assert!(open > 0 && open < 15, "{open} pairs open");
     // Without the response of the truncated modes to the load the forces differ.
-    let without = modal("", "residual_gap_m_per_n = 0.0", pad.archive(5, true, true), disc.archive(4, true, false));
+    let without = modal("", "residual_gap_m_per_n = 0.0", loaded(&pad, 5, true), disc.archive(4, true, true));
     let without = Rig::from_files(&without).unwrap();
     let p = point(300.0, 13.0, 0.5);
     let total = |rig: &Rig| rig.model.at(&p).unwrap().state().unwrap().contact_force_n();
@@ -309,8 +266,9 @@ fn contact_states_that_make_no_sense_are_refused() {
     let exponential = "law = \"exponential\"\npressure_pa = 1e4\nroughness_m = 2e-6\nmeasured = \"back-force\"";
     refused(&with_law(exponential), "`contact_state.area_m2` is missing; expected it for the law \"exponential\"");
 
-    let modal_refused = |more: &str, residual: bool, loaded: bool, expected: &str| {
-        let files = modal("", more, pad().archive(5, residual, loaded), disc().archive(4, residual, false));
+    let modal_refused = |more: &str, residual: bool, with_load: bool, expected: &str| {
+        let pad = if with_load { loaded(&pad(), 5, residual) } else { pad().archive(5, residual, residual) };
+        let files = modal("", more, pad, disc().archive(4, residual, residual));
         let error = Rig::from_files(&files).map(|_| ()).unwrap_err().to_string();
         assert!(error.contains(expected), "{error}\nexpected: {expected}");
     };

@@ -3,7 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use crate::program::{self, npz_bytes, python, rig_file as file};
+use crate::program::side::{Side, archive};
+use crate::program::{self, python, rig_file as file};
 use faer::Mat;
 use faer::linalg::solvers::Solve;
 use squealcast::physics::chart::Scratch;
@@ -20,62 +21,14 @@ fn matrices(rig: &Rig, mu: f64) -> [Mat<f64>; 2] {
     [stiffness, damping]
 }
 
-/// An archive of arrays with name, shape and values.
-fn archive(arrays: &[(&str, Vec<u64>, Vec<f64>)]) -> Vec<u8> {
-    let borrowed: Vec<(&str, &[u64], &[f64])> =
-        arrays.iter().map(|(name, shape, values)| (*name, shape.as_slice(), values.as_slice())).collect();
-    npz_bytes(&borrowed)
-}
-
-/// A side with all its modes, of which archives hold some, and the rest as residuals.
-struct Side {
-    nodes: Vec<[f64; 3]>,
-    omega: Vec<f64>,
-    /// Of every node and axis, for every mode.
-    phi: Vec<Vec<f64>>,
-}
-
-impl Side {
-    fn new(nodes: Vec<[f64; 3]>, modes: usize, step: f64, phase: f64) -> Self {
-        let value = |row: usize, mode: usize| (phase + 1.7 * row as f64 + 2.3 * (mode * mode) as f64).sin();
-        Self {
-            omega: (1..=modes).map(|k| step * k as f64).collect(),
-            phi: (0..3 * nodes.len()).map(|row| (0..modes).map(|mode| value(row, mode)).collect()).collect(),
-            nodes,
-        }
-    }
-
-    /// An archive of the first `kept` modes, with residuals of the rest if requested.
-    fn archive(&self, kept: usize, flexibility: bool, inertia: bool) -> Vec<u8> {
-        let rows = self.phi.len();
-        let (nodes, modes) = (self.nodes.len() as u64, kept as u64);
-        let mut arrays = vec![
-            ("omega_rad_s", vec![modes], self.omega[..kept].to_vec()),
-            ("phi", vec![nodes, 3, modes], self.phi.iter().flat_map(|row| row[..kept].to_vec()).collect()),
-            ("nodes_m", vec![nodes, 3], self.nodes.iter().flatten().copied().collect()),
-        ];
-        for (name, power, asked) in [("residual_flexibility", 2, flexibility), ("residual_inertia", 4, inertia)] {
-            let entry = |i: usize, j: usize| -> f64 {
-                let rest = kept..self.omega.len();
-                rest.map(|k| self.phi[i][k] * self.phi[j][k] / self.omega[k].powi(power)).sum()
-            };
-            if asked {
-                let all = (0..rows).flat_map(|i| (0..rows).map(move |j| (i, j))).map(|(i, j)| entry(i, j));
-                arrays.push((name, vec![3 * nodes; 2], all.collect()));
-            }
-        }
-        archive(&arrays)
-    }
-
-    /// The same side with its nodes in another order.
-    fn permuted(&self) -> Self {
-        let count = self.nodes.len();
-        let order: Vec<usize> = (0..count).map(|k| (7 * k + 3) % count).collect();
-        Self {
-            nodes: order.iter().map(|&node| self.nodes[node]).collect(),
-            omega: self.omega.clone(),
-            phi: order.iter().flat_map(|&node| (0..3).map(move |axis| self.phi[3 * node + axis].clone())).collect(),
-        }
+/// The same side with its nodes in another order.
+fn permuted(side: &Side) -> Side {
+    let count = side.nodes.len();
+    let order: Vec<usize> = (0..count).map(|k| (7 * k + 3) % count).collect();
+    Side {
+        nodes: order.iter().map(|&node| side.nodes[node]).collect(),
+        omega: side.omega.clone(),
+        phi: order.iter().flat_map(|&node| (0..3).map(move |axis| side.phi[3 * node + axis].clone())).collect(),
     }
 }
 
@@ -200,7 +153,7 @@ fn a_selection_puts_the_other_modes_into_the_residual() {
 fn the_order_of_nodes_means_nothing() {
     let band = "[band]\nmax_hz = 300.0";
     let permuted =
-        rig(band, pad().permuted().archive(KEPT[0], true, true), disc().permuted().archive(KEPT[1], true, true));
+        rig(band, permuted(&pad()).archive(KEPT[0], true, true), permuted(&disc()).archive(KEPT[1], true, true));
     let direct = reduced(band, true);
     for mu in [0.0, 0.8] {
         for (found, expected) in matrices(&permuted, mu).iter().zip(matrices(&direct, mu)) {

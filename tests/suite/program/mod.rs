@@ -1,5 +1,7 @@
 //! The binary as a test runs it: separate folders, exit code, both outputs.
 
+pub mod side;
+
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
