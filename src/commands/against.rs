@@ -8,11 +8,12 @@ use clap::Args;
 
 use super::recordings::{open_last, without_predictions};
 use super::{finite, not_negative, positive};
-use crate::msgs::{Prediction, level};
+use crate::msgs::Prediction;
+use crate::offline::score::add;
 use crate::recording::message::Payload;
 use crate::recording::reader::{Recorded, Recording};
 use crate::sound::Squeal;
-use crate::sound::matching::{Criteria, Listened, Meeting, Predictions, Unstable, Verdict};
+use crate::sound::matching::{Criteria, Listened, Meeting, Predictions, Verdict};
 
 /// The predictions that squeal is compared with
 #[derive(Clone, Debug, Args)]
@@ -70,11 +71,7 @@ impl AgainstArgs {
 /// The squealing modes of all predictions of a recording.
 fn read_predictions(recording: &Recording) -> Predictions {
     let mut predictions = Predictions::default();
-    for_each_prediction(recording, |prediction| {
-        let squealing = if prediction.level == level::SQUEAL { unstable(prediction) } else { vec![] };
-        let warns = matches!(prediction.level, level::WARN | level::SQUEAL);
-        predictions.push(prediction.header.stamp.as_ns(), warns, &squealing);
-    });
+    for_each_prediction(recording, |prediction| add(&mut predictions, prediction));
     predictions
 }
 
@@ -85,24 +82,6 @@ pub fn for_each_prediction(recording: &Recording, mut each: impl FnMut(&Predicti
             each(&prediction);
         }
     }
-}
-
-/// The unstable modes of a prediction.
-pub fn unstable(prediction: &Prediction) -> Vec<Unstable> {
-    let mut growing: Vec<Unstable> = prediction
-        .modes
-        .iter()
-        .filter(|mode| mode.growth_rate_per_s > 0.0)
-        .map(|mode| Unstable {
-            mode_id: mode.id,
-            frequency_hz: mode.frequency_hz,
-            growth_rate_per_s: mode.growth_rate_per_s,
-        })
-        .collect();
-    // Modes that grow by less than the threshold of instability are counted as stable.
-    growing.sort_by(|a, b| b.growth_rate_per_s.total_cmp(&a.growth_rate_per_s));
-    growing.truncate(prediction.unstable_modes as usize);
-    growing
 }
 
 impl Against {

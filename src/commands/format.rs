@@ -18,18 +18,20 @@ fn conditions(rig: &Rig, point: &OperatingPoint) -> String {
     text
 }
 
+/// Pairs closed and contact force, as a line of text.
+pub fn contact(state: &SteadyState) -> String {
+    format!(
+        "contact: {} of {} pairs closed, contact force {} N\n",
+        state.pairs_closed(),
+        state.force_n.len(),
+        significant(state.contact_force_n(), 6)
+    )
+}
+
 /// A prediction as a table.
 pub fn prediction(rig: &Rig, point: &OperatingPoint, summary: &Summary, state: Option<&SteadyState>) -> String {
     let mut text = conditions(rig, point);
-    if let Some(state) = state {
-        let _ = writeln!(
-            text,
-            "contact: {} of {} pairs closed, contact force {} N",
-            state.pairs_closed(),
-            state.force_n.len(),
-            significant(state.contact_force_n(), 6)
-        );
-    }
+    text += &state.map(contact).unwrap_or_default();
     text += "\n  id   frequency     growth rate  damping ratio  pad share  residual\n";
     text += "              Hz             1/s                                     \n";
     for mode in &summary.modes {

@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::format::{self, significant};
 use super::memory::{room, solver};
+use super::predict::ContactReport;
 use super::steps::ProgressOptions;
 use super::{Conditions, Outcome, positive, print};
 use crate::full_model::FullModelFile;
@@ -15,7 +16,8 @@ use crate::reduction::{FullSpectrum, FullVectors};
 
 /// Find the complex eigenvalues of a full model under one set of conditions
 ///
-/// Finds every root of the band within discs around shifts on the imaginary axis, each with its residual.
+/// Finds every root of the band within discs around shifts on the imaginary axis, each with its residual; with
+/// `[contact_state]` about the state of steady sliding there.
 #[derive(Debug, Args)]
 pub struct Options {
     /// Full model (TOML)
@@ -51,6 +53,9 @@ struct Report<'a> {
     /// Roots with growth rates between plus and minus this value were found at every frequency of the band; `null` if
     /// all roots were.
     covered_growth_per_s: f64,
+    /// Only for a model with a contact state.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    contact: Option<ContactReport>,
     discs: Vec<DiscReport>,
     roots: Vec<RootReport>,
 }
@@ -81,6 +86,7 @@ impl Options {
         let band_hz = self.band_hz.or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
         let room = room(self.memory_gib, &self.full)?;
         full.damp_modes(room, &mut |_, _| {})?;
+        full.find_statics(room)?;
         let mut said = |step| steps.full("full model", step);
         let mut solver = solver(&full, room, &mut said)?;
         let found = solver
@@ -107,6 +113,7 @@ fn report<'a>(full: &'a FullModelFile, p: &OperatingPoint, band_hz: f64, found: 
         friction_coefficient: p.friction_coefficient,
         band_hz,
         covered_growth_per_s: found.covered_growth_per_s,
+        contact: found.here.state().map(|state| ContactReport::from(&**state)),
         discs: found
             .discs
             .iter()
@@ -131,13 +138,15 @@ fn report<'a>(full: &'a FullModelFile, p: &OperatingPoint, band_hz: f64, found: 
 
 fn table(full: &FullModelFile, p: &OperatingPoint, band_hz: f64, found: &FullSpectrum) -> String {
     let mut text = format!(
-        "{}: {} degrees of freedom, {} N, {} rad/s, friction coefficient {}\n\n   frequency     growth rate  damping ratio  residual\n          Hz             1/s\n",
+        "{}: {} degrees of freedom, {} N, {} rad/s, friction coefficient {}\n",
         full.name,
         full.model.dimension(),
         p.normal_load_n,
         p.disc_speed_rad_s,
         p.friction_coefficient
     );
+    text += &found.here.state().map(|state| format::contact(state)).unwrap_or_default();
+    text += "\n   frequency     growth rate  damping ratio  residual\n          Hz             1/s\n";
     for root in &found.roots {
         let lambda = root.lambda;
         let mark = if lambda.re > full.settings.instability_threshold * lambda.norm() { "  unstable" } else { "" };

@@ -1,10 +1,10 @@
-use std::panic::resume_unwind;
 use std::path::PathBuf;
 use std::sync::Mutex;
 
 use anyhow::{Context, bail};
 use clap::Args;
 
+use super::condition::{Condition, change_between, in_parallel};
 use super::steps::ProgressOptions;
 use super::{Conditions, Outcome, RigName, finite, print, write_file};
 use crate::figures::plane::{self, Axis, Cell, Edge, Plane};
@@ -14,8 +14,6 @@ use crate::session::map_options;
 
 /// Largest number of operating points of a map.
 const MOST_POINTS: usize = 1_000_000;
-/// An edge between two operating points is located to this share of their distance.
-const EDGE_TOLERANCE: f64 = 1e-6;
 
 /// Map the largest growth rate over two conditions, with the edges of the windows of instability
 #[derive(Debug, Args)]
@@ -45,14 +43,6 @@ pub struct Options {
     svg: Option<PathBuf>,
     #[command(flatten)]
     progress: ProgressOptions,
-}
-
-/// A condition.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Condition {
-    Friction,
-    Load,
-    Speed,
 }
 
 /// A condition with its range.
@@ -100,33 +90,6 @@ impl std::str::FromStr for Grid {
         match counts[0].checked_mul(counts[1]) {
             Some(all) if all <= MOST_POINTS => Ok(Self(counts)),
             _ => Err(format!("expected at most {MOST_POINTS} points in all")),
-        }
-    }
-}
-
-impl Condition {
-    fn label(self) -> &'static str {
-        match self {
-            Self::Friction => "friction coefficient",
-            Self::Load => "normal load, N",
-            Self::Speed => "disc speed, rad/s",
-        }
-    }
-
-    /// `point` with this condition at `value`.
-    fn set(self, point: OperatingPoint, value: f64) -> OperatingPoint {
-        match self {
-            Self::Friction => point.with_friction(value),
-            Self::Load => OperatingPoint { normal_load_n: value, ..point },
-            Self::Speed => OperatingPoint { disc_speed_rad_s: value, ..point },
-        }
-    }
-
-    fn of(self, point: &OperatingPoint) -> f64 {
-        match self {
-            Self::Friction => point.friction_coefficient,
-            Self::Load => point.normal_load_n,
-            Self::Speed => point.disc_speed_rad_s,
         }
     }
 }
@@ -270,17 +233,11 @@ fn line(rig: &Rig, solver: &mut Solver, fixed: OperatingPoint, along: Span, valu
                 if before == after {
                     continue;
                 }
-                let (mut low, mut high) = (along.condition.of(from), along.condition.of(to));
-                let least = EDGE_TOLERANCE * (high - low);
-                while high - low > least {
-                    let middle = 0.5 * (low + high);
-                    match unstable(&growth(rig, solver, &along.condition.set(fixed, middle))) {
-                        Some(state) if state == before => low = middle,
-                        Some(_) | None => high = middle,
-                    }
-                }
+                let [low, high] = [from, to].map(|point| along.condition.of(point));
+                let grows = |value| unstable(&growth(rig, solver, &along.condition.set(fixed, value)));
+                let at = change_between(low, high, before, grows);
                 let edge = if after { Edge::Begins } else { Edge::Ends };
-                edges.push((along.condition.set(fixed, high), edge));
+                edges.push((along.condition.set(fixed, at), edge));
             }
         }
     }
@@ -297,23 +254,6 @@ fn growth(rig: &Rig, solver: &mut Solver, point: &OperatingPoint) -> Result<Grow
         unstable_modes: summary.unstable_modes,
         pairs_closed: spectrum.state.as_ref().map(|state| state.pairs_closed()),
     })
-}
-
-/// `task` for every value, on all cores: each is computed by one thread and does not depend on the others.
-fn in_parallel<T: Send>(values: &[f64], dimension: usize, task: impl Fn(f64, &mut Solver) -> T + Sync) -> Vec<T> {
-    let threads = std::thread::available_parallelism().map_or(1, usize::from).min(values.len());
-    let part = |first: usize| {
-        let mut solver = Solver::new(dimension);
-        let own = values.iter().enumerate().skip(first).step_by(threads);
-        own.map(|(index, &value)| (index, task(value, &mut solver))).collect::<Vec<_>>()
-    };
-    let mut found: Vec<(usize, T)> = std::thread::scope(|scope| {
-        let part = &part;
-        let workers: Vec<_> = (0..threads).map(|first| scope.spawn(move || part(first))).collect();
-        workers.into_iter().flat_map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic))).collect()
-    });
-    found.sort_by_key(|(index, _)| *index);
-    found.into_iter().map(|(_, found)| found).collect()
 }
 
 const CONDITIONS: [&str; 3] = ["normal_load_n", "disc_speed_rad_s", "friction_coefficient"];

@@ -5,6 +5,7 @@ mod bench;
 mod buses;
 mod check;
 mod completions;
+mod condition;
 mod critical;
 mod demo;
 mod display;

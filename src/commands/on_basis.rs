@@ -15,6 +15,9 @@ pub const TOLERANCE: f64 = 1e-6;
 const TRAINING: usize = 8;
 /// Held-out operating points for each varying condition.
 const HELD_OUT: usize = 3;
+/// As many times more of both if contact pairs open and close: the contact then changes faster with load and friction
+/// coefficient, fastest where few pairs are left.
+const OF_STATES: usize = 4;
 /// Number of operating points at which the full model is solved before the attempt is given up.
 const MOST_SAMPLES: usize = 40;
 /// Number of basis vectors at which the attempt is given up: modes of the parts would serve as well.
@@ -97,12 +100,13 @@ pub fn basis_of(
     if lowest > 0.0 {
         bail!("{path}: the range of mu begins at {lowest}; expected 0: windows of instability are searched from there");
     }
+    let points = if full.model.statics().is_some() { OF_STATES * matters } else { matters };
     let request = ParametricRequest {
         range,
         counted: Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: -DECAY_PER_S },
         tolerance,
-        training: TRAINING * matters,
-        held_out: HELD_OUT * matters,
+        training: TRAINING * points,
+        held_out: HELD_OUT * points,
         most_samples: MOST_SAMPLES,
         most_vectors: MOST_VECTORS,
     };

@@ -40,7 +40,7 @@ struct Report<'a> {
 
 /// The state of steady sliding.
 #[derive(Serialize)]
-struct ContactReport {
+pub struct ContactReport {
     pairs: usize,
     /// Pairs that carry a force.
     pairs_closed: usize,

@@ -9,7 +9,9 @@ use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
 use super::steps::{ProgressOptions, Steps};
 use super::{Outcome, positive, print};
-use crate::export::{ExportError, HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks};
+use crate::export::{
+    ExportError, HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks, state_on_modes,
+};
 use crate::files::input_file;
 use crate::files::whole_file::{remove_begun, write_together};
 use crate::full_model::FullModelFile;
@@ -98,6 +100,7 @@ impl Options {
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
         let room = room(self.memory_gib, &self.full)?;
         full.damp_modes(room, &mut |_, _| {})?;
+        full.find_statics(room)?;
         let full = full;
         if self.modes.is_none() && self.cutoff_hz.is_none() {
             if full.geometry.len() == 1 {
@@ -118,7 +121,8 @@ impl Options {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
         }
         // Residual flexibility admits every law but stiffness that varies with the load.
-        let ContactLaw { exponent, reference_n: _, slope_s_per_m: _, lateral_damping: _ } = full.settings.contact_law;
+        let ContactLaw { exponent, reference_n: _, slope_s_per_m: _, stribeck: _, lateral_damping: _ } =
+            full.settings.contact_law;
         if exponent != 0.0 && !self.no_residual {
             bail!(
                 "{}: `load.exponent` is {exponent}: residual flexibility requires contact stiffness independent of the load; \
@@ -138,12 +142,16 @@ impl Options {
             ));
         }
         let mut sides = modal_sides(&full, &kept)?;
+        let state = state_on_modes(&full, &kept);
         let residual = if self.compact { between_pairs(&file, &full, &mut sides)? } else { None };
         let (kept, mut remarks) = (remarks(&names, &kept), source_remarks(&full));
         remarks.extend(kept.iter().cloned());
         let make = |known: Option<&Certificate>| {
-            let patches = full.contact_patches.as_ref();
-            modal_rig(&file, &remarks, &full.common_tables, patches, known, &sides, residual.as_ref())
+            let (patches, mut common) = (full.contact_patches.as_ref(), full.common_tables.clone());
+            common.extend(state.iter().map(|state| ("contact_state".to_owned(), state.table.clone().into())));
+            let mut files = modal_rig(&file, &remarks, &common, patches, known, &sides, residual.as_ref())?;
+            files.extend(state.iter().flat_map(|state| state.files.clone()));
+            Ok(files)
         };
         self.finish(steps, &full, None, kept.join("; "), &make)
     }

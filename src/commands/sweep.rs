@@ -1,25 +1,31 @@
-use std::panic::resume_unwind;
 use std::path::PathBuf;
 
+use anyhow::{Context, bail};
 use clap::Args;
 
-use super::{LoadAndSpeed, Outcome, RigName, finite, format, print, write_file};
-use crate::figures::plot::{self, Point};
+use super::condition::{Condition, change_between, in_parallel};
+use super::{Outcome, RigName, finite, format, print, write_file};
+use crate::figures::plot::{self, Point, Shaded};
 use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors, Window};
 use crate::rig::Rig;
 use crate::session::map_options;
 
-/// Sweep the friction coefficient, following modes through crossings and merging points
+/// Sweep friction coefficient, load or speed, following modes through crossings and merging points
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
-    /// Friction coefficients, as FROM:TO:STEP
-    #[arg(long, value_name = "FROM:TO:STEP", default_value = "0:1:0.01", allow_hyphen_values = true)]
-    mu: Range,
-    #[command(flatten)]
-    load_and_speed: LoadAndSpeed,
+    /// Friction coefficients as FROM:TO:STEP, or one of them to sweep load or speed [default: 0:1:0.01, or the reference of
+    /// RIG]
+    #[arg(long, value_name = "FROM:TO:STEP", allow_hyphen_values = true)]
+    mu: Option<Values>,
+    /// Normal load in N, or loads as FROM:TO:STEP [default: the reference of RIG]
+    #[arg(long, value_name = "N", allow_hyphen_values = true)]
+    load: Option<Values>,
+    /// Disc speed in rad/s, or speeds as FROM:TO:STEP; negative turns the other way [default: the reference of RIG]
+    #[arg(long, value_name = "RAD_S", allow_hyphen_values = true)]
+    speed: Option<Values>,
     /// Write the modes as CSV to this file, - for standard output [default: -, unless --svg is given]
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
@@ -28,7 +34,22 @@ pub struct Options {
     svg: Option<PathBuf>,
 }
 
-/// An inclusive range of friction coefficients.
+/// One value of a condition, or a range of them.
+#[derive(Clone, Copy, Debug)]
+enum Values {
+    One(f64),
+    Range(Range),
+}
+
+impl std::str::FromStr for Values {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text.contains(':') { text.parse().map(Self::Range) } else { finite(text).map(Self::One) }
+    }
+}
+
+/// An inclusive range of a condition.
 #[derive(Clone, Copy, Debug)]
 struct Range {
     from: f64,
@@ -65,39 +86,97 @@ impl Range {
     }
 }
 
+/// Friction coefficients that are swept if no condition is given as a range.
+const FRICTION: Range = Range { from: 0.0, to: 1.0, step: 0.01 };
+
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
-        let point = self.load_and_speed.point(&rig)?;
-        let Sweep { modes, beside_ends, windows } = sweep(&rig, &point, self.mu, self.svg.is_some())?;
-        let csv = to_csv(&point, &modes)?;
+        let (condition, range, point) = self.swept(&rig)?;
+        let swept = match condition {
+            Condition::Friction => over_friction(&rig, &point, range, self.svg.is_some())?,
+            Condition::Load | Condition::Speed => over_load_or_speed(&rig, &point, condition, range),
+        };
+        let csv = to_csv(&swept.modes)?;
         match (&self.csv, &self.svg) {
             (Some(path), _) => write_file(path, csv.as_bytes())?,
             (None, None) => print(&csv)?,
             (None, Some(_)) => {}
         }
         if let Some(path) = &self.svg {
-            let mut points: Vec<Point> = modes
-                .iter()
-                .chain(&beside_ends)
-                .map(|(mu, mode)| Point {
-                    mu: *mu,
-                    id: mode.id,
-                    frequency_hz: mode.root.frequency_hz(),
-                    growth_rate_per_s: mode.root.growth_rate_per_s(),
-                })
-                .collect();
-            points.sort_by(|a, b| a.mu.total_cmp(&b.mu));
-            let title = format!("{}, {} N, {} rad/s", rig.name, point.normal_load_n, point.disc_speed_rad_s);
-            write_file(path, plot::sweep(&title, &points, &windows)?.as_bytes())?;
-            note!("{}: {}", path.display(), format::count(windows.len(), "window") + " of instability");
+            let mut points: Vec<Point> =
+                swept.modes.iter().chain(&swept.beside_ends).map(|s| s.drawn(condition)).collect();
+            points.sort_by(|a, b| a.x.total_cmp(&b.x));
+            let title = format!("{}, {}", rig.name, rest(condition, &point));
+            write_file(path, plot::sweep(&title, condition.label(), &points, &swept.windows)?.as_bytes())?;
+            note!("{}: {}", path.display(), format::count(swept.windows.len(), "window") + " of instability");
         }
         Ok(Outcome::Done)
     }
+
+    /// The condition that is swept, its range, and the operating point with the other two.
+    ///
+    /// # Errors
+    /// More than one range, no range, or a condition outside the limits of the rig.
+    fn swept(&self, rig: &Rig) -> anyhow::Result<(Condition, Range, OperatingPoint)> {
+        let given = [(Condition::Friction, self.mu), (Condition::Load, self.load), (Condition::Speed, self.speed)];
+        let (mut ranges, mut point) = (vec![], rig.reference);
+        for (condition, values) in given {
+            match values {
+                Some(Values::Range(range)) => ranges.push((condition, range)),
+                Some(Values::One(value)) => point = condition.set(point, value),
+                None => {}
+            }
+        }
+        let (condition, range) = match (ranges.as_slice(), self.mu) {
+            (&[one], _) => one,
+            ([], None) => (Condition::Friction, FRICTION),
+            ([], Some(_)) => {
+                bail!("--mu is one friction coefficient: expected a range FROM:TO:STEP of --load or --speed")
+            }
+            (several, _) => bail!("{} ranges, expected one of --mu, --load and --speed as FROM:TO:STEP", several.len()),
+        };
+        let limits = |point| rig.limits.check(&point).with_context(|| rig.name.clone());
+        match condition {
+            // Friction coefficients may be swept beyond the limits of inputs.
+            Condition::Friction => limits(point.with_friction(rig.reference.friction_coefficient))?,
+            Condition::Load | Condition::Speed => {
+                limits(condition.set(point, range.from))?;
+                limits(condition.set(point, range.to))?;
+            }
+        }
+        Ok((condition, range, point))
+    }
 }
 
-/// A mode at a friction coefficient.
-type Swept = (f64, Mode);
+/// The two conditions that are not swept, in words.
+fn rest(swept: Condition, point: &OperatingPoint) -> String {
+    let OperatingPoint { normal_load_n: load, disc_speed_rad_s: speed, friction_coefficient: mu } = point;
+    match swept {
+        Condition::Friction => format!("{load} N, {speed} rad/s"),
+        Condition::Load => format!("friction coefficient {mu}, {speed} rad/s"),
+        Condition::Speed => format!("friction coefficient {mu}, {load} N"),
+    }
+}
+
+/// A mode at an operating point.
+#[derive(Clone, Copy, Debug)]
+struct Swept {
+    point: OperatingPoint,
+    mode: Mode,
+}
+
+impl Swept {
+    /// The mode as a point of a curve over `condition`.
+    fn drawn(&self, condition: Condition) -> Point {
+        Point {
+            x: condition.of(&self.point),
+            id: self.mode.id,
+            frequency_hz: self.mode.root.frequency_hz(),
+            growth_rate_per_s: self.mode.root.growth_rate_per_s(),
+        }
+    }
+}
 
 /// Distance from a window at which the stable side of its end is drawn.
 const OFFSET: f64 = 1e-6;
@@ -108,11 +187,11 @@ struct Sweep {
     /// The modes just outside the windows, where they are still stable. Without them a coarse line would rise too
     /// early.
     beside_ends: Vec<Swept>,
-    windows: Vec<Window>,
+    windows: Vec<Shaded>,
 }
 
 /// All modes of the band at every friction coefficient of the range, and the windows of instability if requested.
-fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<Sweep> {
+fn over_friction(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<Sweep> {
     let mut solver = Solver::new(rig.model.dimension());
     // At least the range that a session searches, so that identities are the same.
     let searched = map_options(rig);
@@ -124,45 +203,116 @@ fn sweep(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyh
         values.retain(|&mu| mu <= end.mu);
         note!("the sweep ends at friction coefficient {:.6}: {}", end.mu, end.reason);
     }
-    let modes_at = |solver: &mut Solver, mu: f64| -> anyhow::Result<Vec<Swept>> {
-        let spectrum = solver.solve(&rig.model, &point.with_friction(mu), Vectors::Right)?;
-        let summary = Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold);
-        Ok(summary.modes.into_iter().map(|mode| (mu, mode)).collect())
-    };
-    // Each solve uses one thread and many run at once: the result at one friction coefficient does not depend on the
-    // others.
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
-    let share = values.len().div_ceil(threads).max(1);
-    let sweep_part = |part: &[f64]| {
-        let mut solver = Solver::new(rig.model.dimension());
-        let mut modes = vec![];
-        for &mu in part {
-            modes.extend(modes_at(&mut solver, mu)?);
-        }
-        Ok(modes)
-    };
-    let parts: Vec<anyhow::Result<Vec<Swept>>> = std::thread::scope(|scope| {
-        let workers: Vec<_> = values.chunks(share).map(|part| scope.spawn(|| sweep_part(part))).collect();
-        workers.into_iter().map(|worker| worker.join().unwrap_or_else(|panic| resume_unwind(panic))).collect()
-    });
+    let at = |mu: f64, solver: &mut Solver| modes_at(rig, solver, &point.with_friction(mu), &map);
     let mut modes = vec![];
-    for part in parts {
-        modes.extend(part?);
+    for found in in_parallel(&values, rig.model.dimension(), at) {
+        modes.extend(found?);
     }
-    let mut windows = map.windows.clone();
+    let mut windows: Vec<Window> = map.windows.clone();
     windows.retain(|window| window.mu_from <= range.to);
     windows.iter_mut().for_each(|window| window.mu_to = window.mu_to.filter(|&mu| mu <= range.to));
     let mut beside_ends = vec![];
     for window in &windows {
         let outside = [Some(window.mu_from - OFFSET), window.mu_to.map(|mu| mu + OFFSET)];
         for mu in outside.into_iter().flatten().filter(|mu| (range.from..=range.to).contains(mu)) {
-            beside_ends.extend(modes_at(&mut solver, mu)?);
+            beside_ends.extend(at(mu, &mut solver)?);
         }
     }
+    let windows = windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
     Ok(Sweep { modes, beside_ends, windows })
 }
 
-fn to_csv(at: &OperatingPoint, modes: &[Swept]) -> anyhow::Result<String> {
+/// All modes of the band at `point`, with the identities that `map` gives.
+fn modes_at(rig: &Rig, solver: &mut Solver, point: &OperatingPoint, map: &StabilityMap) -> anyhow::Result<Vec<Swept>> {
+    let spectrum = solver.solve(&rig.model, point, Vectors::Right)?;
+    let summary = Summary::of_spectrum(&spectrum, Some(map), rig.band_max_hz, rig.instability_threshold);
+    Ok(summary.modes.into_iter().map(|mode| Swept { point: *point, mode }).collect())
+}
+
+/// All modes of the band at every load or speed of the range, with the ranges of load or speed in which one is unstable.
+/// Identities at each of them are those of its own stability map. Values without a prediction are named in a note.
+fn over_load_or_speed(rig: &Rig, point: &OperatingPoint, condition: Condition, range: Range) -> Sweep {
+    let searched = map_options(rig);
+    let mu = point.friction_coefficient;
+    let followed =
+        MapOptions { mu_min: mu.min(searched.mu_min), mu_max: mu.max(searched.mu_max), windows: false, ..searched };
+    let at = |value: f64, solver: &mut Solver| -> anyhow::Result<Vec<Swept>> {
+        let point = condition.set(*point, value);
+        let map = StabilityMap::build(&rig.model, solver, &point, &followed)?;
+        modes_at(rig, solver, &point, &map)
+    };
+    let values: Vec<f64> = range.values().collect();
+    let (mut modes, mut stable, mut missing) = (vec![], vec![], vec![]);
+    for (&value, found) in values.iter().zip(in_parallel(&values, rig.model.dimension(), at)) {
+        match found {
+            Ok(found) => {
+                stable.push((value, Some(is_unstable(rig, &found))));
+                modes.extend(found);
+            }
+            Err(error) => {
+                stable.push((value, None));
+                missing.push((value, error));
+            }
+        }
+    }
+    if let Some((value, error)) = missing.first() {
+        let count = format::count(missing.len(), "value");
+        note!("no prediction at {count} of the {}, the first at {value}: {error:#}", condition.label());
+    }
+    let mut sweep = Sweep { modes, beside_ends: vec![], windows: vec![] };
+    sweep.find_windows(rig, &stable, at);
+    sweep
+}
+
+/// Whether any of the modes is unstable.
+fn is_unstable(rig: &Rig, modes: &[Swept]) -> bool {
+    modes.iter().any(|swept| swept.mode.root.is_unstable(rig.instability_threshold))
+}
+
+impl Sweep {
+    /// Finds where the modes become stable and unstable between neighbours in `unstable`, and the modes just outside.
+    fn find_windows(
+        &mut self,
+        rig: &Rig,
+        unstable: &[(f64, Option<bool>)],
+        at: impl Fn(f64, &mut Solver) -> anyhow::Result<Vec<Swept>>,
+    ) {
+        let mut solver = Solver::new(rig.model.dimension());
+        let mut open = None;
+        for (k, &(value, state)) in unstable.iter().enumerate() {
+            let before =
+                k.checked_sub(1).and_then(|before| unstable[before].1.map(|state| (unstable[before].0, state)));
+            let edge = match (before, state) {
+                (Some((from, before)), Some(state)) if before != state => {
+                    let grows = |value| at(value, &mut solver).ok().map(|modes| is_unstable(rig, &modes));
+                    change_between(from, value, before, grows)
+                }
+                (Some((from, _)), None) => from,
+                _ => value,
+            };
+            match (open, state) {
+                (None, Some(true)) => open = Some(edge),
+                (Some(from), Some(false) | None) => {
+                    self.windows.push((from, Some(edge)));
+                    open = None;
+                }
+                _ => {}
+            }
+        }
+        self.windows.extend(open.map(|from| (from, None)));
+        let (first, last) = (unstable.first(), unstable.last());
+        let Some((first, last)) = first.zip(last).map(|(first, last)| (first.0, last.0)) else { return };
+        let away = OFFSET * (last - first);
+        for (from, to) in self.windows.clone() {
+            let outside = [Some(from - away), to.map(|to| to + away)];
+            for value in outside.into_iter().flatten().filter(|value| (first..=last).contains(value)) {
+                self.beside_ends.extend(at(value, &mut solver).into_iter().flatten());
+            }
+        }
+    }
+}
+
+fn to_csv(modes: &[Swept]) -> anyhow::Result<String> {
     let mut writer = csv::Writer::from_writer(vec![]);
     writer.write_record([
         "normal_load_n",
@@ -173,12 +323,12 @@ fn to_csv(at: &OperatingPoint, modes: &[Swept]) -> anyhow::Result<String> {
         "growth_rate_per_s",
         "damping_ratio",
     ])?;
-    let (load, speed) = (at.normal_load_n.to_string(), at.disc_speed_rad_s.to_string());
-    for (mu, mode) in modes {
+    for Swept { point, mode } in modes {
         let root = &mode.root;
+        let OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient } = point;
+        let conditions = [normal_load_n, disc_speed_rad_s, friction_coefficient].map(f64::to_string);
         let values = [root.frequency_hz(), root.growth_rate_per_s(), root.damping_ratio()].map(|v| v.to_string());
-        let [hz, growth, damping] = &values;
-        writer.write_record([&load, &speed, &mu.to_string(), &mode.id.to_string(), hz, growth, damping])?;
+        writer.write_record(conditions.iter().chain([&mode.id.to_string()]).chain(&values))?;
     }
     Ok(String::from_utf8(writer.into_inner()?)?)
 }
@@ -191,20 +341,23 @@ mod tests {
     fn a_coarse_sweep_does_not_grow_before_its_window() {
         let rig = Rig::load("nine-dof-case-2").unwrap();
         let range = "0:1.6:0.2".parse().unwrap();
-        let Sweep { modes, beside_ends, windows } = sweep(&rig, &rig.reference, range, true).unwrap();
+        let Sweep { modes, beside_ends, windows } = over_friction(&rig, &rig.reference, range, true).unwrap();
         assert!(!windows.is_empty());
-        for window in &windows {
+        let mu = |swept: &Swept| swept.point.friction_coefficient;
+        for &(from, _) in &windows {
             // Check between the last step before a window and its beginning: no visible growth is drawn there.
-            let last = |swept: &&Swept| swept.0 < window.mu_from;
-            let grows = |swept: &Swept| swept.1.root.growth_rate_per_s() / swept.1.root.lambda.norm();
-            let before: Vec<&Swept> = beside_ends.iter().filter(last).collect();
-            let nearest = before.iter().map(|swept| swept.0).fold(0.0, f64::max);
-            assert!(window.mu_from - nearest < 2.0 * OFFSET, "{nearest}, the window begins at {}", window.mu_from);
-            let ids: Vec<u32> = before.iter().filter(|swept| swept.0 == nearest).map(|swept| swept.1.id).collect();
-            assert!(window.mode_ids.iter().all(|id| ids.contains(id)), "the pair has ids there: {ids:?}");
-            let pair = before.iter().filter(|swept| swept.0 == nearest && window.mode_ids.contains(&swept.1.id));
-            assert!(pair.into_iter().all(|swept| grows(swept) < 1e-6));
+            let nearest = beside_ends.iter().map(mu).filter(|mu| *mu < from).fold(0.0, f64::max);
+            assert!(from - nearest < 2.0 * OFFSET, "{nearest}, the window begins at {from}");
+            let outside: Vec<&Swept> = beside_ends.iter().filter(|swept| mu(swept) == nearest).collect();
+            assert_eq!(outside.len(), 9, "every mode is drawn there");
+            let grows = |swept: &&Swept| swept.mode.root.growth_rate_per_s() / swept.mode.root.lambda.norm();
+            let growing = outside.iter().filter(|swept| grows(swept) >= 1e-6).count();
+            let open = windows.iter().filter(|(other, to)| *other < from && to.is_none_or(|to| to > from)).count();
+            assert_eq!(growing, open, "one mode of every window that is open already, none of this one");
         }
-        assert!(modes.iter().all(|(mu, _)| ((mu / 0.2).round() * 0.2 - mu).abs() < 1e-12), "the table keeps its steps");
+        assert!(
+            modes.iter().map(mu).all(|mu| ((mu / 0.2).round() * 0.2 - mu).abs() < 1e-12),
+            "the table keeps its steps"
+        );
     }
 }

@@ -68,6 +68,7 @@ impl Options {
             Against { points: self.points, seed: self.seed, band_hz: self.band_hz, windows: !self.no_windows };
         let room = room(self.memory_gib, &self.against)?;
         full.damp_modes(room, &mut |_, _| {})?;
+        full.find_statics(room)?;
         let mut solver = solver(&full, room, &mut |step| steps.full("full model", step))?;
         let found = verify_against(&rig, &full, &mut solver, &against, &mut |what, step| steps.full(what, step))?;
         drop(steps);
@@ -76,6 +77,7 @@ impl Options {
         let tolerance = self.tolerance.or(rig.basis_tolerance).unwrap_or(TOLERANCE);
         let agrees = certificate.is_complete()
             && certificate.max_relative_error <= tolerance
+            && certificate.max_force_error.is_none_or(|error| error <= tolerance)
             && certificate.critical_friction_error.is_none_or(|error| error <= tolerance.max(FRICTION_TOLERANCE));
         Ok(if agrees { Outcome::Done } else { Outcome::Differences })
     }
@@ -104,6 +106,14 @@ fn text(rig: &Rig, full: &FullModelFile, found: &Verified) -> String {
             for [growth, hz] in roots {
                 let _ = writeln!(text, "            {what}: {hz:.3} Hz growing at {growth:.4} 1/s");
             }
+        }
+        if let Some(contact) = &point.contact {
+            let [full, rig] = contact.pairs_closed;
+            let _ = writeln!(
+                text,
+                "            {full} pairs closed, {rig} in the rig; contact forces differ by {:.1e} of the largest",
+                contact.max_force_error
+            );
         }
         if point.unpaired > 0 {
             let _ = writeln!(text, "            {} modes of the full model have no partner", point.unpaired);

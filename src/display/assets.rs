@@ -34,13 +34,14 @@ const CSS: &str = "text/css; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
 
 /// All files of the page; the first is the page itself.
-pub static ASSETS: [Asset; 20] = assets! {
+pub static ASSETS: [Asset; 22] = assets! {
     "index.html": "text/html; charset=utf-8",
     "style.css": CSS,
     "icon.svg": "image/svg+xml",
     "theme.js": JS,
     "app.js": JS,
     "clock.js": JS,
+    "contact.js": JS,
     "events.js": JS,
     "format.js": JS,
     "history.js": JS,

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use super::contact::contact;
 use super::curves::Curves;
 use super::events::{Events, seconds};
 use super::heard::SquealsInSound;
@@ -206,6 +207,12 @@ mod tests {
         let inputs = Some(InputSources { places: vec!["/rig/operating_point".to_owned()], start: None });
         let about = About { simulated: true, inputs, ..About::new(&rig, "live", 70.0) };
         let live = Live::new(rig, watch.clone(), about);
+
+    fn contact(&self, _at_s: Option<f64>) -> Result<String, String> {
+        let input = self.watch.snapshot().input.ok_or("no conditions were received yet")?;
+        let contact = contact(&self.rig, &conditions(&input))?;
+        Ok(serde_json::to_string(&contact).unwrap_or_default())
+    }
         let state = || serde_json::from_str::<serde_json::Value>(&live.state(None)).expect("JSON");
         let about = serde_json::to_value(live.about()).expect("JSON");
         assert_eq!(

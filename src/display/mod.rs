@@ -10,6 +10,7 @@ pub mod change;
 pub mod comparison;
 mod connections;
 pub mod curves;
+pub mod contact;
 pub mod events;
 pub mod heard;
 pub mod history;

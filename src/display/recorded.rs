@@ -1,9 +1,10 @@
 //! The page's source for a recording: read once, then queried for single moments.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::comparison::{Comparison, Criteria, Measurements};
+use super::contact::contact;
 use super::curves::Curves;
 use super::events::{Events, seconds};
 use super::heard::SquealsInSound;
@@ -376,7 +377,7 @@ mod tests {
             let input = OperatingPoint { header, seq, normal_load_n, disc_speed_rad_s: 13.0, friction_coefficient };
             Measured::at_its_stamp(Quantity::Conditions(input))
         });
-        let predicted = offline::record(&rig, None, std::iter::empty(), inputs, directory).expect("recorded");
+        let predicted = offline::record(&rig, None, std::iter::empty(), inputs, None, directory).expect("recorded");
         Recorded::read(&Recording::open(&predicted.directory).expect("a recording"), rig, Criteria::default())
     }
 
@@ -399,6 +400,14 @@ mod tests {
             assert_eq!(state["simulated"], true, "{text}");
             let growth = state["fastest"]["growth_rate_per_s"].as_f64();
             assert_eq!(growth, (prediction.unstable_modes > 0).then_some(prediction.max_growth_rate_per_s), "{text}");
+
+    fn contact(&self, at_s: Option<f64>) -> Result<String, String> {
+        let time_s = at_s.or(self.span_s().map(|span| span.0)).unwrap_or(0.0);
+        let moment = self.moment(time_s).ok_or("the recording holds no prediction")?;
+        let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
+        let contact = contact(&self.rig, &conditions(input))?;
+        Ok(serde_json::to_string(&contact).unwrap_or_default())
+    }
             if prediction.friction_margin.is_finite() {
                 let next = &state["next"];
                 assert_eq!(next["margin"].as_f64(), Some(prediction.friction_margin), "{text}");

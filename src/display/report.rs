@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use super::comparison::{Comparison, Judged, Verdict};
+use super::contact::contact;
 use super::curves::Curves;
 use super::events::{Event, EventColumn, EventKind, EventMoment, Events, MomentColumn, iso, seconds};
 use super::heard::SquealsInSound;
@@ -12,10 +13,11 @@ use crate::figures::plot;
 use crate::msgs::{SessionEvent, SessionEventKind};
 use crate::node::status::Status;
 
+use crate::session::conditions;
 /// Number of stability maps drawn.
 const WORST: usize = 3;
 /// Number of events listed; all of them are in the CSV file.
-const LISTED: usize = 500;
+pub(super) const LISTED: usize = 500;
 
 /// Settings recorded in this initial time are those the session started with, s.
 const STARTING_S: f64 = 0.5;
@@ -97,12 +99,53 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         }
         .to_owned();
     }
+    html += &contacts(recorded, from_s, to_s)?;
     html += &section("Stability maps at the worst moments", &maps);
     html += &section("Error bounds", &error_bounds(recorded));
     html += &section("Skipped work and damage", &skipped(recorded));
     html += &section("Rig", &format!("<pre>{}</pre>\n", escaped(&rig.describe())));
     Ok(page(&format!("squealcast report: {title}"), &html))
 }
+/// The contact at the worst moments, or at the last one if nothing squealed, for a rig with a contact state.
+///
+/// # Errors
+/// A figure cannot be drawn.
+fn contacts(recorded: &Recorded, from_s: f64, to_s: f64) -> Result<String, plot::PlotError> {
+    if recorded.rig.model.statics().is_none() {
+        return Ok(String::new());
+    }
+    let mut moments: Vec<f64> =
+        worst(&recorded.events).iter().take(WORST).filter_map(|e| Some(e.peak?.time_s)).collect();
+    if moments.is_empty() {
+        moments.push(to_s);
+    }
+    let mut html = String::new();
+    for time_s in moments {
+        let Some(input) = recorded.moment(time_s).and_then(|moment| moment.input.as_ref()) else { continue };
+        let after_s = time_s - from_s;
+        match contact(&recorded.rig, &conditions(input)) {
+            Ok(contact) => {
+                let caption = format!(
+                    "{after_s:.2} s after the start: {:.1} N, {:.3} rad/s, friction coefficient {:.4}. {} of {} pairs \
+                     closed; they carry {:.1} N in all, with {:.1} N on the back of the pad.",
+                    contact.normal_load_n,
+                    contact.disc_speed_rad_s,
+                    contact.friction_coefficient,
+                    contact.pairs_closed,
+                    contact.force_n.len(),
+                    contact.contact_force_n,
+                    contact.back_force_n
+                );
+                for face in contact.faces() {
+                    html += &figure(&contact_figure::draw(&face)?, &escaped(&caption));
+                }
+            }
+            Err(reason) => html += &format!("<p>{after_s:.2} s after the start: {}.</p>\n", escaped(&reason)),
+        }
+    }
+    Ok(section("Contact", &html))
+}
+
 
 /// One sentence that summarises the recording.
 fn verdict(recorded: &Recorded, to_s: f64) -> String {
@@ -456,7 +499,7 @@ fn skipped(recorded: &Recorded) -> String {
     html
 }
 
-fn optional(value: Option<f64>) -> String {
+pub(super) fn optional(value: Option<f64>) -> String {
     number(value.unwrap_or(f64::NAN))
 }
 

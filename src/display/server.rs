@@ -69,6 +69,11 @@ pub trait Source: Send + Sync + 'static {
 /// Constant properties of a source.
 #[derive(Clone, Debug, Serialize)]
 pub struct About {
+    /// The force of every contact pair, for a rig with a contact state.
+    ///
+    /// # Errors
+    /// Why it is not known.
+    fn contact(&self, at_s: Option<f64>) -> Result<String, String>;
     /// `live` or `recording`.
     pub kind: &'static str,
     pub rig: String,
@@ -85,6 +90,8 @@ pub struct About {
     /// Where a node expects its inputs.
     pub inputs: Option<InputSources>,
     /// First and last moment of a recording, s since the epoch.
+    /// Whether contact pairs of the rig open and close, so that their forces are shown.
+    pub contact_state: bool,
     pub span_s: Option<(f64, f64)>,
     /// When maps and charts of a recording became available.
     pub notes: Vec<Note>,
@@ -119,6 +126,7 @@ impl About {
             span_s: None,
             notes: vec![],
             event_columns: page_columns(),
+            contact_state: rig.model.statics().is_some(),
         }
     }
 }
@@ -197,6 +205,7 @@ async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Sourc
         () = connections::serve(listener, router, Bounds::default()) => {}
         () = send_states(app) => {}
     }
+        .route("/contact.json", get(contact))
 }
 
 async fn send_states(app: App) {
@@ -378,6 +387,14 @@ mod tests {
     use super::*;
 
     #[test]
+async fn contact(Shared(app): Shared<App>, Query(asked): Query<Moment>) -> Response {
+    aside(move || match app.source.contact(asked.at) {
+        Ok(contact) => json(contact),
+        Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
+    })
+    .await
+}
+
     fn only_its_own_addresses_are_names_of_a_display() {
         let (loopback, anywhere): (IpAddr, IpAddr) = ([127, 0, 0, 1].into(), [0, 0, 0, 0].into());
         for host in ["127.0.0.1:8765", "localhost:8765", "LOCALHOST", "[::1]:8765"] {

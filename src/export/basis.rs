@@ -7,6 +7,7 @@ use sha2::{Digest, Sha256};
 use super::error::ExportError;
 use super::matrix_market::write_array;
 use super::rig::{HASH_DIGITS, ModalSide, modal_rig, rig_name, source_remarks};
+use super::state::state_on_basis;
 use crate::full_model::FullModelFile;
 use crate::physics::{Law, Term};
 use crate::reduction::{ParametricBasis, ParametricRequest, project_sparse};
@@ -70,7 +71,11 @@ pub fn basis_rig(
             }
         })
         .collect();
-    modal_rig(file, &remarks, &common, full.contact_patches.as_ref(), known, &sides, None)
+    let state = state_on_basis(file, full)?;
+    common.extend(state.iter().map(|state| ("contact_state".to_owned(), state.table.clone().into())));
+    let mut files = modal_rig(file, &remarks, &common, full.contact_patches.as_ref(), known, &sides, None)?;
+    files.extend(state.into_iter().flat_map(|state| state.files));
+    Ok(files)
 }
 
 /// The common tables of the full model, with the ranges of `[search]` and `[chart]` replaced by those of the basis.
@@ -138,6 +143,7 @@ fn system_rig(
                 | Law::ContactDamping
                 | Law::FrictionDamping
                 | Law::FrictionSlope
+                | Law::FallingFriction { .. }
                 | Law::LateralFriction
                 | Law::FrictionChebyshev { .. }
                 | Law::DiscSpeedInContact { .. }

@@ -7,6 +7,7 @@ mod error;
 mod full_model;
 mod matrix_market;
 mod rig;
+mod state;
 mod vtk;
 
 pub use basis::basis_rig;
@@ -15,4 +16,5 @@ pub use error::ExportError;
 pub use full_model::write_full_model;
 pub use matrix_market::{write_skew, write_symmetric};
 pub use rig::{HASH_DIGITS, ModalSide, modal_rig, modal_sides, source_remarks};
+pub use state::{StateOfRig, state_on_basis, state_on_modes};
 pub use vtk::write_mesh;

@@ -126,8 +126,7 @@ impl ModalSide<'_> {
 
 /// Residual flexibility between contact pairs as an archive that a rig of kind 2 reads.
 fn residual_archive(residual: &ResidualFlexibility) -> std::io::Result<Vec<u8>> {
-    let c = residual.normal.nrows();
-    let lower = |m: &Mat<f64>| (0..c).flat_map(|i| (0..=i).map(move |j| m[(i, j)])).collect::<Vec<f64>>();
+    let (c, lower) = (residual.normal.nrows(), lower_triangle);
     let mut arrays = vec![
         ("flexibility_normal", vec![c * (c + 1) / 2], lower(&residual.normal)),
         ("flexibility_sliding", vec![c, c], by_rows(&residual.sliding)),
@@ -139,12 +138,17 @@ fn residual_archive(residual: &ResidualFlexibility) -> std::io::Result<Vec<u8>> 
     packed(&arrays)
 }
 
-fn by_rows(matrix: &Mat<f64>) -> Vec<f64> {
+/// The lower triangle of a symmetric matrix, by rows.
+pub(super) fn lower_triangle(matrix: &Mat<f64>) -> Vec<f64> {
+    (0..matrix.nrows()).flat_map(|i| (0..=i).map(move |j| matrix[(i, j)])).collect()
+}
+
+pub(super) fn by_rows(matrix: &Mat<f64>) -> Vec<f64> {
     (0..matrix.nrows()).flat_map(|i| (0..matrix.ncols()).map(move |j| matrix[(i, j)])).collect()
 }
 
 /// An `.npz` archive of arrays, as `numpy.savez` would write it; `arrays` are names, shapes and values in C order.
-fn packed(arrays: &[(&str, Vec<usize>, Vec<f64>)]) -> std::io::Result<Vec<u8>> {
+pub(super) fn packed(arrays: &[(&str, Vec<usize>, Vec<f64>)]) -> std::io::Result<Vec<u8>> {
     let mut bytes = Cursor::new(vec![]);
     let mut archive = npyz::npz::NpzWriter::new(&mut bytes);
     for (name, shape, values) in arrays {

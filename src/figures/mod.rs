@@ -1,5 +1,6 @@
 //! Figures as SVG and self-contained HTML pages.
 
+pub mod contact;
 pub mod html;
 pub mod plane;
 pub mod plot;

@@ -35,10 +35,11 @@ const DASHES: [Option<(u32, u32)>; 3] = [None, Some((8, 4)), Some((2, 3))];
 const LEGEND_WIDTH: usize = 891;
 const LEGEND_MOST: usize = 27;
 
-/// A mode at one friction coefficient: a point of its curve.
+/// A mode at one value of a condition: a point of its curve.
 #[derive(Clone, Copy, Debug)]
 pub struct Point {
-    pub mu: f64,
+    /// The condition: the friction coefficient, or the one that the figure names.
+    pub x: f64,
     pub id: u32,
     pub frequency_hz: f64,
     pub growth_rate_per_s: f64,
@@ -58,13 +59,17 @@ struct Line<'a> {
     points: Vec<&'a Point>,
 }
 
-/// Contents of a figure over the friction coefficient.
-struct AgainstFriction<'a> {
+/// Label of the axis of the friction coefficient.
+const FRICTION: &str = "friction coefficient";
+
+/// Contents of a figure over one condition.
+struct AgainstCondition<'a> {
     lines: Vec<Line<'a>>,
     dots: &'a [Point],
     windows: Vec<(f64, Option<f64>)>,
-    mu: (f64, f64),
-    /// A friction coefficient marked by a vertical line.
+    x: (f64, f64),
+    x_label: &'static str,
+    /// A value of the condition marked by a vertical line.
     marked: Option<f64>,
     unit: Unit,
 }
@@ -79,12 +84,13 @@ pub struct PlotError(String);
 ///
 /// # Errors
 /// [`PlotError`] if the plotting library fails.
-pub fn sweep(title: &str, points: &[Point], windows: &[Window]) -> Result<String, PlotError> {
-    AgainstFriction {
+pub fn sweep(title: &str, x_label: &'static str, points: &[Point], windows: &[Shaded]) -> Result<String, PlotError> {
+    AgainstCondition {
         lines: by_mode(points),
         dots: &[],
-        windows: windows.iter().map(|window| (window.mu_from, window.mu_to)).collect(),
-        mu: range(points.iter().map(|point| point.mu)),
+        windows: windows.to_vec(),
+        x: range(points.iter().map(|point| point.x)),
+        x_label,
         marked: None,
         unit: Unit::Hz,
     }
@@ -104,7 +110,8 @@ pub fn against_full(
     unit: Unit,
 ) -> Result<String, PlotError> {
     let windows = windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
-    AgainstFriction { lines: by_mode(lines), dots, windows, mu: (0.0, mu_max), marked: None, unit }.draw(title)
+    let x = (0.0, mu_max);
+    AgainstCondition { lines: by_mode(lines), dots, windows, x, x_label: FRICTION, marked: None, unit }.draw(title)
 }
 
 /// Curves of several models as lines, with one style and legend entry per model, and of another model as dots.
@@ -115,8 +122,8 @@ pub fn several(title: &str, models: &[(String, Vec<Point>)], dots: &[Point], mu_
     let lines = models.iter().enumerate().flat_map(|(k, (name, points))| {
         by_mode(points).into_iter().map(move |line| Line { style: k as u32, label: name.clone(), ..line })
     });
-    let (lines, mu) = (lines.collect(), (0.0, mu_max));
-    AgainstFriction { lines, dots, windows: vec![], mu, marked: None, unit: Unit::Hz }.draw(title)
+    let (lines, x) = (lines.collect(), (0.0, mu_max));
+    AgainstCondition { lines, dots, windows: vec![], x, x_label: FRICTION, marked: None, unit: Unit::Hz }.draw(title)
 }
 
 /// One curve per mode.
@@ -135,8 +142,9 @@ fn by_mode(points: &[Point]) -> Vec<Line<'_>> {
 pub fn map(title: &str, curves: &Curves, mu_to: f64, marked: Option<f64>) -> Result<String, PlotError> {
     let windows = curves.windows.iter().map(|window| (window.mu_from, window.mu_to)).collect();
     let from = curves.mu.first().copied().unwrap_or(0.0);
-    let (lines, mu) = (points(curves, mu_to), (from, mu_to.max(from + 1e-6)));
-    AgainstFriction { lines: by_mode(&lines), dots: &[], windows, mu, marked, unit: Unit::Hz }.draw(title)
+    let (points, x) = (points(curves, mu_to), (from, mu_to.max(from + 1e-6)));
+    let (lines, unit) = (by_mode(&points), Unit::Hz);
+    AgainstCondition { lines, dots: &[], windows, x, x_label: FRICTION, marked, unit }.draw(title)
 }
 
 /// The points of curves up to `mu_to`.
@@ -146,16 +154,16 @@ pub fn points(curves: &Curves, mu_to: f64) -> Vec<Point> {
         for ((&mu, hz), growth) in curves.mu.iter().zip(&mode.frequency_hz).zip(&mode.growth_rate_per_s) {
             if let (Some(hz), Some(growth), true) = (*hz, *growth, mu <= mu_to) {
                 let (frequency_hz, growth_rate_per_s) = (hz.into(), growth.into());
-                points.push(Point { mu, id: mode.id, frequency_hz, growth_rate_per_s });
+                points.push(Point { x: mu, id: mode.id, frequency_hz, growth_rate_per_s });
             }
         }
     }
     points
 }
 
-impl AgainstFriction<'_> {
+impl AgainstCondition<'_> {
     fn draw(&self, title: &str) -> Result<String, PlotError> {
-        let mu = self.mu;
+        let x = self.x;
         let mut entries: Vec<(u32, &str)> = self.lines.iter().map(|line| (line.style, &*line.label)).collect();
         entries.dedup();
         let longest = entries.iter().map(|(_, label)| label.chars().count()).max().unwrap_or(0);
@@ -175,20 +183,20 @@ impl AgainstFriction<'_> {
             for (area, label, value) in [(&upper, "growth rate, 1/s", growth), (&lower, frequency_label, frequency)] {
                 let drawn = self.lines.iter().flat_map(|line| line.points.iter().copied()).chain(self.dots);
                 let y = padded(range(drawn.map(value)));
-                let mut chart = axes(area, mu, y, "friction coefficient", label)?;
+                let mut chart = axes(area, x, y, self.x_label, label)?;
                 for &(from, to) in &self.windows {
-                    let (from, to) = (from.max(mu.0), to.unwrap_or(mu.1).min(mu.1));
+                    let (from, to) = (from.max(x.0), to.unwrap_or(x.1).min(x.1));
                     if from < to {
                         chart.draw_series([Rectangle::new([(from, y.0), (to, y.1)], shade())]).map_err(failed)?;
                     }
                 }
                 for line in &self.lines {
-                    let points = line.points.iter().map(|point| (point.mu, value(point))).collect();
+                    let points = line.points.iter().map(|point| (point.x, value(point))).collect();
                     curve(&mut chart, line.style, points)?;
                 }
-                let dot = |point: &Point| Circle::new((point.mu, value(point)), 3 * FINE / 2, BLACK.filled());
+                let dot = |point: &Point| Circle::new((point.x, value(point)), 3 * FINE / 2, BLACK.filled());
                 chart.draw_series(self.dots.iter().map(dot)).map_err(failed)?;
-                if let Some(at) = self.marked.filter(|at| (mu.0..=mu.1).contains(at)) {
+                if let Some(at) = self.marked.filter(|at| (x.0..=x.1).contains(at)) {
                     let line = LineSeries::new([(at, y.0), (at, y.1)], BLACK.stroke_width(2 * FINE));
                     chart.draw_series(line).map_err(failed)?;
                 }
@@ -573,7 +581,7 @@ fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
     }
 }
 
-fn padded((low, high): (f64, f64)) -> (f64, f64) {
+pub(super) fn padded((low, high): (f64, f64)) -> (f64, f64) {
     let pad = 0.04 * (high - low);
     (low - pad, high + pad)
 }

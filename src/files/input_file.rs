@@ -14,6 +14,7 @@
 //! | matrices of a rig (Matrix Market) | [`RIG_PART`] | about 16 times the file |
 //! | table of contact pressures of a rig (CSV) | [`RIG_PART`] | twice the file; lines of 1 MiB, 1000 points |
 //! | matrices, nodes and rows of a full model | [`FULL_MODEL_PART`] | about 20 times the file; lines of 1 MiB |
+//! | table of contact pressures of a full model (CSV) | [`TABLE`] | 3 times the file; 1000 points |
 //! | tribometer log | [`LOG`] | about 12 times the file; lines of 64 KiB |
 //! | target frequencies | [`TARGETS`] | about 10 times the file |
 //! | WAV file | none: read in pieces | 20 MiB for each channel, of at most 64 |
@@ -34,6 +35,8 @@ pub const PARAMETERS: u64 = 1 << 20;
 pub const RIG_PART: u64 = 512 << 20;
 /// Files that a full model refers to; they are read line by line.
 pub const FULL_MODEL_PART: u64 = 16 << 30;
+/// Tables of contact pressures that a full model refers to.
+pub const TABLE: u64 = 1 << 20;
 /// Logs of a tribometer.
 pub const LOG: u64 = 512 << 20;
 /// Samples of sound and acceleration, other than WAV files.

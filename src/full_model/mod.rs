@@ -9,6 +9,7 @@ mod entries;
 mod files;
 mod part;
 mod raw;
+mod state;
 mod tables;
 pub mod verification;
 
@@ -16,7 +17,7 @@ use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use crate::files::input_file;
-use crate::physics::ContactLaw;
+use crate::physics::{ContactLaw, ModelError};
 use crate::reduction::{
     FullContact, FullModel, FullPart, Kept, PartTurning, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
     Substructure, Wanted, keep_modes, normal_modes,
@@ -27,6 +28,7 @@ use crate::rig::{Pair, RigError, patch, settings, system};
 
 use files::Files;
 use raw::{RawFullModel, RawPart};
+pub use state::FullState;
 use verification::DEFAULT_BAND_HZ;
 
 /// A full model and everything its files contain.
@@ -46,6 +48,8 @@ pub struct FullModelFile {
     pub common_tables: toml::Table,
     /// `[[contact_patch]]` as written in the file; `None` for a system.
     pub contact_patches: Option<toml::Value>,
+    /// `[contact_state]`; `None` if the contact pairs are always closed.
+    pub state: Option<FullState>,
     /// Field, such as `pad.mass`, and file name of each matrix of a part.
     matrix_files: Vec<(String, String)>,
     /// Path of the TOML file.
@@ -110,6 +114,7 @@ impl FullModelFile {
         let own: RawFullModel = crate::rig::raw::parse(&files.toml, &bytes)?;
         let mut common_tables: toml::Table = crate::rig::raw::parse(&files.toml, &bytes)?;
         let contact_patches = common_tables.remove("contact_patch");
+        let state_keys = common_tables.remove("contact_state").and_then(|table| table.as_table().cloned());
         common_tables.retain(|key, _| Common::TABLES.contains(&key));
         let settings = settings::check(&files.toml, &own.common())?;
         let toml = files.toml.clone();
@@ -128,11 +133,12 @@ impl FullModelFile {
             (Some(_), Some(_)) => return Err(refuse_beside_system("pad")),
             (Some(_), None) if own.disc.is_some() => return Err(refuse_beside_system("disc")),
             (Some(_), None) if own.contact_patch.is_some() => return Err(refuse_beside_system("contact_patch")),
+            (Some(_), None) if own.contact_state.is_some() => return Err(refuse_beside_system("contact_state")),
             (Some(system), None) => read_system(&mut files, system, &settings)?,
             (None, None) => return Err(missing("pad", "[pad] with stiffness and mass, or [system]")),
             (None, Some(pad)) => match own.contact_patch.as_deref() {
                 None | Some([]) => return Err(missing("contact_patch", "at least one [[contact_patch]]")),
-                Some(patches) => read_parts(&mut files, pad, own.disc.as_ref(), patches, settings.contact_law)?,
+                Some(patches) => read_parts(&mut files, pad, &own, patches, settings.contact_law)?,
             },
         };
         let mut contents = read.contents;
@@ -145,6 +151,7 @@ impl FullModelFile {
             settings,
             common_tables,
             contact_patches,
+            state: read.state.map(|state| state.written_as(state_keys.unwrap_or_default())),
             matrix_files: matrix_files(&own),
             path: path.to_owned(),
             content_hash: files.content_hash(),
@@ -284,14 +291,15 @@ struct ReadModel {
     model: FullModel,
     geometry: Vec<PartGeometry>,
     pairs: Vec<Pair>,
+    state: Option<FullState>,
     contents: Vec<String>,
 }
 
-/// Reads `[pad]`, `[disc]` and their contact patches.
+/// Reads `[pad]`, `[disc]`, their contact patches and `[contact_state]` of the file `own`.
 fn read_parts(
     files: &mut Files,
     pad: &RawPart,
-    disc: Option<&RawPart>,
+    own: &RawFullModel,
     patches: &[RawPatch],
     contact_law: ContactLaw,
 ) -> Result<ReadModel, RigError> {
@@ -302,7 +310,7 @@ fn read_parts(
         return Err(RigError::Kind { file: toml, field, value, limit: format!("disc.{key}") });
     }
     let pad = part::read(files, "pad", pad)?;
-    let disc = disc.map(|disc| part::read(files, "disc", disc)).transpose()?;
+    let disc = own.disc.as_ref().map(|disc| part::read(files, "disc", disc)).transpose()?;
     let (pad_m, disc_m) = (pad.geometry.interface_m(), disc.as_ref().map(|disc| disc.geometry.interface_m()));
     let patch::Contacts { mut pairs, stiffness_n_per_m, damping_n_s_per_m } =
         patch::contacts(&toml, patches, &pad_m, disc_m.as_deref())?;
@@ -334,7 +342,14 @@ fn read_parts(
         stiffness_n_per_m,
         damping_n_s_per_m,
         radius_m: pairs.iter().map(|pair| pair.radius_m).collect(),
+        steady: None,
     };
+    let state = own.contact_state.as_ref().map(|raw| state::read(files, raw, &pad, &contact.stiffness_n_per_m));
+    let state = state.transpose()?;
+    if state.is_some() && contact_law.exponent != 0.0 {
+        let source = ModelError::StateLoadExponent { exponent: contact_law.exponent };
+        return Err(RigError::Model { file: toml, source });
+    }
     let mut contents = vec!["kind       pad and disc of a finite-element program".to_owned()];
     for part in std::iter::once(&pad).chain(&disc) {
         contents.push(format!(
@@ -380,6 +395,7 @@ fn read_parts(
         contact.stiffness_n_per_m.iter().sum::<f64>(),
         pairs.len() - coincident
     ));
+    contents.extend(state.iter().flat_map(|state| state.describe(pairs.len())));
     let (mut parts, mut geometry): (Vec<FullPart>, Vec<PartGeometry>) = (vec![], vec![]);
     let mut own = vec![];
     for part in std::iter::once(pad).chain(disc) {
@@ -399,7 +415,7 @@ fn read_parts(
         let added = model.damp(part, *alpha_per_s, *beta_s).and_then(|()| model.turn(part, turning));
         added.map_err(|source| RigError::Reduction { file: toml.clone(), source })?;
     }
-    Ok(ReadModel { model, geometry, pairs, contents })
+    Ok(ReadModel { model, geometry, pairs, state, contents })
 }
 
 /// A sparse row that gives `weight` times the displacement of `node` along a direction. Constrained directions
@@ -456,5 +472,5 @@ fn read_system(files: &mut Files, raw: &RawSystem, settings: &Settings) -> Resul
     let part = FullPart { name: "system".to_owned(), mass, stiffness: none };
     let contact_law = settings.contact_law;
     let model = FullModel { parts: vec![part], stiffness, damping, modal_damping: vec![], contact: None, contact_law };
-    Ok(ReadModel { model, geometry: vec![], pairs: vec![], contents })
+    Ok(ReadModel { model, geometry: vec![], pairs: vec![], state: None, contents })
 }

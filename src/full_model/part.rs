@@ -19,6 +19,8 @@ use crate::rig::{RigError, lines, matrix_market};
 pub struct Part {
     pub part: FullPart,
     pub geometry: PartGeometry,
+    /// Its nodes by label.
+    pub nodes: Nodes,
     /// Row of each node index and direction.
     pub row_of: HashMap<(usize, usize), usize>,
     /// `α`, 1/s, and `β`, s, of Rayleigh damping `α M + β K`.
@@ -104,6 +106,15 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
     for (key, value) in given {
         within(&toml, &field(key), value, value >= 0.0, "at least 0")?;
     }
+    let loss_factor = within(&toml, &field("loss_factor"), raw.loss_factor, raw.loss_factor >= 0.0, "at least 0")?;
+    if loss_factor != 0.0 {
+        return Err(RigError::Kind {
+            file: toml,
+            field: field("loss_factor"),
+            value: format!("is {loss_factor}, but a complex stiffness K (1 + i eta) has no real equation of motion"),
+            limit: format!("damping_ratio = {} for the same damping of every mode of the part", 0.5 * loss_factor),
+        });
+    }
     let interface = interface(&toml, &field("interface_nodes"), &raw.interface_nodes, &nodes, &raw.nodes)?;
     let not_negative = |field: &str, value: f64| within(&toml, field, value, value >= 0.0, "at least 0");
     let damping_ratio = match &raw.damping_ratio {
@@ -119,7 +130,8 @@ pub fn read(files: &mut Files, name: &str, raw: &RawPart) -> Result<Part, RigErr
     };
     Ok(Part {
         part: FullPart { name: name.to_owned(), mass, stiffness },
-        geometry: PartGeometry { nodes_m: nodes.positions, rows, interface, damping_ratio },
+        geometry: PartGeometry { nodes_m: nodes.positions.clone(), rows, interface, damping_ratio },
+        nodes,
         row_of,
         rayleigh: given.map(|(_, value)| value),
         turning,
@@ -221,7 +233,7 @@ pub fn matrix(
 }
 
 /// Whether the remaining input is a Matrix Market file (begins with its banner) or empty.
-fn is_matrix_market(input: &mut dyn BufRead) -> bool {
+pub fn is_matrix_market(input: &mut dyn BufRead) -> bool {
     input.fill_buf().is_ok_and(|start| start.is_empty() || start.starts_with(b"%"))
 }
 

@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use crate::rig::raw::{OneOrMany, RawPatch, RawSystem, define_file, with_common_tables};
+use crate::rig::raw::{OneOrMany, RawContactState, RawPatch, RawSystem, define_file, with_common_tables};
 
 with_common_tables!(define_file! {
     /// A whole full model: the common tables of a rig file, and either parts or a system.
@@ -10,6 +10,7 @@ with_common_tables!(define_file! {
         pad: Option<RawPart>,
         disc: Option<RawPart>,
         contact_patch: Option<Vec<RawPatch>>,
+        contact_state: Option<RawContactState>,
         system: Option<RawSystem>,
     }
 });
@@ -28,6 +29,9 @@ pub struct RawPart {
     pub rayleigh_alpha_per_s: f64,
     #[serde(default)]
     pub rayleigh_beta_s: f64,
+    /// Refused unless it is 0: a complex stiffness has no real equation of motion.
+    #[serde(default)]
+    pub loss_factor: f64,
     pub gyroscopic: Option<String>,
     pub spin: Option<String>,
     pub stress_stiffening: Option<String>,

@@ -7,9 +7,10 @@ use crate::rig::RigError;
 use crate::rig::lines::{Lines, found};
 
 /// Directions of the rows of a node, in numerical order.
-const DIRECTIONS: [&str; 6] = ["x", "y", "z", "rx", "ry", "rz"];
+pub const DIRECTIONS: [&str; 6] = ["x", "y", "z", "rx", "ry", "rz"];
 
 /// Positions of nodes, accessible by label.
+#[derive(Clone, Debug)]
 pub struct Nodes {
     pub positions: Vec<[f64; 3]>,
     /// Index into `positions` of every label. Without labels in the table, nodes are labelled from 0.
@@ -106,7 +107,7 @@ pub fn rows(file: &str, input: impl BufRead) -> Result<Vec<(u64, usize)>, RigErr
 }
 
 /// The first line, with all spaces removed.
-fn header<R: BufRead>(lines: &mut Lines<'_, R>) -> Result<String, RigError> {
+pub fn header<R: BufRead>(lines: &mut Lines<'_, R>) -> Result<String, RigError> {
     let header = lines.advance()?.map(|(_, text)| text.chars().filter(|c| !c.is_whitespace()).collect::<String>());
     Ok(header.unwrap_or_default())
 }

@@ -4,6 +4,7 @@
 use faer::c64;
 use serde::Serialize;
 
+use crate::contact::SteadyState;
 use crate::full_model::FullModelFile;
 use crate::physics::{MapError, MapOptions, OperatingPoint, SolveError, Solver, StabilityMap, Window};
 use crate::random::Random;
@@ -24,14 +25,15 @@ pub enum VerificationError {
     /// No operating points were asked for.
     #[error("--points is 0, expected at least 1")]
     NoPoints,
-    /// The rig's contact pairs follow a contact state, those of the full model are always closed.
+    /// The contact pairs of one follow a contact state, those of the other are always closed.
     #[error(
-        "{rig}: `contact_state` is given, but the pairs of a full model are always closed, so the two cannot agree; \
-         expected a rig without it"
+        "{with}: `contact_state` is given, but the pairs of {without} are always closed; expected it in both or neither"
     )]
     ContactState {
-        /// Name of the rig.
-        rig: String,
+        /// Name of the rig or full model that has it.
+        with: String,
+        /// Name of the other.
+        without: String,
     },
     /// The full model could not be solved at an operating point.
     #[error("full model at {point:?}")]
@@ -84,6 +86,32 @@ pub struct PointReport {
     pub missed: Vec<[f64; 2]>,
     pub invented: Vec<[f64; 2]>,
     pub unpaired: usize,
+    /// The contact states of both; `None` if the pairs are always closed, or if one of the two has no state.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub contact: Option<ContactDifference>,
+}
+
+/// Contact states of full model and rig.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct ContactDifference {
+    /// Pairs that carry a force in the full model, and in the rig.
+    pub pairs_closed: [usize; 2],
+    /// Pairs that carry a force in one of the two only.
+    pub pairs_differ: usize,
+    /// Largest difference of the force of a pair, relative to the largest force of the full model.
+    pub max_force_error: f64,
+}
+
+impl ContactDifference {
+    fn new(full: &SteadyState, rig: &SteadyState) -> Self {
+        let largest = full.force_n.iter().copied().fold(0.0, f64::max);
+        let forces = || full.force_n.iter().zip(&rig.force_n);
+        Self {
+            pairs_closed: [full.pairs_closed(), rig.pairs_closed()],
+            pairs_differ: forces().filter(|(full, rig)| (**full > 0.0) != (**rig > 0.0)).count(),
+            max_force_error: forces().map(|(full, rig)| (full - rig).abs() / largest).fold(0.0, f64::max),
+        }
+    }
 }
 
 /// A window of instability of the full model, the rig or both.
@@ -111,8 +139,9 @@ pub struct Verified {
     pub windows: Vec<WindowReport>,
 }
 
-/// Compares a rig with its full model: roots at held-out operating points within the rig's range, and windows of
-/// instability at the reference and at the corners of that range. `full_solver` solves the full model; `progress`
+/// Compares a rig with its full model: contact states and roots at held-out operating points within the rig's range, and
+/// windows of instability at the reference and at the corners of that range. A held-out point without a state of steady
+/// sliding in one of the two counts as missed or invented, and is omitted otherwise. `full_solver` solves the full model; `progress`
 /// receives a description of the step and its progress.
 ///
 /// # Errors
@@ -127,22 +156,29 @@ pub fn verify_against(
     if against.points == 0 {
         return Err(VerificationError::NoPoints);
     }
-    if rig.model.statics().is_some() {
-        return Err(VerificationError::ContactState { rig: rig.name.clone() });
+    let (of_rig, of_full) = (rig.name.clone(), full.name.clone());
+    match (rig.model.statics(), full.model.statics()) {
+        (Some(_), None) => return Err(VerificationError::ContactState { with: of_rig, without: of_full }),
+        (None, Some(_)) => return Err(VerificationError::ContactState { with: of_full, without: of_rig }),
+        (Some(_), Some(_)) | (None, None) => {}
     }
     let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
     let band_rad_s = std::f64::consts::TAU * band_hz;
     let judged = Judged { band_rad_s, instability_threshold: rig.instability_threshold, decay_per_s: DECAY_PER_S };
     let mut solver = Solver::new(rig.model.dimension());
-    let mut points = vec![];
+    let (mut points, mut states) = (vec![], StatesOfOne::default());
     for (index, p) in held_out(rig, against).into_iter().enumerate() {
         let label = format!("point {} of {}", index + 1, against.points);
+        if states.miss(rig, full, &p) {
+            continue;
+        }
         let found = full_solver
             .roots(&p, band_rad_s, FullVectors::None, &mut |step| progress(&label, step))
             .map_err(|source| VerificationError::Full { point: p, source })?;
         let lambdas: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
-        let reduced =
-            reduced_roots(&rig.model, &mut solver, &p).map_err(|source| VerificationError::Rig { point: p, source })?;
+        let failed = |source| VerificationError::Rig { point: p, source };
+        let reduced = reduced_roots(&rig.model, &mut solver, &p).map_err(failed)?;
+        let here = rig.model.at(&p).map_err(|error| failed(error.into()))?;
         let comparison = compare_roots(&lambdas, &reduced, &judged);
         let listed = |roots: &[c64]| roots.iter().map(|l| [l.re, l.im / std::f64::consts::TAU]).collect();
         points.push(PointReport {
@@ -156,6 +192,7 @@ pub fn verify_against(
             missed: listed(&comparison.missed),
             invented: listed(&comparison.invented),
             unpaired: comparison.unpaired,
+            contact: found.here.state().zip(here.state()).map(|(full, rig)| ContactDifference::new(full, rig)),
         });
     }
     let options = MapOptions {
@@ -193,21 +230,41 @@ pub fn verify_against(
     // Without a compared mode the errors are unknown, hence NaN.
     let nothing = if points.iter().all(|point| point.modes == 0) { f64::NAN } else { 0.0 };
     let largest = |of: fn(&PointReport) -> f64| nothing + points.iter().map(of).fold(0.0, f64::max);
+    let contacts = || points.iter().filter_map(|point| point.contact);
     let certificate = Certificate {
         full_model_hash: full.content_hash.clone(),
         method: rig.reduction.as_ref().map(|known| known.method.clone()).unwrap_or_default(),
         band_hz,
-        points: points.len(),
+        points: against.points,
         max_frequency_error: largest(|point| point.max_frequency_error),
         max_growth_error_per_s: largest(|point| point.max_growth_error_per_s),
         max_relative_error: largest(|point| point.max_relative_error),
         windows_compared_at,
         critical_friction_error: critical,
-        missed: missed + points.iter().map(|point| point.missed.len()).sum::<usize>(),
-        invented: invented + points.iter().map(|point| point.invented.len()).sum::<usize>(),
+        max_force_error: contacts().map(|contact| contact.max_force_error).reduce(f64::max),
+        pairs_differ: contacts().map(|contact| contact.pairs_differ).reduce(|sum, count| sum + count),
+        missed: missed + states.of_full + points.iter().map(|point| point.missed.len()).sum::<usize>(),
+        invented: invented + states.of_rig + points.iter().map(|point| point.invented.len()).sum::<usize>(),
         unpaired: points.iter().map(|point| point.unpaired).sum(),
     };
     Ok(Verified { certificate, points, windows })
+}
+
+/// Number of held-out points at which only one of the two has a state of steady sliding.
+#[derive(Default)]
+struct StatesOfOne {
+    of_full: usize,
+    of_rig: usize,
+}
+
+impl StatesOfOne {
+    /// Whether full model or rig has no state of steady sliding at `p`; counts it if the other one has.
+    fn miss(&mut self, rig: &Rig, full: &FullModelFile, p: &OperatingPoint) -> bool {
+        let (of_full, of_rig) = (full.model.at(p).is_ok(), rig.model.at(p).is_ok());
+        self.of_full += usize::from(of_full && !of_rig);
+        self.of_rig += usize::from(of_rig && !of_full);
+        !(of_full && of_rig)
+    }
 }
 
 fn ends(window: &Window) -> WindowEnds {

@@ -1,13 +1,17 @@
 //! Rigs on a basis of the whole full model (`[basis]`): their model, and a summary of what `[basis]` records.
 
+use std::sync::Arc;
+
 use faer::Mat;
 
-use super::inline::{describe_contact, free_frequencies};
+use super::contact_state::StateTable;
+use super::inline::{describe_contact, describe_falling_friction, free_frequencies};
 use super::modal::Part;
 use super::patch::Pair;
 use super::raw::RawBasis;
 use super::settings::{Settings, within};
 use super::{Built, Contact, RigError, SideShapes};
+use crate::contact::Statics;
 use crate::physics::{ContactPairs, Law, Model, Term};
 
 /// Builds the model of pad and disc that share `k` coordinates, the vectors `V` of a basis of the whole full model:
@@ -17,7 +21,8 @@ use crate::physics::{ContactPairs, Law, Model, Term};
 /// ```
 ///
 /// `κ` is the load law of the contact stiffness, `s` the sign of the disc speed and `d` a direction of each pair.
-/// `values` are stiffness (N/m) and damping (N s/m) of the pairs.
+/// `values` are stiffness (N/m) and damping (N s/m) of the pairs. With a contact `state` the pairs follow the states of its
+/// statics.
 ///
 /// # Errors
 /// [`RigError::Kind`] if there is no disc, if the natural frequencies of the two sides differ, if coordinates are
@@ -29,6 +34,7 @@ pub(super) fn build(
     disc: Option<&Part>,
     pairs: &[Pair],
     values: [Vec<f64>; 2],
+    state: Option<(StateTable, Arc<Statics>)>,
     settings: &Settings,
 ) -> Result<Built, RigError> {
     let refuse = |field: &str, value: &str, limit: &str| {
@@ -88,7 +94,10 @@ pub(super) fn build(
     let terms = super::modal::terms(file, k, pad, Some((disc, 0)))?;
     let stiffness = std::iter::once(free).chain(terms.stiffness).collect();
     let model = Model::new(k, stiffness, terms.damping, law, None)
-        .and_then(|model| model.with_contact(&contact))
+        .and_then(|model| match &state {
+            Some((_, statics)) => model.with_steady_contact(&contact, statics.clone(), None),
+            None => model.with_contact(&contact),
+        })
         .and_then(|model| match &pad.data.mass_share {
             // The model takes its coordinates in ascending frequency.
             Some(share) => model.with_pad_mass(Mat::from_fn(k, k, |i, j| share[(pad.selected[i], pad.selected[j])])),
@@ -99,13 +108,17 @@ pub(super) fn build(
         "kind       pad and disc on a shared basis (kind 2)".to_owned(),
         format!("vectors    {k}, of the full model"),
     ];
-    contents.extend(describe_contact(&contact, &law));
+    contents.extend(match &state {
+        Some((state, statics)) => state.describe("statics", statics, &contact, settings)?,
+        None => describe_contact(&contact, &law),
+    });
+    contents.extend(describe_falling_friction(&contact, settings));
     contents.extend(free_frequencies("vectors", omega_rad_s));
     contents.extend(terms.contents);
     let shapes = ["pad", "disc"]
         .map(|name| SideShapes { name, first_coordinate: 0, phi: Mat::zeros(0, k), nodes_m: vec![] })
         .into();
-    let contact = Some(Contact { pairs: contact, residual: None });
+    let contact = Some(Contact { pairs: contact, residual: None, places: vec![] });
     Ok(Built { model, contact, contents, shapes, band_max_hz: settings.band_max_hz })
 }
 

@@ -21,6 +21,13 @@ pub struct Certificate {
     pub max_growth_error_per_s: f64,
     /// Largest `|Δλ| / |λ|`.
     pub max_relative_error: f64,
+    /// Largest difference of the force of a contact pair, relative to the largest force; `None` if the pairs are always
+    /// closed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max_force_error: Option<f64>,
+    /// Contact pairs that are closed in one of the two and open in the other, summed over all points.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pairs_differ: Option<usize>,
     /// Number of pairs of load and speed at which windows of instability were compared.
     #[serde(default)]
     pub windows_compared_at: usize,
@@ -53,9 +60,16 @@ impl Certificate {
             0 => String::new(),
             count => format!(", {count} modes without a partner"),
         };
+        let contact = match (self.max_force_error, self.pairs_differ) {
+            (Some(error), Some(0)) => format!(", contact forces {error:.1e}, the same pairs closed"),
+            (Some(error), differ) => {
+                format!(", contact forces {error:.1e}, {} pairs not closed in both", differ.unwrap_or(0))
+            }
+            (None, _) => String::new(),
+        };
         format!(
-            "reduction  errors at {} held-out points up to {} Hz: frequency {:.1e} relative, growth rate {:.1e} 1/s{critical}; \
-             {} {what} missed, {} invented{unpaired}",
+            "reduction  errors at {} held-out points up to {} Hz: frequency {:.1e} relative, growth rate {:.1e} 1/s\
+             {critical}{contact}; {} {what} missed, {} invented{unpaired}",
             self.points,
             self.band_hz,
             self.max_frequency_error,

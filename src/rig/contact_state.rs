@@ -12,6 +12,7 @@ use super::RigError;
 use super::inline::{describe_pairs, modal_row};
 use super::lines::{self, Lines, found};
 use super::modal::Part;
+use super::npz;
 use super::patch::{Pair, dot};
 use super::raw::{OneOrMany, RawContactState, RawRig};
 use super::settings::{Settings, at_most, spread, within};
@@ -33,7 +34,8 @@ const ANCHOR_LOADS: u32 = 6;
 const ANCHOR_STEPS: u32 = 8;
 
 /// The table `[contact_state]`, checked as far as it does not depend on the parts.
-pub(super) struct StateTable {
+#[derive(Clone, Debug)]
+pub struct StateTable {
     file: String,
     law: PressureLaw,
     measured: MeasuredLoad,
@@ -43,7 +45,7 @@ pub(super) struct StateTable {
 /// The load of 1 N on the modes of both sides.
 pub(super) struct Load {
     /// The key that gives it, for errors.
-    field: &'static str,
+    pub field: &'static str,
     /// Generalised force in each coordinate, kg^-1/2.
     coordinates: Vec<f64>,
     /// Response of the gaps to the load by the truncated modes, m/N; with residual flexibility only.
@@ -57,6 +59,19 @@ pub(super) struct Load {
 pub(super) fn read(source: &mut Source<'_>, raw: &RawRig) -> Result<Option<StateTable>, RigError> {
     let Some(raw) = &raw.contact_state else { return Ok(None) };
     let file = source.rig_file.clone();
+    check(&file, raw, &mut |field, name| read_table(name, source.read(field, name)?)).map(Some)
+}
+
+/// Checks the table `[contact_state]` of `file`. `pressures` reads the table of pressures that a field names.
+///
+/// # Errors
+/// [`RigError`], naming file, key, value and limit.
+pub fn check(
+    file: &str,
+    raw: &RawContactState,
+    pressures: &mut dyn FnMut(&str, &str) -> Result<PressureTable, RigError>,
+) -> Result<StateTable, RigError> {
+    let file = file.to_owned();
     let unknown = |key: &str, value: &str, limit: &str| {
         let (field, value, limit) = (format!("contact_state.{key}"), format!("\"{value}\""), limit.to_owned());
         Err(RigError::Range { file: file.clone(), field, value, limit })
@@ -114,11 +129,11 @@ pub(super) fn read(source: &mut Source<'_>, raw: &RawRig) -> Result<Option<State
         },
         "table" => {
             let name = raw.table.as_deref().unwrap_or_default();
-            PressureLaw::Table(read_table(name, source.read("contact_state.table", name)?)?)
+            PressureLaw::Table(pressures("contact_state.table", name)?)
         }
         _ => PressureLaw::Linear { stiffness: 1.0 },
     };
-    Ok(Some(StateTable { file, law, measured, raw: raw.clone() }))
+    Ok(StateTable { file, law, measured, raw: raw.clone() })
 }
 
 /// Reads a table `closure_m,pressure_pa`.
@@ -168,13 +183,11 @@ impl StateTable {
     ///
     /// # Errors
     /// [`RigError`].
-    pub fn load_on_inline(&self, pad: &Modes, disc: Option<&Modes>) -> Result<Load, RigError> {
-        if self.raw.load_coordinates.is_some() {
-            return Err(self.kind("load_coordinates", "is given for inline substructures", "load_pad"));
-        }
+    pub(super) fn load_on_inline(&self, pad: &Modes, disc: Option<&Modes>) -> Result<Load, RigError> {
         if self.raw.residual_gap_m_per_n.is_some() {
             return Err(self.no_residual("inline substructures have no residual flexibility"));
         }
+        self.loaded_by("inline substructures", &["load_pad"])?;
         let row = self.raw.load_pad.as_ref();
         let mut coordinates = modal_row(&self.file, "contact_state.load_pad", row, Some(pad), true, 1.0)?;
         coordinates.resize(pad.phi.ncols() + disc.map_or(0, |disc| disc.phi.ncols()), 0.0);
@@ -186,16 +199,14 @@ impl StateTable {
     ///
     /// # Errors
     /// [`RigError`].
-    pub fn load_on_modes(
+    pub(super) fn load_on_modes(
         &self,
         pad: &Part,
         disc_modes: usize,
         pairs: &[Pair],
         flexible: bool,
     ) -> Result<Load, RigError> {
-        if self.raw.load_pad.is_some() {
-            return Err(self.kind("load_pad", "is given for modal substructures", "load_coordinates"));
-        }
+        self.loaded_by("modal substructures", &["load_coordinates", "residual_gap_m_per_n"])?;
         let field = "contact_state.load_coordinates";
         let modes = pad.data.omega_rad_s.len();
         let loads = match (&self.raw.load_coordinates, &pad.data.load) {
@@ -239,6 +250,28 @@ impl StateTable {
         Ok(Load { field: "load_coordinates", coordinates, residual_gap_m_per_n })
     }
 
+    /// Checks that no key but those listed gives the load of `what`.
+    ///
+    /// # Errors
+    /// [`RigError::Kind`].
+    pub fn loaded_by(&self, what: &str, keys: &[&str]) -> Result<(), RigError> {
+        let RawContactState { load_pad, load_coordinates, residual_gap_m_per_n, statics, .. } = &self.raw;
+        let RawContactState { load_file, load_nodes, load_direction, .. } = &self.raw;
+        let given = [
+            ("load_pad", load_pad.is_some()),
+            ("load_coordinates", load_coordinates.is_some()),
+            ("residual_gap_m_per_n", residual_gap_m_per_n.is_some()),
+            ("statics", statics.is_some()),
+            ("load_file", load_file.is_some()),
+            ("load_nodes", load_nodes.is_some()),
+            ("load_direction", load_direction.is_some()),
+        ];
+        match given.iter().find(|(key, is_given)| *is_given && !keys.contains(key)) {
+            Some((key, _)) => Err(self.kind(key, &format!("is given for {what}"), keys[0])),
+            None => Ok(()),
+        }
+    }
+
     fn no_residual(&self, why: &str) -> RigError {
         self.kind("residual_gap_m_per_n", &format!("has nothing to act on: {why}"), "no such key")
     }
@@ -247,7 +280,7 @@ impl StateTable {
     ///
     /// # Errors
     /// [`RigError`].
-    pub fn statics(
+    pub(super) fn statics(
         &self,
         omega: &[f64],
         pairs: &ContactPairs,
@@ -255,25 +288,7 @@ impl StateTable {
         load: &Load,
         settings: &Settings,
     ) -> Result<Statics, RigError> {
-        let (file, count) = (self.file.as_str(), pairs.normal.nrows());
-        at_most(file, "contact pairs with [contact_state]", count, MOST_PAIRS)?;
-        let refuse = |source| RigError::ContactState { file: file.to_owned(), source };
-        let per_pair = |key: &str, values: &OneOrMany| {
-            spread(file, &format!("contact_state.{key}"), values, count, "contact pairs")
-        };
-        let area = match &self.raw.area_m2 {
-            Some(values) => per_pair("area_m2", values)?,
-            None => pairs.stiffness_n_per_m.clone(),
-        };
-        let of_area = if self.raw.area_m2.is_some() { "contact_state.area_m2" } else { "stiffness_n_per_m" };
-        for (pair, &value) in area.iter().enumerate() {
-            let field = format!("{of_area} of contact pair {pair}");
-            within(file, &field, value, value > 0.0, "more than 0, because it scales the law of [contact_state]")?;
-        }
-        let gap_m = match &self.raw.gap_m {
-            Some(values) => per_pair("gap_m", values)?,
-            None => vec![0.0; count],
-        };
+        self.check_pairs(&pairs.stiffness_n_per_m)?;
         let omega_squared: Vec<f64> = omega.iter().map(|omega| omega * omega).collect();
         let modes = FreeModes {
             omega_squared: &omega_squared,
@@ -289,6 +304,51 @@ impl StateTable {
                 self.kind("law", &format!("has no statics: {error}"), "parts with a static response")
             }
         })?;
+        self.statics_of(response, &pairs.stiffness_n_per_m, settings)
+    }
+
+    /// Checks the number of contact pairs, and whatever is given for each of them. `stiffness_n_per_m` is that of each pair.
+    ///
+    /// # Errors
+    /// [`RigError`].
+    pub fn check_pairs(&self, stiffness_n_per_m: &[f64]) -> Result<(), RigError> {
+        at_most(&self.file, "contact pairs with [contact_state]", stiffness_n_per_m.len(), MOST_PAIRS)?;
+        self.area_and_gap(stiffness_n_per_m).map(|_| ())
+    }
+
+    /// Area, or factor of the law, and initial gap (m) of each pair.
+    fn area_and_gap(&self, stiffness_n_per_m: &[f64]) -> Result<[Vec<f64>; 2], RigError> {
+        let (file, count) = (self.file.as_str(), stiffness_n_per_m.len());
+        let per_pair = |key: &str, values: &OneOrMany| {
+            spread(file, &format!("contact_state.{key}"), values, count, "contact pairs")
+        };
+        let area = match &self.raw.area_m2 {
+            Some(values) => per_pair("area_m2", values)?,
+            None => stiffness_n_per_m.to_vec(),
+        };
+        let of_area = if self.raw.area_m2.is_some() { "contact_state.area_m2" } else { "stiffness_n_per_m" };
+        for (pair, &value) in area.iter().enumerate() {
+            let field = format!("{of_area} of contact pair {pair}");
+            within(file, &field, value, value > 0.0, "more than 0, because it scales the law of [contact_state]")?;
+        }
+        let gap_m = match &self.raw.gap_m {
+            Some(values) => per_pair("gap_m", values)?,
+            None => vec![0.0; count],
+        };
+        Ok([area, gap_m])
+    }
+
+    /// The statics of contact pairs with the static `response`.
+    ///
+    /// # Errors
+    /// [`RigError`].
+    pub fn statics_of(
+        &self,
+        response: StaticResponse,
+        stiffness_n_per_m: &[f64],
+        settings: &Settings,
+    ) -> Result<Statics, RigError> {
+        let [area, gap_m] = self.area_and_gap(stiffness_n_per_m)?;
         let parts = StaticsParts { law: self.law.clone(), area, gap_m, response, measured: self.measured };
         let [low, high] = settings.chart.normal_load_n;
         let loads: Vec<f64> =
@@ -296,7 +356,59 @@ impl StateTable {
         // In the direction of rotation of the reference; in the other one, states are continued from 0.
         let last = settings.mu_max.copysign(settings.reference.disc_speed_rad_s);
         let s_mus: Vec<f64> = (0..=ANCHOR_STEPS).map(|k| last * f64::from(k) / f64::from(ANCHOR_STEPS)).collect();
-        Ok(Statics::new(parts).map_err(refuse)?.with_anchors(&loads, &s_mus))
+        Ok(Statics::new(parts).map_err(|source| self.refuse(source))?.with_anchors(&loads, &s_mus))
+    }
+
+    /// The statics of a rig on a shared basis, from the archive that the key `statics` names.
+    ///
+    /// # Errors
+    /// [`RigError`].
+    pub(super) fn statics_on_basis(
+        &self,
+        source: &mut Source<'_>,
+        stiffness_n_per_m: &[f64],
+        settings: &Settings,
+    ) -> Result<Statics, RigError> {
+        self.loaded_by("a shared basis", &["statics"])?;
+        self.check_pairs(stiffness_n_per_m)?;
+        let Some(name) = &self.raw.statics else {
+            return Err(self.missing("statics", "an .npz archive of the static response, which `reduce` writes"));
+        };
+        let bytes = source.read("contact_state.statics", name)?;
+        self.statics_of(npz::read_static_response(name, bytes, stiffness_n_per_m.len())?, stiffness_n_per_m, settings)
+    }
+
+    /// Checks that the load presses the pad on the disc; `key` gives it. Returns the load at which it was checked, N.
+    ///
+    /// # Errors
+    /// [`RigError::ContactState`] if there is no state without friction; [`RigError::Range`] if the contact force does not
+    /// grow with the load.
+    pub fn check_load(&self, key: &str, statics: &Statics, settings: &Settings) -> Result<f64, RigError> {
+        let reference = &settings.reference;
+        let [lowest, _] = settings.chart.normal_load_n;
+        let load_n = if reference.normal_load_n > 0.0 { reference.normal_load_n } else { lowest };
+        // By the force on the back, which follows the sign of the load vector.
+        let at_rest =
+            self.plain(statics, MeasuredLoad::Back)?.state(load_n, 0.0).map_err(|source| self.refuse(source))?;
+        let slope: f64 = at_rest.per_load.force.iter().sum();
+        if slope.is_nan() || slope <= 0.0 {
+            return Err(RigError::Range {
+                file: self.file.clone(),
+                field: format!("contact_state.{key}"),
+                value: format!("a load that changes the contact force by {slope} N per N at {load_n} N"),
+                limit: "more than 0: a load that presses the pad on the disc".to_owned(),
+            });
+        }
+        Ok(load_n)
+    }
+
+    /// The statics without anchors, which cost more than a few states.
+    fn plain(&self, statics: &Statics, measured: MeasuredLoad) -> Result<Statics, RigError> {
+        Statics::new(StaticsParts { measured, ..statics.parts().clone() }).map_err(|source| self.refuse(source))
+    }
+
+    fn refuse(&self, source: StaticsError) -> RigError {
+        RigError::ContactState { file: self.file.clone(), source }
     }
 
     /// Lines for [`super::Rig::describe`]. Refuses a load that does not press the pad on the disc.
@@ -304,48 +416,26 @@ impl StateTable {
     /// # Errors
     /// [`RigError::ContactState`] if there is no state without friction; [`RigError::Range`] if the contact force does not
     /// grow with the load.
-    pub fn describe(
+    pub(super) fn describe(
         &self,
-        load: &Load,
+        load: &str,
         statics: &Statics,
         pairs: &ContactPairs,
         settings: &Settings,
     ) -> Result<Vec<String>, RigError> {
-        let refuse = |source| RigError::ContactState { file: self.file.clone(), source };
         let reference = &settings.reference;
-        let [lowest, _] = settings.chart.normal_load_n;
-        let load_n = if reference.normal_load_n > 0.0 { reference.normal_load_n } else { lowest };
-        // Without anchors, which cost more than the few states below.
-        let plain = |measured| Statics::new(StaticsParts { measured, ..statics.parts().clone() }).map_err(refuse);
-        // By the force on the back, which follows the sign of the load vector.
-        let at_rest = plain(MeasuredLoad::Back)?.state(load_n, 0.0).map_err(refuse)?;
-        let slope: f64 = at_rest.per_load.force.iter().sum();
-        if slope.is_nan() || slope <= 0.0 {
-            return Err(RigError::Range {
-                file: self.file.clone(),
-                field: format!("contact_state.{}", load.field),
-                value: format!("a load that changes the contact force by {slope} N per N at {load_n} N"),
-                limit: "more than 0: a load that presses the pad on the disc".to_owned(),
-            });
-        }
-        let (law, measured) = (
-            self.describe_law(),
-            match self.measured {
-                MeasuredLoad::Contact => "the contact force",
-                MeasuredLoad::Back => "the force on the pad's back",
-            },
-        );
+        let load_n = self.check_load(load, statics, settings)?;
         let friction = match reference.contact_state() {
             ContactState::Sliding => reference.disc_speed_rad_s.signum() * reference.friction_coefficient,
             ContactState::NotSliding | ContactState::Open => 0.0,
         };
         let mut line = format!("state      {} pairs", statics.pairs());
-        let plain = plain(self.measured)?;
+        let plain = self.plain(statics, self.measured)?;
         for (index, s_mu) in [0.0, friction].into_iter().enumerate() {
             let closed = match plain.state(load_n, s_mu) {
                 Ok(state) => format!("{} closed", state.pairs_closed()),
                 Err(StaticsError::NoEquilibrium { end, .. }) => format!("none in steady sliding, because {end},"),
-                Err(error) => return Err(refuse(error)),
+                Err(error) => return Err(self.refuse(error)),
             };
             match index {
                 0 => line += &format!(": {closed} at {load_n} N without friction"),
@@ -360,11 +450,16 @@ impl StateTable {
             }
             None => describe_pairs(pairs),
         };
-        Ok(vec![contact, format!("law        {law}; the load is {measured}"), line])
+        Ok(vec![contact, self.describe_law(), line])
     }
 
-    fn describe_law(&self) -> String {
-        match &self.law {
+    /// The contact law and what the load is, as a line of text.
+    pub fn describe_law(&self) -> String {
+        let measured = match self.measured {
+            MeasuredLoad::Contact => "the contact force",
+            MeasuredLoad::Back => "the force on the pad's back",
+        };
+        let law = match &self.law {
             PressureLaw::Linear { .. } => "linear springs that only push".to_owned(),
             PressureLaw::Power { reference_m, exponent, roughness_m, .. } => {
                 let rounded = match roughness_m {
@@ -381,6 +476,7 @@ impl StateTable {
                 self.raw.table.as_deref().unwrap_or_default(),
                 table.last_closure_m()
             ),
-        }
+        };
+        format!("law        {law}; the load is {measured}")
     }
 }

@@ -8,7 +8,7 @@ use super::contact_state::{Load, StateTable};
 use super::raw::{RawContact, RawSubstructure};
 use super::settings::{Settings, finite, spread, within};
 use super::{Built, Contact, RigError, SideShapes};
-use crate::physics::{ContactLaw, ContactPairs, Law, Model, ResidualFlexibility, Term};
+use crate::physics::{ContactLaw, ContactPairs, Law, Model, ResidualFlexibility, Stribeck, Term};
 use crate::reduction::{Modes, free_interface_modes};
 
 /// Modes of one side with their damping ratios.
@@ -54,7 +54,7 @@ pub(super) struct Terms {
 /// The contact in three lines of text: its pairs, the law of their stiffness, and that they are always closed.
 pub(super) fn describe_contact(pairs: &ContactPairs, law: &ContactLaw) -> Vec<String> {
     // Friction is described with the damping, if at all.
-    let ContactLaw { exponent, reference_n, slope_s_per_m: _, lateral_damping: _ } = *law;
+    let ContactLaw { exponent, reference_n, slope_s_per_m: _, stribeck: _, lateral_damping: _ } = *law;
     vec![
         describe_pairs(pairs),
         match exponent {
@@ -63,6 +63,19 @@ pub(super) fn describe_contact(pairs: &ContactPairs, law: &ContactLaw) -> Vec<St
         },
         "state      every pair always closed: springs that push and pull".to_owned(),
     ]
+}
+
+/// Friction that falls with speed, if it does: its law, and its slope at the reference speed.
+pub(super) fn describe_falling_friction(pairs: &ContactPairs, settings: &Settings) -> Option<String> {
+    let law = settings.contact_law;
+    let Stribeck { drop, speed_m_s, exponent } = law.stribeck?;
+    let speed = settings.reference.disc_speed_rad_s;
+    let slopes = pairs.radius_m.iter().map(|radius| law.falling_slope(speed.abs() * radius));
+    let (low, high) = slopes.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), s| (low.min(s), high.max(s)));
+    Some(format!(
+        "friction   falls with the sliding speed v by {drop} (1 - exp(-(v / {speed_m_s} m/s)^{exponent})): slope \
+         {low:.3e} to {high:.3e} s/m at {speed} rad/s"
+    ))
 }
 
 /// Number, stiffness and damping of the contact pairs.
@@ -133,7 +146,7 @@ pub(super) fn assemble(
         ),
     ];
     contents.extend(match (&state, &statics) {
-        (Some((state, load)), Some(statics)) => state.describe(load, statics, &pairs, settings)?,
+        (Some((state, load)), Some(statics)) => state.describe(load.field, statics, &pairs, settings)?,
         (None, _) | (_, None) => describe_contact(&pairs, &contact_law),
     });
     for (name, side) in ["pad", "disc"].into_iter().zip(&sides) {
@@ -145,6 +158,7 @@ pub(super) fn assemble(
         contact_law.slope_s_per_m,
         if contact_law.lateral_damping { "on" } else { "off" }
     ));
+    contents.extend(describe_falling_friction(&pairs, settings));
     contents.extend(terms.contents);
     let mut first_coordinate = 0;
     let mut shapes = vec![];
@@ -152,7 +166,7 @@ pub(super) fn assemble(
         shapes.push(SideShapes { name, first_coordinate, phi: side.modes.phi.clone(), nodes_m: vec![] });
         first_coordinate += side.modes.omega_rad_s.len();
     }
-    let contact = Some(Contact { pairs, residual });
+    let contact = Some(Contact { pairs, residual, places: vec![] });
     Ok(Built { model, contact, contents, shapes, band_max_hz: settings.band_max_hz })
 }
 

@@ -11,7 +11,7 @@
 
 mod basis;
 mod certificate;
-mod contact_state;
+pub(crate) mod contact_state;
 mod embedded;
 mod error;
 mod inline;
@@ -111,6 +111,17 @@ pub struct Contact {
     pub pairs: ContactPairs,
     /// Residual flexibility of the truncated modes at the pairs, if used.
     pub residual: Option<ResidualFlexibility>,
+    /// Places of the pairs, for pictures; empty if they have none.
+    pub places: Vec<PairPlace>,
+}
+
+/// Where a contact pair is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PairPlace {
+    /// Position of the node of the pad, m.
+    pub at_m: [f64; 3],
+    /// Normal from disc to pad.
+    pub normal: [f64; 3],
 }
 
 /// Displacement shapes of one side in the coordinates of the model.
@@ -277,8 +288,10 @@ impl Rig {
             normal: patch.normal,
         });
         let certified = raw.reduction.as_ref().map(|reduction| match built.model.statics() {
-            Some(_) => format!("{}; with every pair always closed", reduction.summary()),
-            None => reduction.summary(),
+            Some(_) if reduction.max_force_error.is_none() => {
+                format!("{}; with every pair always closed", reduction.summary())
+            }
+            _ => reduction.summary(),
         });
         Ok(Self {
             name: raw.name,
@@ -364,7 +377,7 @@ impl Rig {
     /// [`RigError::Model`], [`RigError::ContactState`] if `factor` takes the contact out of range; [`RigError::Kind`] if
     /// the law of the rig's `[contact_state]` has no stiffness.
     pub fn at_rest_with_contact_stiffness_times(&self, factor: f64) -> Result<Model, RigError> {
-        let Some(Contact { pairs, residual }) = &self.contact else { return Ok(self.model.clone()) };
+        let Some(Contact { pairs, residual, places: _ }) = &self.contact else { return Ok(self.model.clone()) };
         self.has_stiffness_to_scale()?;
         let mut pairs = pairs.clone();
         pairs.stiffness_n_per_m.iter_mut().for_each(|stiffness| *stiffness *= factor);

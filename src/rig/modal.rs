@@ -1,5 +1,7 @@
 //! Kind 2: substructures given by their modes at the contact interface, from any finite-element program.
 
+use std::sync::Arc;
+
 use faer::Mat;
 
 use super::contact_state::{self, StateTable};
@@ -10,7 +12,7 @@ use super::raw::{RawPatch, RawResidual, RawRig, RawSubstructure};
 use super::residual::{self, SideResidual};
 use super::settings::{MOST_COORDINATES, Settings, at_most, spread};
 use super::source::Source;
-use super::{Built, RigError, basis, npz};
+use super::{Built, PairPlace, RigError, basis, npz};
 use crate::physics::{ContactPairs, Law, ResidualFlexibility, Term};
 use crate::reduction::{Modes, PartMatrices};
 
@@ -46,11 +48,6 @@ pub(super) fn build(
     let given = raw.residual.as_ref().map(|raw| given(source, raw, &pad, disc.as_ref(), pairs.len())).transpose()?;
     let state = contact_state::read(source, raw)?;
     let mut built = if shared {
-        if state.is_some() {
-            let (field, limit) = ("contact_state".to_owned(), "modes of the parts".to_owned());
-            let value = "cannot be combined with a shared basis, which does not hold the static response to the load";
-            return Err(RigError::Kind { file, field, value: value.to_owned(), limit });
-        }
         if given.is_some() {
             let (field, limit) = ("residual".to_owned(), "modes of the parts, or none".to_owned());
             return Err(RigError::Kind {
@@ -60,7 +57,12 @@ pub(super) fn build(
                 limit,
             });
         }
-        basis::build(&file, &pad, disc.as_ref(), &pairs, values, settings)?
+        let on_basis = |state: StateTable| {
+            let statics = state.statics_on_basis(source, &values[0], settings)?;
+            Ok::<_, RigError>((state, Arc::new(statics)))
+        };
+        let state = state.map(on_basis).transpose()?;
+        basis::build(&file, &pad, disc.as_ref(), &pairs, values, state, settings)?
     } else {
         apart(&file, &pad, disc.as_ref(), &pairs, values, given, state, settings)?
     };
@@ -69,6 +71,10 @@ pub(super) fn build(
         let entry = |row: usize, mode: usize| part.data.shape(row / 3, part.selected[mode])[row % 3];
         shapes.phi = Mat::from_fn(rows, part.selected.len(), entry);
         shapes.nodes_m.clone_from(&part.data.nodes_m);
+    }
+    if let Some(contact) = &mut built.contact {
+        let place = |pair: &Pair| PairPlace { at_m: pad.data.nodes_m[pair.pad_node], normal: pair.normal };
+        contact.places = pairs.iter().map(place).collect();
     }
     if disc.is_some() {
         let coincident = pairs.iter().filter(|pair| pair.disc.len() == 1).count();

@@ -10,6 +10,7 @@ use npyz::{DType, Deserialize, NpyFile, Order, TypeChar};
 
 use super::RigError;
 use super::modal_data::{ModalData, Residual};
+use crate::contact::{RigidMotions, StaticResponse};
 use crate::physics::ResidualFlexibility;
 use crate::reduction::PartMatrices;
 
@@ -23,6 +24,8 @@ const LONGEST_HEADER: usize = 1024;
 /// Largest difference of two mirrored entries of a symmetric or skew matrix, relative to its largest entry: the
 /// rounding of ten printed digits.
 const SYMMETRY: f64 = 1e-9;
+/// Most rigid motions of free-floating parts: six of each of two parts.
+const MOST_RIGID: usize = 12;
 
 /// A numpy array in C order.
 struct Array {
@@ -60,6 +63,45 @@ pub fn read_pair_residual(file: &str, bytes: &[u8], c: usize) -> Result<Residual
     let [normal, sliding] =
         both("flexibility")?.ok_or_else(|| refuse(file, "flexibility_normal", "is missing", "an array"))?;
     Ok(ResidualFlexibility { normal, sliding, inertia: both("inertia")? })
+}
+
+/// Reads the static response between `c` contact pairs: `flexibility_normal` and `flexibility_sliding` as
+/// [`read_pair_residual`], `gap_per_load` (c), and of free-floating parts `rigid_normal` and `rigid_sliding` (c, r) and
+/// `rigid_load` (r).
+///
+/// # Errors
+/// [`RigError::Npz`], [`RigError::NotFinite`].
+pub fn read_static_response(file: &str, bytes: &[u8], c: usize) -> Result<StaticResponse, RigError> {
+    let ResidualFlexibility { normal, sliding, inertia: _ } = read_pair_residual(file, bytes, c)?;
+    let mut archive = Archive::open(file, bytes)?;
+    let mut array = |name: &str, shape: &[usize]| {
+        let limit = || format!("({})", dimensions(shape));
+        archive.array(name, |found| if found == shape { Ok(()) } else { Err(limit()) })
+    };
+    let required = |name: &str, array: Option<Array>| array.ok_or_else(|| refuse(file, name, "is missing", "an array"));
+    let gap_per_load = required("gap_per_load", array("gap_per_load", &[c])?)?.values;
+    let load = archive.array("rigid_load", |shape| {
+        if matches!(shape, [0..=MOST_RIGID]) { Ok(()) } else { Err(format!("(r), at most {MOST_RIGID} rigid motions")) }
+    })?;
+    let load = load.map(|load| load.values).unwrap_or_default();
+    let mut motions = |name: &str| -> Result<Mat<f64>, RigError> {
+        if load.is_empty() {
+            return Ok(Mat::zeros(c, 0));
+        }
+        let r = load.len();
+        let expected = |found: &[usize]| found == [c, r];
+        let array = archive
+            .array(name, |found| if expected(found) { Ok(()) } else { Err(format!("({c}, {r}), by rigid_load")) })?;
+        let array = required(name, array)?;
+        Ok(Mat::from_fn(c, r, |i, j| array.values[i * r + j]))
+    };
+    let (rigid_normal, rigid_sliding) = (motions("rigid_normal")?, motions("rigid_sliding")?);
+    Ok(StaticResponse {
+        normal_flexibility: normal,
+        sliding_flexibility: sliding,
+        gap_per_load,
+        rigid: RigidMotions { normal: rigid_normal, sliding: rigid_sliding, load },
+    })
 }
 
 /// Reads `omega_rad_s` (i), `phi` (c, 3, i), `nodes_m` (c, 3) and the optional arrays `damping_ratio` and `load` (i),

@@ -115,7 +115,13 @@ table_with_defaults! {
 }
 table_with_defaults! {
     /// `[friction]`.
-    RawFriction { slope_s_per_m: f64 = 0.0, lateral_damping: bool = false, }
+    RawFriction {
+        slope_s_per_m: f64 = 0.0,
+        stribeck_drop: f64 = 0.0,
+        stribeck_speed_m_s: Option<f64> = None,
+        stribeck_exponent: f64 = 2.0,
+        lateral_damping: bool = false,
+    }
 }
 table_with_defaults! {
     /// `[load]`: `k = k_ref (N / reference_n)^exponent`.
@@ -166,6 +172,13 @@ pub struct RawContactState {
     pub load_pad: Option<Vec<f64>>,
     pub load_coordinates: Option<Vec<f64>>,
     pub residual_gap_m_per_n: Option<OneOrMany>,
+    /// Name of an `.npz` archive, for a shared basis.
+    pub statics: Option<String>,
+    /// Name of a CSV or Matrix Market file, for a full model.
+    pub load_file: Option<String>,
+    /// Labels of nodes of the pad of a full model, and the direction of the load on them.
+    pub load_nodes: Option<Vec<u64>>,
+    pub load_direction: Option<[f64; 3]>,
 }
 
 /// `[residual]`: residual flexibility between the contact pairs.

@@ -4,7 +4,7 @@ use super::raw::{
     Common, OneOrMany, RawContact, RawFriction, RawLoad, RawModes, RawPatch, RawRig, RawSubstructure, RawSystem,
 };
 use super::{ChartRange, Limits, RigError, Warning};
-use crate::physics::{ContactLaw, OperatingPoint};
+use crate::physics::{ContactLaw, OperatingPoint, Stribeck};
 use crate::reduction::ModeSelection;
 
 /// Largest number of coordinates of a model: a prediction that is not charted solves a dense eigenvalue problem of this
@@ -98,6 +98,7 @@ pub fn check(file: &str, raw: &Common) -> Result<Settings, RigError> {
             exponent: number("load.exponent", raw.load.exponent)?,
             reference_n: positive("load.reference_n", raw.load.reference_n)?,
             slope_s_per_m: number("friction.slope_s_per_m", raw.friction.slope_s_per_m)?,
+            stribeck: stribeck(file, &raw.friction)?,
             lateral_damping: raw.friction.lateral_damping,
         },
         limits: Limits {
@@ -118,6 +119,25 @@ pub fn check(file: &str, raw: &Common) -> Result<Settings, RigError> {
             )?,
         },
     })
+}
+
+/// The Stribeck law of `[friction]`; `None` if friction does not fall.
+fn stribeck(file: &str, raw: &RawFriction) -> Result<Option<Stribeck>, RigError> {
+    let drop = finite(file, "friction.stribeck_drop", raw.stribeck_drop)?;
+    let exponent = raw.stribeck_exponent;
+    within(file, "friction.stribeck_exponent", exponent, (1.0..=10.0).contains(&exponent), "1 to 10")?;
+    match raw.stribeck_speed_m_s {
+        Some(speed_m_s) => {
+            within(file, "friction.stribeck_speed_m_s", speed_m_s, speed_m_s > 0.0, "more than 0")?;
+            Ok((drop != 0.0).then_some(Stribeck { drop, speed_m_s, exponent }))
+        }
+        None if drop == 0.0 => Ok(None),
+        None => Err(RigError::MissingKey {
+            file: file.to_owned(),
+            field: "friction.stribeck_speed_m_s".to_owned(),
+            limit: format!("the sliding speed, m/s, over which friction falls by stribeck_drop = {drop}"),
+        }),
+    }
 }
 
 /// Determines which of the three kinds a rig file is.
@@ -141,10 +161,12 @@ pub fn kind<'a>(file: &str, raw: &'a RawRig) -> Result<Kind<'a>, RigError> {
         if let Some((field, _)) = other.iter().find(|(_, present)| *present) {
             return mixed(field, "cannot be combined with [system]", "either [system] or [pad] with its contact");
         }
-        let RawFriction { slope_s_per_m, lateral_damping } = raw.friction;
+        let RawFriction { slope_s_per_m, stribeck_drop, stribeck_speed_m_s: _, stribeck_exponent: _, lateral_damping } =
+            raw.friction;
         let RawLoad { exponent, reference_n: _ } = raw.load;
         let friction_or_load = [
             ("friction.slope_s_per_m", slope_s_per_m != 0.0),
+            ("friction.stribeck_drop", stribeck_drop != 0.0),
             ("friction.lateral_damping", lateral_damping),
             ("load.exponent", exponent != 0.0),
         ];

@@ -192,6 +192,7 @@ fn value_at(law: &Law, reference: &OperatingPoint) -> f64 {
         | Law::ContactDamping
         | Law::FrictionDamping
         | Law::FrictionSlope
+        | Law::FallingFriction { .. }
         | Law::LateralFriction
         | Law::FrictionChebyshev { .. }
         | Law::DiscSpeed { .. }

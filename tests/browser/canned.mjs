@@ -60,6 +60,17 @@ function shape(id) {
   return { id, frequency_hz: hz, growth_rate_per_s: growth, pad_share: 0.31, growth_change, disc, parts: [part("pad", 0.4, 0), part("disc", 1, 1)] };
 }
 
+/** Forces of pairs on a sector: larger at the leading edge, open at the trailing one. */
+function contact() {
+  const [places, force_n] = [[], []];
+  for (let i = 0; i < 6; i++) for (let j = 0; j < 11; j++) {
+    places.push({ along_m: 0.004 * (j - 5), outward_m: 0.005 * (i - 2.5), opposite: false });
+    force_n.push(Math.max(0, 20 - 3 * j + i));
+  }
+  const contact_force_n = force_n.reduce((sum, force) => sum + force, 0);
+  return { normal_load_n: 500.2, disc_speed_rad_s: 13.04, friction_coefficient: 0.42, pairs_closed: force_n.filter((force) => force > 0).length, contact_force_n, back_force_n: 500.2, force_n, places };
+}
+
 /** The node's prediction at a friction coefficient. */
 function predicted(mu, seq) {
   const modes = modesAt(mu);
@@ -133,7 +144,7 @@ const event_columns = [
   ofMoment("disc_speed_rad_s", "speed", "rad/s", [2, 2]), ofMoment("friction_coefficient", "μ", "onset → fastest", [4, 4], true), once("reason", "reason"),
 ];
 
-const about = { kind: "live", rig: "tribometer", content_hash: "0".repeat(64), version: "0.1.0", band_max_hz: 4000, mu_max: 1, warn_margin: 0.05, instability_threshold: 1e-6, vibration_threshold_db: 70, span_s: null, notes: [], event_columns, simulated: false, inputs: { places: ["/rig/operating_point (ROS 2, domain 0)", "rig/operating_point (shared memory)"], start: "squealcast simulate" } };
+const about = { kind: "live", rig: "tribometer", content_hash: "0".repeat(64), version: "0.1.0", band_max_hz: 4000, mu_max: 1, warn_margin: 0.05, instability_threshold: 1e-6, vibration_threshold_db: 70, span_s: null, notes: [], event_columns, contact_state: false, simulated: false, inputs: { places: ["/rig/operating_point (ROS 2, domain 0)", "rig/operating_point (shared memory)"], start: "squealcast simulate" } };
 
 /** Serves the page of `assets` in a situation, which `turn` changes. */
 export function serve(assets, situation, more = {}) {
@@ -148,6 +159,7 @@ export function serve(assets, situation, more = {}) {
     "/comparison.json": () => null,
     "/map.json": map,
     "/shape.json": (query) => shape(Number(query.get("id"))),
+    "/contact.json": contact,
   };
   const server = createServer((request, response) => {
     const { pathname, searchParams } = new URL(request.url, "http://localhost");
@@ -184,5 +196,5 @@ export function fields() {
   const of = (answer) => Object.keys(answer).sort();
   const curves = map();
   const mode = shape(1);
-  return { state: of(SITUATIONS.squeal), fastest: of(SITUATIONS.squeal.fastest), next: of(SITUATIONS.squeal.next), about: of(about), map: of(curves), curve: of(curves.modes[0]), window: of(curves.windows[0]), shape: of(mode), part: of(mode.parts[0]), growth_change: of(mode.growth_change), disc: of(mode.disc), event: of(events()[0]), moment: of(events()[0].onset), event_columns };
+  return { state: of(SITUATIONS.squeal), fastest: of(SITUATIONS.squeal.fastest), next: of(SITUATIONS.squeal.next), about: of(about), map: of(curves), curve: of(curves.modes[0]), window: of(curves.windows[0]), shape: of(mode), part: of(mode.parts[0]), contact: of(contact()), place: of(contact().places[0]), growth_change: of(mode.growth_change), disc: of(mode.disc), event: of(events()[0]), moment: of(events()[0].onset), event_columns };
 }

@@ -31,6 +31,7 @@ pub const TARGETS: [Target; 16] = [
         read: |bytes| {
             let _ = npz::read("a.npz", bytes);
             let _ = npz::read_pair_residual("a.npz", bytes, 2);
+            let _ = npz::read_static_response("a.npz", bytes, 2);
         },
     },
     Target { name: "uff", read: |bytes| drop(uff::read("a.unv", bytes)) },
@@ -92,12 +93,14 @@ fn file(name: &str, bytes: &[u8]) -> PathBuf {
 }
 
 /// The files of a full model of one node; the first byte selects the file that the rest represents.
-const FULL_MODEL: [(&str, &str); 5] = [
+const FULL_MODEL: [(&str, &str); 7] = [
     ("model.toml", include_str!("full_model.toml")),
     ("K.mtx", "%%MatrixMarket matrix coordinate real symmetric\n3 3 3\n1 1 2e6\n2 2 3e6\n3 3 4e6\n"),
     ("M.sti", "1 1 1.0\n2 2 1.0\n3 3 1.0\n"),
     ("nodes.inp", "*NODE, NSET=ALL\n7, 0.1, 0., 0.\n"),
     ("rows.csv", "node,direction\n7,x\n7,y\n7,z\n"),
+    ("law.csv", "closure_m,pressure_pa\n0,0\n1e-6,1e4\n3e-6,9e4\n"),
+    ("load.csv", "node,direction,force_n\n7,z,-0.8\n7,x,0.6\n"),
 ];
 
 fn full_model(bytes: &[u8]) {

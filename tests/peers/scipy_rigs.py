@@ -139,9 +139,10 @@ def linear_weights(disc, candidates, at, normal):
 class Modal:
     """A rig of kind 2, and its matrices from the formulas above."""
 
-    def __init__(self, name, pad, disc, patches, slope=0.0, lateral=False, exponent=0.0, reference=500.0):
+    def __init__(self, name, pad, disc, patches, slope=0.0, lateral=False, exponent=0.0, reference=500.0, falls=None):
         self.name, self.pad, self.disc, self.patches = name, pad, disc, patches
         self.slope, self.lateral, self.exponent, self.reference = slope, lateral, exponent, reference
+        self.falls = falls  # fall of the friction coefficient, speed in m/s and exponent of the Stribeck law
 
     def write(self, folder, write_pad, modes=""):
         write_pad(folder / f"{self.name}-pad.npz", omega_rad_s=self.pad.omega, phi=self.pad.phi,
@@ -155,6 +156,8 @@ class Modal:
                                 phi=np.asfortranarray(self.disc.phi), nodes_m=self.disc.nodes)  # fmt: skip
             text += f"[disc]\nmodal = '{self.name}-disc.npz'\ndamping_ratio = {zeta.tolist()}\n"
         text += f"[friction]\nslope_s_per_m = {self.slope!r}\nlateral_damping = {str(self.lateral).lower()}\n"
+        if self.falls:
+            text += "stribeck_drop = {!r}\nstribeck_speed_m_s = {!r}\nstribeck_exponent = {!r}\n".format(*self.falls)
         text += f"[load]\nexponent = {self.exponent!r}\nreference_n = {self.reference!r}\n"
         for patch in self.patches:
             text += "[[contact_patch]]\n"
@@ -206,7 +209,12 @@ class Modal:
         k = k + (bn + mu * bt).T @ np.diag(kc) @ bn
         c = c + (bn + mu * bt).T @ np.diag(contact_damping) @ bn
         if slides:
-            c = c + self.slope * n0 * bt.T @ bt
+            slope = np.full(pairs, self.slope)
+            if self.falls:
+                drop, scale, exponent = self.falls
+                v = abs(speed) * radius
+                slope -= drop * exponent / v * (v / scale) ** exponent * np.exp(-((v / scale) ** exponent))
+            c = c + n0 * bt.T @ np.diag(slope) @ bt
             if self.lateral:
                 c = c + mu * bb.T @ np.diag(n0 / (abs(speed) * radius)) @ bb
         return k, c
@@ -244,12 +252,12 @@ def modal_cases(folder):
     pad = Side(rng, place(pad_nodes), 6, (700, 6000), damped=True)
     disc = Side(rng, place(disc_nodes), 9, (400, 7000), damped=True, free=1)
     patches = [patch(axis, list(range(len(disc_nodes))), 2e7, 35.0)]
-    rigs.append((Modal("coincident", pad, disc, patches, -0.02, True, 1 / 3, 400.0), np.savez, ""))
+    rigs.append((Modal("coincident", pad, disc, patches, -0.02, True, 1 / 3, 400.0, (0.15, 1.2, 2.0)), np.savez, ""))
 
     # The same with a normal that leans, as on a cone.
     leaning = axis + turned.apply([0.2, 0.1, 0.0])
     patches = [patch(leaning, list(range(len(disc_nodes))), 3e7, 0.0)]
-    rigs.append((Modal("leaning", pad, disc, patches, 0.01, True), np.savez, ""))
+    rigs.append((Modal("leaning", pad, disc, patches, 0.01, True, falls=(0.3, 0.8, 1.0)), np.savez, ""))
 
     # Different nodes on both sides, no damping; the five lowest of eight pad modes.
     pad = Side(rng, place(sector(rng, *pad_grid, 0.0, 1.0)), 8, (700, 8000), damped=False)

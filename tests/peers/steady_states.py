@@ -80,7 +80,12 @@ def predict(data, load, speed, mu):
     stiffness = stiffness + push.T @ inverse @ rows
     relaxation = np.array(data["relaxation_s"])[closed]
     damping = damping + push.T @ inverse @ np.diag(relaxation / tangent[closed]) @ inverse @ rows
-    damping = damping + data["slope_s_per_m"] * sliding.T @ np.diag(force) @ sliding
+    slope = np.full(len(force), data["slope_s_per_m"])
+    if data["stribeck"]:
+        drop, scale, exponent = data["stribeck"]
+        ratio = abs(speed) * np.array(data["radius_m"]) / scale
+        slope -= drop * exponent / scale * ratio ** (exponent - 1) * np.exp(-(ratio**exponent))
+    damping = damping + sliding.T @ np.diag(slope * force) @ sliding
     if data["lateral_damping"]:
         across = mu * force / (abs(speed) * np.array(data["radius_m"]))
         damping = damping + lateral.T @ np.diag(across) @ lateral

@@ -203,6 +203,18 @@ fn truncated_modes_keep_their_static_response() {
         open += expected.iter().filter(|force| **force == 0.0).count();
     }
     assert!(open > 0 && open < 15, "{open} pairs open");
+    // A picture places the pairs along the motion of the disc, +y at the pad, and outward from its axis.
+    let p = point(300.0, 13.0, 0.5);
+    let shown = squealcast::display::contact::contact(&selected, &p).unwrap();
+    assert_eq!(shown.force_n, selected.model.at(&p).unwrap().state().unwrap().force_n);
+    assert_eq!(shown.places.len(), pad.nodes.len());
+    let middle = [0.10425, 0.004];
+    let height = f64::hypot(middle[0], middle[1]);
+    for (node, place) in pad.nodes.iter().zip(&shown.places) {
+        let along = (middle[0] * node[1] - middle[1] * node[0]) / height;
+        let outward = (middle[0] * node[0] + middle[1] * node[1]) / height - height;
+        assert!((place.along_m - along).abs() < 1e-15 && (place.outward_m - outward).abs() < 1e-15, "{place:?}");
+    }
     // Without the response of the truncated modes to the load the forces differ.
     let without = modal("", "residual_gap_m_per_n = 0.0", loaded(&pad, 5, true), disc.archive(4, true, true));
     let without = Rig::from_files(&without).unwrap();
@@ -211,13 +223,13 @@ fn truncated_modes_keep_their_static_response() {
     assert!((total(&without) / total(&all) - 1.0).abs() > 1e-3);
 }
 
-/// The pairs of a full model are always closed, so it says nothing about a rig whose pairs open.
+/// A full model whose pairs are always closed says nothing about a rig whose pairs open.
 #[test]
-fn a_rig_with_a_contact_state_is_not_verified_against_a_full_model() {
+fn a_rig_with_a_contact_state_is_not_verified_against_closed_pairs() {
     run(["verify", "rough-pad", "--against", &launch("hulten.toml"), "--points", "1"])
         .exits(1)
-        .complains("rough-pad: `contact_state` is given, but the pairs of a full model are always closed")
-        .complains("expected a rig without it");
+        .complains("rough-pad: `contact_state` is given, but the pairs of hulten are always closed")
+        .complains("expected it in both or neither");
 }
 
 #[test]
@@ -523,4 +535,97 @@ fn a_map_shows_what_the_load_does_to_a_window() {
     run(["map", "nine-dof", "--x", "mu=0:1", "--y", "speed=1:20000"]).exits(1).complains("disc_speed_rad_s is 20000");
     run(["map", "nine-dof", "--x", "heat=0:1"]).exits(2).complains("expected mu, load or speed");
     run(["map", "nine-dof", "--points", "1x5"]).exits(2).complains("expected at least 2");
+}
+
+/// A sweep over the load has the modes that `predict` gives, the same numbers, and its window has the ends that a map over
+/// load and speed finds by another search. Where the pad jams it leaves out the loads and names the reason.
+#[test]
+fn a_sweep_over_the_load_shows_its_window() {
+    let folder = folder();
+    let [csv, svg, edges] = ["sweep.csv", "sweep.svg", "edges.csv"].map(|name| text(&folder.path().join(name)));
+    let swept = run(["sweep", "rough-pad", "--mu", "0.4", "--load", "100:2000:475", "--csv", &csv, "--svg", &svg]);
+    swept.exits(0).complains("1 window of instability");
+    let rows = table(&std::fs::read_to_string(&csv).unwrap());
+    let mut loads: Vec<&str> = rows.iter().map(|row| row["normal_load_n"].as_str()).collect();
+    loads.dedup();
+    assert_eq!(loads, ["100", "575", "1050", "1525", "2000"]);
+    for load in &loads {
+        let found = json(["predict", "rough-pad", "--mu", "0.4", "--load", load, "--json"]);
+        let of_load: Vec<_> = rows.iter().filter(|row| row["normal_load_n"] == *load).collect();
+        let modes = found["modes"].as_array().unwrap();
+        assert_eq!(of_load.len(), modes.len());
+        for (row, mode) in of_load.iter().zip(modes) {
+            assert_eq!(row["mode_id"], mode["id"].to_string());
+            assert_eq!(row["frequency_hz"], number(mode, "frequency_hz").to_string());
+            assert_eq!(row["growth_rate_per_s"], number(mode, "growth_rate_per_s").to_string());
+        }
+    }
+    let drawn = std::fs::read_to_string(&svg).unwrap();
+    assert!(drawn.contains("normal load, N") && drawn.contains("rough-pad, friction coefficient 0.4, 13 rad/s"));
+    assert!(!drawn.contains(">friction coefficient<"));
+    // Two rectangles, one in each panel, shade the window: their edges, in units of the drawing, are those of the map.
+    let args = ["--mu", "0.4", "--points", "5x2", "--edges", &edges, "--csv", "-", "-q"];
+    run(["map", "rough-pad", "--x", "load=100:2000", "--y", "speed=13:14"].into_iter().chain(args)).exits(0);
+    let found = table(&std::fs::read_to_string(&edges).unwrap());
+    let expected: Vec<f64> = found[..2].iter().map(|row| row["normal_load_n"].parse().unwrap()).collect();
+    let attribute = |tag: &str, name: &str| -> Option<f64> {
+        tag.split_once(&format!(" {name}=\""))?.1.split('"').next()?.parse().ok()
+    };
+    let shaded: Vec<(f64, f64)> = drawn
+        .split('<')
+        .filter(|tag| tag.starts_with("rect") && tag.contains("opacity=\"0.12\""))
+        .map(|tag| {
+            let (x, width) = (attribute(tag, "x").unwrap(), attribute(tag, "width").unwrap());
+            (x, width)
+        })
+        .collect();
+    assert_eq!((shaded.len(), shaded[0]), (2, shaded[1]));
+    let share = (expected[1] - expected[0]) / 1900.0;
+    let axes = drawn
+        .split('<')
+        .filter(|tag| tag.starts_with("line"))
+        .filter_map(|tag| Some((attribute(tag, "x2")? - attribute(tag, "x1")?).abs()));
+    let whole = axes.fold(0.0, f64::max);
+    assert!((shaded[0].1 / whole - share).abs() < 2e-3, "{shaded:?} of {whole}, expected {share}");
+    // Jamming.
+    let rig = write(folder.path(), "jamming.toml", &jamming());
+    let swept = run(["sweep", &rig, "--mu", "2.5", "--speed", "-13", "--load", "50:90:20"]).exits(0);
+    let swept = swept.complains("no prediction at 3 values of the normal load, N, the first at 50: ");
+    assert_eq!(swept.stdout.lines().count(), 1);
+}
+
+/// A sweep over the speed of a rig whose friction falls with speed: at low speed the steep slope makes modes grow, at high
+/// speed none does. What is swept must be one condition.
+#[test]
+fn a_sweep_over_the_speed_follows_the_slope_of_friction() {
+    let folder = folder();
+    let falls = "[friction]\nstribeck_drop = 0.3\nstribeck_speed_m_s = 0.5\n";
+    let rough = std::fs::read_to_string(crate::program::launch("rough-pad.toml")).unwrap();
+    let falling =
+        rough.replacen("[pad]", &format!("{falls}[pad]"), 1).replace("[[contact]]", "[[contact]]\nradius_m = 0.1");
+    let rig = write(folder.path(), "falling.toml", &falling);
+    let growth = |mu: &str, speeds: &str| -> Vec<(f64, f64)> {
+        let rows = table(&run(["sweep", &rig, "--mu", mu, "--speed", speeds]).exits(0).stdout);
+        let value = |row: &std::collections::BTreeMap<String, String>, key: &str| row[key].parse::<f64>().unwrap();
+        let mut of_speeds: Vec<(f64, f64)> = vec![];
+        for row in &rows {
+            let (speed, growth) = (value(row, "disc_speed_rad_s"), value(row, "growth_rate_per_s"));
+            match of_speeds.last_mut().filter(|(last, _)| *last == speed) {
+                Some((_, most)) => *most = most.max(growth),
+                None => of_speeds.push((speed, growth)),
+            }
+        }
+        of_speeds
+    };
+    let found = growth("0.1", "1:41:10");
+    assert_eq!(found.iter().map(|(speed, _)| *speed).collect::<Vec<_>>(), [1.0, 11.0, 21.0, 31.0, 41.0]);
+    eprintln!("{found:?}");
+    assert!(found[0].1 > 0.0 && found[4].1 < 0.0, "{found:?}");
+    // Without friction either direction of rotation is the same, to the last bit.
+    let both = growth("0", "-3:3:6");
+    assert_eq!((both.len(), both[0].1), (2, both[1].1));
+    run(["sweep", &rig, "--load", "50:90:20", "--speed", "1:3:1"]).exits(1).complains("2 ranges, expected one of");
+    run(["sweep", &rig, "--mu", "0.3"]).exits(1).complains("--mu is one friction coefficient: expected a range");
+    run(["sweep", &rig, "--load", "0:2e7:1e6"]).exits(1).complains("normal_load_n is 20000000");
+    run(["sweep", &rig, "--load", "heavy"]).exits(2).complains("--load");
 }

@@ -376,6 +376,51 @@ fn the_page_shows_every_status_and_the_next_squeal() {
 }
 
 fn tribometer_axis() -> squealcast::rig::DiscAxis {
+/// The page of a node whose contact pairs open and close shows their forces: those of the state at the conditions it names.
+#[test]
+fn the_page_shows_the_contact() {
+    let _alone = alone();
+    if !browser_ready() {
+        return;
+    }
+    let shown = Shown::demo(&["rough-pad", "--rate", "100"]);
+    let found = browse("contact.mjs", &[&format!("http://{}/", shown.address)]);
+    let answer: serde_json::Value = serde_json::from_str(&shown.get("/contact.json").2).unwrap();
+    shown.stop();
+    let made_up = |name: &str| -> Vec<&str> {
+        found["fields"][name].as_array().unwrap().iter().map(|field| field.as_str().unwrap()).collect()
+    };
+    assert_eq!(fields(&answer), made_up("contact"));
+    let place = squealcast::display::contact::Place { along_m: 0.0, outward_m: 0.0, opposite: false };
+    assert_eq!(fields(&serde_json::to_value(place).unwrap()), made_up("place"));
+    let number = |name: &str| answer[name].as_f64().unwrap();
+    let rig = squealcast::rig::Rig::load("rough-pad").unwrap();
+    let point = squealcast::physics::OperatingPoint {
+        normal_load_n: number("normal_load_n"),
+        disc_speed_rad_s: number("disc_speed_rad_s"),
+        friction_coefficient: number("friction_coefficient"),
+    };
+    let state = rig.model.at(&point).unwrap().state().unwrap().clone();
+    let forces: Vec<f64> = answer["force_n"].as_array().unwrap().iter().map(|force| force.as_f64().unwrap()).collect();
+    assert_eq!(forces, state.force_n);
+    // The page shows a bar for each pair, as high as its force is of the largest.
+    let page = &found["shown"];
+    assert!(page["note"].as_str().unwrap().starts_with("7 of 7 pairs closed at "), "{page}");
+    let bars: Vec<f64> = page["bars"].as_array().unwrap().iter().map(|bar| bar.as_f64().unwrap()).collect();
+    let forces: Vec<f64> = page["titles"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|title| title.as_str().unwrap().split([' ']).nth(2).unwrap().parse().unwrap())
+        .collect();
+    let most = |values: &[f64]| values.iter().copied().fold(0.0, f64::max);
+    assert_eq!((bars.len(), forces.len()), (7, 7));
+    for (bar, force) in bars.iter().zip(&forces) {
+        // Forces are written with two decimals.
+        assert!((bar / most(&bars) - force / most(&forces)).abs() < 0.01 / most(&forces), "{page}");
+    }
+}
+
     squealcast::rig::Rig::load("tribometer").unwrap().disc_axis.unwrap()
 }
 
@@ -523,6 +568,43 @@ fn a_recording_of_faults_is_not_called_quiet() {
 }
 
 #[test]
+/// A report shows the contact of a rig with a contact state where it squeals worst, or at the end, and of no other rig.
+#[test]
+fn a_report_shows_the_contact() {
+    let directory = tempfile::tempdir().unwrap();
+    let run = |arguments: &[&str]| {
+        let output = Command::new(env!("CARGO_BIN_EXE_squealcast")).args(arguments).output().unwrap();
+        assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    };
+    let report = |rig: &str, mu: f64| {
+        let [profile, recorded, out] =
+            ["profile.toml", "recorded", "report"].map(|name| directory.path().join(format!("{rig}-{mu}-{name}")));
+        let point = |time_s: f64, mu: f64| {
+            format!(
+                "[[point]]\ntime_s = {time_s}\nnormal_load_n = 500\ndisc_speed_rad_s = 13\nfriction_coefficient = {mu}\n"
+            )
+        };
+        std::fs::write(&profile, point(0.0, 0.1) + &point(1.0, mu)).unwrap();
+        let [profile, recorded, out] = [&profile, &recorded, &out].map(|path| path.to_str().unwrap());
+        let rate = ["--rate", "20", "--duration", "1"];
+        run(&[&["simulate", "--rig", rig, "--profile", profile, "--record", recorded], &rate[..]].concat());
+        let session = std::fs::read_dir(recorded).unwrap().next().unwrap().unwrap().path();
+        run(&["report", session.to_str().unwrap(), "-o", out]);
+        std::fs::read_to_string(Path::new(out).join("report.html")).unwrap()
+    };
+    for mu in [0.12, 0.6] {
+        let html = report("rough-pad", mu);
+        let (_, contact) = html.split_once("<h2>Contact</h2>").expect("a section");
+        let (contact, _) = contact.split_once("</section>").unwrap();
+        assert!(contact.contains("7 of 7 pairs closed") && contact.contains(" N on the back of the pad."), "{contact}");
+        assert!(contact.contains("contact pair") && contact.contains("force, N"), "axes");
+        // A dot for each pair, and two in the legend.
+        assert_eq!(contact.matches("<circle").count(), 9, "{contact}");
+        assert_eq!(html.contains("No squeal was predicted"), mu == 0.12, "worth testing");
+    }
+    assert!(!report("nine-dof-case-2", 0.2).contains("<h2>Contact</h2>"));
+}
+
 fn a_silent_connection_is_closed() {
     let shown = Shown::demo(&[]);
     let mut silent = TcpStream::connect(shown.address).unwrap();

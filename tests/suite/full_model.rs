@@ -110,6 +110,24 @@ fn errors_name_file_line_and_value() {
     run(["check", &toml]).exits(1).complains("one.toml: pad.mass = \"m.mtx\" cannot be read");
 }
 
+/// A pad of one node that jams, as the rig `jamming` of `contact_rigs`: `K_0 = [1.5 0.75; 0.75 0.5]` MN/m along -t and n, a
+/// contact spring of 4/3 MN/m; with reversed sliding its matrix is singular at `μ = (0.1875 + 1.5 k) / (0.75 k) = 2.1875`.
+#[test]
+fn a_full_model_that_jams_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let toml = std::fs::read_to_string(one_node(folder)).unwrap();
+    let matrix = "%%MatrixMarket matrix coordinate real symmetric\n3 3 4\n1 1 3e6\n2 2 5e5\n3 3 15e5\n3 2 75e4\n";
+    write(folder, "k.mtx", matrix);
+    let state = "[contact_state]\nlaw = \"linear\"\nmeasured = \"back-force\"\nload_nodes = [17]\n\
+                 load_direction = [0.0, -1.0, 0.0]\n[limits]\nfriction_coefficient = [0.0, 3.0]\n";
+    let toml = toml.replace("stiffness_n_per_m = 1e6", &format!("stiffness_n_per_m = {}", 4e6 / 3.0)) + state;
+    let path = write(folder, "jamming.toml", &toml);
+    run(["full", &path, "--mu", "2.1", "--speed", "-13"]).exits(0).says("contact: 1 of 1 pairs closed");
+    run(["full", &path, "--mu", "2.2", "--speed", "-13"]).exits(1).complains("the pad jams at 2.187500");
+    run(["check", &path]).exits(0).says("1 pairs that open and close; the load acts on 1 degrees of freedom");
+}
+
 /// The lines of a matrix of CalculiX: row, column, value.
 fn listed(path: &Path) -> Vec<(usize, usize, String)> {
     let text = std::fs::read_to_string(path).unwrap();

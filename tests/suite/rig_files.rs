@@ -171,8 +171,43 @@ fn bad_files_of_kind_1() {
     refused!(
         inline("name = \"x\"", "name = \"x\"\n[friction]\nlateral_damping = true"),
         RigError::Model { .. },
-        "x.toml: contact pair 0: radius_m is 0, expected more than 0 for lateral damping"
+        "x.toml: contact pair 0: radius_m is 0, expected more than 0 for lateral damping and for friction that falls \
+         with speed"
     );
+}
+
+/// The keys of the Stribeck law; a law of drop 0 is none, so the model is the same to the last bit.
+#[test]
+fn friction_that_falls_is_checked() {
+    let with = |friction: &str| {
+        let radius = INLINE.replacen("[[contact]]\n", "[[contact]]\nradius_m = 0.1\n", 1);
+        assert_ne!(radius, INLINE);
+        [file("x.toml", radius.replacen("name = \"x\"", &format!("name = \"x\"\n[friction]\n{friction}"), 1))]
+    };
+    refused!(
+        refused(&with("stribeck_drop = 0.1")),
+        RigError::MissingKey { .. },
+        "x.toml: `friction.stribeck_speed_m_s` is missing; expected the sliding speed, m/s, over which friction falls by \
+         stribeck_drop = 0.1"
+    );
+    refused!(
+        refused(&with("stribeck_drop = 0.1\nstribeck_speed_m_s = 0.0")),
+        RigError::Range { .. },
+        "x.toml: `friction.stribeck_speed_m_s` is 0, expected more than 0"
+    );
+    refused!(
+        refused(&with("stribeck_drop = 0.1\nstribeck_speed_m_s = 0.5\nstribeck_exponent = 0.9")),
+        RigError::Range { .. },
+        "x.toml: `friction.stribeck_exponent` is 0.9, expected 1 to 10"
+    );
+    let falls = Rig::from_files(&with("stribeck_drop = 0.1\nstribeck_speed_m_s = 1.3")).unwrap();
+    // By hand: -2 · 0.1 / 1.3 · e^-1 at the reference speed of 13 rad/s.
+    let line = "friction   falls with the sliding speed v by 0.1 (1 - exp(-(v / 1.3 m/s)^2)): slope -5.660e-2 to -5.660e-2 \
+                s/m at 13 rad/s";
+    assert!(falls.describe().contains(line), "{}", falls.describe());
+    assert_eq!(falls.model.depends_on_load_and_speed(), (true, true));
+    let none = Rig::from_files(&with("stribeck_drop = 0.0\nstribeck_speed_m_s = 1.3")).unwrap();
+    assert_eq!(none.model.depends_on_load_and_speed(), (false, false));
 }
 
 #[test]

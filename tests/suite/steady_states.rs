@@ -13,7 +13,7 @@ use squealcast::contact::{
 };
 use squealcast::physics::{
     ContactLaw, ContactPairs, Law, MapOptions, Model, OperatingPoint, ResidualFlexibility, Solver, Spectrum,
-    StabilityMap, Term, Vectors, WindowKind,
+    StabilityMap, Stribeck, Term, Vectors, WindowKind,
 };
 use squealcast::proof::synthetic::Uniform;
 
@@ -88,7 +88,8 @@ impl Rig {
             "damping_ratio": damping_ratio, "normal": rows(&normal), "sliding": rows(&sliding),
             "lateral": rows(&lateral), "pressed": pressed, "gaps_m": gaps_m, "radius_m": radius_m,
             "relaxation_s": vec![relaxation_s; PAIRS], "r_nn": rows(&r_nn), "r_nt": rows(&r_nt),
-            "slope_s_per_m": friction.slope_s_per_m, "lateral_damping": friction.lateral_damping,
+            "slope_s_per_m": friction.slope_s_per_m,
+            "stribeck": friction.stribeck.map(|law| [law.drop, law.speed_m_s, law.exponent]), "lateral_damping": friction.lateral_damping,
         });
         let diagonal = |value: &dyn Fn(f64) -> f64| Term {
             matrix: Mat::from_fn(MODES, MODES, |i, j| if i == j { value(omega[i]) } else { 0.0 }),
@@ -118,8 +119,12 @@ impl Rig {
     }
 }
 
-const PLAIN: ContactLaw = ContactLaw { exponent: 0.0, reference_n: 500.0, slope_s_per_m: 0.0, lateral_damping: false };
+const PLAIN: ContactLaw =
+    ContactLaw { exponent: 0.0, reference_n: 500.0, slope_s_per_m: 0.0, stribeck: None, lateral_damping: false };
 const FRICTION: ContactLaw = ContactLaw { slope_s_per_m: -1e-4, lateral_damping: true, ..PLAIN };
+/// Pairs are 1 km from the axis: they slide with some 10 km/s.
+const FALLING: ContactLaw =
+    ContactLaw { stribeck: Some(Stribeck { drop: 1.0, speed_m_s: 1e4, exponent: 2.0 }), ..FRICTION };
 
 fn point(normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64) -> OperatingPoint {
     OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient }
@@ -156,7 +161,11 @@ fn scipy_finds_the_same_states_and_roots() {
         for seed in 0..6 {
             let seed = 10 * k as u64 + seed;
             let kind = seed % 3;
-            let friction = if kind == 2 { FRICTION } else { PLAIN };
+            let friction = match (kind, seed % 2) {
+                (2, 0) => FALLING,
+                (2, _) => FRICTION,
+                _ => PLAIN,
+            };
             let rig = Rig::new(seed, law, [0.0, 1e-2, 1e-2][kind as usize], seed % 2 == 1, friction);
             let mut points: Vec<(OperatingPoint, bool)> =
                 [point(500.0, 13.0, 0.0), point(500.0, 13.0, 0.4), point(150.0, -13.0, 0.3), point(2000.0, 4.0, 0.6)]

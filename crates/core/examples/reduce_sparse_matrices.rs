@@ -41,13 +41,15 @@ fn triplet((row, column, value): (usize, usize, f64)) -> Triplet<usize, usize, f
 fn main() -> Result<(), Box<dyn Error>> {
     // Each contact pair is a linear form of the displacements: the row of the pad minus the row of the disc.
     let row = |pad: usize, disc: usize| vec![(pad, 1.0), (40 + disc, -1.0)];
-    let contact_law = ContactLaw { exponent: 0.5, reference_n: 500.0, slope_s_per_m: -0.01, lateral_damping: true };
+    let contact_law =
+        ContactLaw { exponent: 0.5, reference_n: 500.0, slope_s_per_m: -0.01, lateral_damping: true, stribeck: None };
     let full = FullModel {
         parts: vec![chain("pad", 40, 4e6)?, chain("disc", 35, 5e6)?],
         stiffness: vec![],
         damping: vec![],
         modal_damping: vec![],
         contact: Some(FullContact {
+            steady: None,
             normal: vec![row(12, 9), row(22, 18), row(33, 30)],
             sliding: vec![row(13, 11), row(20, 19), row(35, 28)],
             lateral: vec![row(5, 4), row(17, 16), row(38, 33)],

@@ -1,6 +1,7 @@
 // Connects the page with its source: a node's stream of states, or a recording that is queried for moments.
 
 import { next } from "./clock.js";
+import { ContactView } from "./contact.js";
 import { Events } from "./events.js";
 import { History } from "./history.js";
 import { StabilityMap } from "./map.js";
@@ -30,6 +31,7 @@ const history = new History(about);
 const shape = new ShapeView();
 const modes = new Modes(about, choose, () => follow(false));
 let timeline;
+const contact = new ContactView(about, showContact);
 const events = new Events(about, recording ? (moment) => timeline.go(moment) : undefined);
 
 let latest = null;
@@ -71,6 +73,22 @@ async function choose(id) {
 function follow(on) {
   following = on;
   at("shape-follow").setAttribute("aria-pressed", String(on));
+let contactAt = 0;
+let contactFor = [];
+let contacts = 0;
+
+async function showContact() {
+  const order = ++contacts;
+  contactAt = performance.now();
+  contactFor = latest ? conditions(latest) : [];
+  try {
+    const answer = await ask(recording && latest ? `contact.json?at=${latest.time_s}` : "contact.json");
+    if (order === contacts) contact.show(answer);
+  } catch (error) {
+    if (order === contacts) contact.missing(error.message);
+  }
+}
+
   if (on && latest) numbers();
 }
 at("shape-follow").addEventListener("click", () => follow(!following));
@@ -137,6 +155,7 @@ function paint() {
 
 function numbers() {
   if (!latest) return;
+  contact.still(!asserts(latest));
   const age = typeof latest.age_s === "number" ? latest.age_s + (recording ? 0 : (performance.now() - heardAt) / 1000) : undefined;
   status.numbers(latest, age, (id) => (shape.shape?.id === id ? shape.shape.pad_share : undefined));
   modes.numbers(latest);
@@ -147,6 +166,7 @@ function numbers() {
   const settled = since > SETTLED;
   // A recording that is paused sends no further states.
   clearTimeout(later);
+  if (contact.chosen && performance.now() - contactAt > FOLLOWED && moved(conditions(latest), contactFor)) showContact();
   if (recording && !settled) later = setTimeout(numbers, SETTLED);
   if (following && wanted !== undefined && wanted !== modes.chosen && (since > FOLLOWED || modes.chosen === null)) modes.select(wanted);
   // The shape of a mode changes with the conditions.
@@ -166,6 +186,7 @@ function link(kind, text) {
   status.needle(latest);
   map.cursor(latest);
 }
+  contact.still(true);
 
 /** The page is connected to the node; the sign is green only if the node receives inputs. */
 function connected() {

@@ -335,9 +335,13 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> Result<Model, ModelError> {
         Kind::Undamped => ContactLaw::default(),
         Kind::Hertzian => ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() },
         Kind::Lateral => ContactLaw { lateral_damping: true, ..ContactLaw::default() },
-        Kind::Damped => {
-            ContactLaw { exponent: 1.0 / 3.0, reference_n: 500.0, slope_s_per_m: -0.02, lateral_damping: true }
-        }
+        Kind::Damped => ContactLaw {
+            exponent: 1.0 / 3.0,
+            reference_n: 500.0,
+            slope_s_per_m: -0.02,
+            lateral_damping: true,
+            stribeck: None,
+        },
     };
     let damping_ratio = if matches!(plan.kind, Kind::Damped | Kind::Lateral) { 5e-3 } else { 0.0 };
     rig(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })

@@ -149,7 +149,7 @@ impl Figure {
         for (model, points) in [(drawn, &lines), ("full", &dots)] {
             for point in points {
                 let omega = std::f64::consts::TAU * point.frequency_hz;
-                csv += &format!("{},{model},{},{omega},{}\n", point.mu, point.id, point.growth_rate_per_s);
+                csv += &format!("{},{model},{},{omega},{}\n", point.x, point.id, point.growth_rate_per_s);
             }
         }
         Ok(Item { name: self.name, title: self.title.to_owned(), text, csv, svg: Some(svg) })
@@ -168,7 +168,7 @@ impl Figure {
             let mu = self.mu_max * k as f64 / DOTS as f64;
             let spectrum = solver.solve(&rig.model, &rig.reference.with_friction(mu), Vectors::Right)?;
             dots.extend(spectrum.modes().iter().enumerate().map(|(id, root)| Point {
-                mu,
+                x: mu,
                 id: id as u32,
                 frequency_hz: root.frequency_hz(),
                 growth_rate_per_s: root.growth_rate_per_s(),

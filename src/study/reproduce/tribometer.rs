@@ -193,7 +193,7 @@ impl Study<'_> {
             let mu = MU_MAX * k as f64 / DOTS as f64;
             let found = roots(&format!("friction coefficient {mu}"), &reference.with_friction(mu), report)?;
             dots.extend(found.roots.iter().filter(|root| root.lambda.im > 0.0).enumerate().map(|(id, root)| Point {
-                mu,
+                x: mu,
                 id: id as u32,
                 frequency_hz: root.lambda.im / TAU,
                 growth_rate_per_s: root.lambda.re,
@@ -371,7 +371,7 @@ const CURVES_HEADER: &str = "friction_coefficient,model,mode_id,frequency_hz,gro
 
 fn rows_of(model: &str, points: &[Point]) -> String {
     let row = |point: &Point| {
-        let Point { mu, id, frequency_hz, growth_rate_per_s } = point;
+        let Point { x: mu, id, frequency_hz, growth_rate_per_s } = point;
         format!("{mu},\"{model}\",{id},{frequency_hz},{growth_rate_per_s}\n")
     };
     points.iter().map(row).collect()

@@ -125,7 +125,8 @@ impl Scales {
 impl<'a> Equations<'a> {
     fn new(statics: &'a Statics, load: f64, x: f64, support: f64, scales: &'a Scales) -> Self {
         let parts = &statics.parts;
-        let flexibility = &parts.response.normal_flexibility + faer::Scale(x) * &parts.response.sliding_flexibility;
+        let (normal, sliding) = (&parts.response.normal_flexibility, &parts.response.sliding_flexibility);
+        let flexibility = faer::zip!(normal, sliding).map(|faer::unzip!(nn, nt)| nn + x * nt);
         let pushed = &parts.response.rigid.normal + faer::Scale(x) * &parts.response.rigid.sliding;
         Self { statics, load, x, flexibility, pushed, support, scales }
     }
@@ -276,14 +277,17 @@ impl<'a> Equations<'a> {
             None => right[(c + row - m, column)],
         });
         jacobian.lu.solve_in_place(reduced.as_mut());
+        let open: Vec<usize> = (0..c).filter(|&k| jacobian.tangent[k] == 0.0).collect();
         let mut moved = vec![0.0; c];
         let mut increments = vec![0.0; c];
         for column in 0..right.ncols() {
             for (row, &k) in jacobian.closed.iter().enumerate() {
                 increments[k] = jacobian.tangent[k] * reduced[(row, column)];
             }
-            times_columns(self.flexibility.as_ref(), &increments, &jacobian.closed, &mut moved);
-            for k in 0..c {
+            if !open.is_empty() {
+                times_columns(self.flexibility.as_ref(), &increments, &jacobian.closed, &mut moved);
+            }
+            for &k in &open {
                 // The closure of an open pair follows from the other unknowns.
                 let mut value = right[(k, column)] - moved[k];
                 for other in 0..others {

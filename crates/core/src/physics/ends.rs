@@ -398,6 +398,7 @@ fn closure(here: &Situation, pair: usize) -> Option<Value> {
 mod tests {
     use super::super::law::ContactLaw;
     use super::super::stability_map::MapOptions;
+    use super::super::stribeck::Stribeck;
     use super::super::test_models::{REFERENCE, hulten, nine_dof};
     use super::*;
     use crate::proof::synthetic::{Synthetic, Uniform, rig};
@@ -472,7 +473,16 @@ mod tests {
     fn ends_follow_load_and_speed() {
         let laws = [
             (0.0, ContactLaw { exponent: 0.4, ..Default::default() }),
-            (2e-3, ContactLaw { exponent: 0.4, slope_s_per_m: -2e-3, lateral_damping: true, ..Default::default() }),
+            (
+                2e-3,
+                ContactLaw {
+                    exponent: 0.4,
+                    slope_s_per_m: -2e-3,
+                    stribeck: Some(Stribeck { drop: 5e-3, speed_m_s: 1.5, exponent: 2.0 }),
+                    lateral_damping: true,
+                    ..Default::default()
+                },
+            ),
         ];
         let mut uniform = Uniform::new(5);
         let (mut carried_ends, mut moved_most) = (0, 0.0f64);

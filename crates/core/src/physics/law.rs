@@ -6,6 +6,7 @@
 use std::sync::Arc;
 
 use super::operating_point::{ContactState, OperatingPoint};
+use super::stribeck::Stribeck;
 use crate::chebyshev;
 
 /// The scalar factor of a term, as a function of the operating point. Where its condition (contact closed, or
@@ -24,6 +25,12 @@ pub enum Law {
     FrictionDamping,
     /// `N` while the contact slides; the matrix contains the slope `dμ/dv`.
     FrictionSlope,
+    /// `N μ'(|Ω| ρ)` while the contact slides, with the slope of [`ContactLaw::stribeck`] at the radius `ρ`; 0 without
+    /// it.
+    FallingFriction {
+        /// `ρ`, m.
+        radius_m: f64,
+    },
     /// `μ N / |ω|` while the contact slides.
     LateralFriction,
     /// `x T_k(x / r)` with `x = s μ`, while the contact slides. A sum of such terms expands `f(x) - f(0)` of a smooth
@@ -99,6 +106,9 @@ impl Law {
             Self::ContactDamping => when(closed, 1.0),
             Self::FrictionDamping => when(sliding, p.disc_speed_rad_s.signum() * mu),
             Self::FrictionSlope => when(sliding, load),
+            Self::FallingFriction { radius_m } => {
+                when(sliding, load * contact.falling_slope(p.disc_speed_rad_s.abs() * radius_m))
+            }
             Self::LateralFriction => when(sliding, mu * load / p.disc_speed_rad_s.abs()),
             Self::FrictionChebyshev { degree, range } => {
                 let x = p.disc_speed_rad_s.signum() * mu;
@@ -151,6 +161,15 @@ impl Law {
                 Load => ratio(value, p.normal_load_n),
                 Friction | Speed | ContactStiffness | ContactDamping => 0.0,
             },
+            Self::FallingFriction { radius_m } => match parameter {
+                Load => ratio(value, p.normal_load_n),
+                Speed if state == ContactState::Sliding => {
+                    let v = p.disc_speed_rad_s.abs() * radius_m;
+                    let bend = contact.stribeck.map_or(0.0, |stribeck| stribeck.slope_per_speed(v));
+                    p.normal_load_n * bend * radius_m * p.disc_speed_rad_s.signum()
+                }
+                Friction | Speed | ContactStiffness | ContactDamping => 0.0,
+            },
             Self::LateralFriction => match parameter {
                 Friction => per_friction(),
                 Load => ratio(value, p.normal_load_n),
@@ -196,7 +215,7 @@ impl Law {
             }
             Self::ContactStiffness | Self::FrictionStiffness => (contact.exponent != 0.0, false),
             Self::FrictionSlope => (true, false),
-            Self::LateralFriction => (true, true),
+            Self::FallingFriction { .. } | Self::LateralFriction => (true, true),
             Self::DiscSpeed { .. } | Self::DiscSpeedInContact { .. } | Self::DiscSpeedChebyshev { .. } => (false, true),
             Self::Custom(custom) => (custom.depends_on_load, custom.depends_on_speed),
         }
@@ -213,6 +232,7 @@ impl Law {
             | Self::ContactDamping
             | Self::FrictionDamping
             | Self::FrictionSlope
+            | Self::FallingFriction { .. }
             | Self::LateralFriction
             | Self::DiscSpeed { .. }
             | Self::DiscSpeedInContact { .. }
@@ -261,15 +281,24 @@ pub struct ContactLaw {
     pub exponent: f64,
     /// `N_ref`, N.
     pub reference_n: f64,
-    /// `dμ/dv`, s/m; negative where friction falls with speed.
+    /// `dμ/dv` at every speed, s/m; negative where friction falls with speed. The slope of `stribeck` is added to it.
     pub slope_s_per_m: f64,
+    /// Friction that falls with the sliding speed of each pair.
+    pub stribeck: Option<Stribeck>,
     /// Whether the friction force follows the direction of the sliding velocity, and so damps motion along `b`.
     pub lateral_damping: bool,
 }
 
 impl Default for ContactLaw {
     fn default() -> Self {
-        Self { exponent: 0.0, reference_n: 500.0, slope_s_per_m: 0.0, lateral_damping: false }
+        Self { exponent: 0.0, reference_n: 500.0, slope_s_per_m: 0.0, stribeck: None, lateral_damping: false }
+    }
+}
+
+impl ContactLaw {
+    /// Slope of [`Self::stribeck`] at the sliding speed `v_m_s`, s/m; 0 without it.
+    pub fn falling_slope(&self, v_m_s: f64) -> f64 {
+        self.stribeck.map_or(0.0, |stribeck| stribeck.slope(v_m_s))
     }
 }
 

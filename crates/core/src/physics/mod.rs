@@ -21,6 +21,7 @@ pub mod stability_map;
 mod steady_contact;
 #[cfg(test)]
 mod steady_tests;
+mod stribeck;
 pub(crate) mod summary;
 #[cfg(test)]
 pub(crate) mod test_models;
@@ -42,5 +43,7 @@ pub use solver::Solver;
 pub use spectrum::{Root, RootError, SolveError, Spectrum, Vectors};
 pub use stability_map::{MapError, MapOptions, NextWindow, StabilityMap};
 pub use steady_contact::Situation;
+pub(crate) use steady_contact::relaxation_s;
+pub use stribeck::Stribeck;
 pub use summary::{Mode, Summary};
 pub use traces::{Exact, Traces};

@@ -12,6 +12,7 @@ use super::law::{ContactLaw, Law, Parameter};
 use super::model_error::ModelError;
 use super::operating_point::{ContactState, OperatingPoint};
 use super::steady_contact::{Response, Situation, SteadyContact, signed_friction};
+use super::stribeck::Node;
 
 /// A constant matrix times a scalar law of the operating point.
 #[derive(Clone, Debug)]
@@ -42,7 +43,7 @@ pub struct ContactPairs {
 
 impl ContactPairs {
     /// Checks that every pair is at a distance from the disc's axis.
-    fn check_radius(&self) -> Result<(), ModelError> {
+    pub(super) fn check_radius(&self) -> Result<(), ModelError> {
         match self.radius_m.iter().position(|radius_m| radius_m.is_nan() || *radius_m <= 0.0) {
             Some(pair) => Err(ModelError::Radius { pair, radius_m: self.radius_m[pair] }),
             None => Ok(()),
@@ -169,12 +170,13 @@ impl Model {
     ///
     /// ```text
     /// K += κ(N) (B_n + s μ B_t)ᵀ K_c B_n
-    /// C += (B_n + s μ B_t)ᵀ C_c B_n + dμ/dv B_tᵀ diag(N_0) B_t + μ B_bᵀ diag(N_0 / v) B_b
+    /// C += (B_n + s μ B_t)ᵀ C_c B_n + B_tᵀ diag(N_0 μ'(v)) B_t + μ B_bᵀ diag(N_0 / v) B_b
     /// N_0 = N / c, v_k = |ω| r_k
     /// ```
     ///
     /// # Errors
-    /// [`ModelError::Shape`], [`ModelError::NotFinite`], [`ModelError::PairCount`], [`ModelError::Radius`].
+    /// [`ModelError::Shape`], [`ModelError::NotFinite`], [`ModelError::PairCount`], [`ModelError::Radius`],
+    /// [`ModelError::StribeckRadii`].
     pub fn with_contact(mut self, pairs: &ContactPairs) -> Result<Self, ModelError> {
         self.check_pairs(pairs)?;
         let (n, t) = (pairs.normal.as_ref(), pairs.sliding.as_ref());
@@ -225,6 +227,14 @@ impl Model {
         let (t, b) = (pairs.sliding.as_ref(), pairs.lateral.as_ref());
         self.add_damping("friction slope", congruence(t, &slope, t), Law::FrictionSlope)?;
         self.add_damping("lateral friction", congruence(b, &inverse_radius, b), Law::LateralFriction)?;
+        if let Some(stribeck) = self.contact_law.stribeck {
+            pairs.check_radius()?;
+            for Node { radius_m, shares } in stribeck.nodes(&pairs.radius_m)? {
+                let weights: Vec<f64> = shares.iter().map(|share| each_n_0 * share).collect();
+                let matrix = congruence(t, &weights, t);
+                self.add_damping("falling friction", matrix, Law::FallingFriction { radius_m })?;
+            }
+        }
         self.has_contact = true;
         Ok(self.finished())
     }

@@ -92,13 +92,32 @@ pub enum ModelError {
         /// Largest such size accepted.
         limit: f64,
     },
-    /// A contact pair has no lever arm, which lateral damping needs.
-    #[error("contact pair {pair}: radius_m is {radius_m}, expected more than 0 for lateral damping")]
+    /// A contact pair has no lever arm, which friction that depends on the sliding speed needs.
+    #[error(
+        "contact pair {pair}: radius_m is {radius_m}, expected more than 0 for lateral damping and for friction that \
+         falls with speed"
+    )]
     Radius {
         /// Index of the pair.
         pair: usize,
         /// Its distance from the axis, m.
         radius_m: f64,
+    },
+    /// The radii of the contact pairs are too many and too different for the slope of the Stribeck law.
+    #[error(
+        "{found} contact pairs at different radii from {low_m} to {high_m} m, expected at most {limit}, or a range that \
+         as many polynomials cover: the sliding speed of a pair, and with it the slope of stribeck_drop, follows its \
+         radius"
+    )]
+    StribeckRadii {
+        /// Number of different radii.
+        found: usize,
+        /// Smallest radius, m.
+        low_m: f64,
+        /// Largest radius, m.
+        high_m: f64,
+        /// Largest number of radii.
+        limit: usize,
     },
     /// Damping of a pair that is not proportional to its stiffness.
     #[error(

@@ -453,6 +453,7 @@ mod tests {
     use super::super::operating_point::OperatingPoint;
     use super::super::solver::Solver;
     use super::super::spectrum::Vectors;
+    use super::super::stribeck::Stribeck;
     use super::super::test_models::{REFERENCE, hulten, nine_dof};
     use super::*;
     use crate::proof::synthetic::{Synthetic, rig};
@@ -526,6 +527,13 @@ mod tests {
     fn slopes_are_the_derivatives() {
         let laws = [
             (0.01, ContactLaw { exponent: 0.4, slope_s_per_m: -2e-3, lateral_damping: true, ..Default::default() }),
+            (
+                0.01,
+                ContactLaw {
+                    stribeck: Some(Stribeck { drop: 0.05, speed_m_s: 1.5, exponent: 2.0 }),
+                    ..Default::default()
+                },
+            ),
             (0.0, ContactLaw { exponent: 0.4, ..Default::default() }),
         ];
         let mut checked = 0;

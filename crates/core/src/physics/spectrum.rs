@@ -178,7 +178,7 @@ pub enum SolveError {
 
 impl Spectrum {
     /// The operating point with its contact state.
-    pub(super) fn situation(&self) -> Situation {
+    pub(crate) fn situation(&self) -> Situation {
         Situation { point: self.point, state: self.state.clone() }
     }
 

@@ -33,6 +33,7 @@ use super::model::{ContactPairs, Model};
 use super::model_error::ModelError;
 use super::operating_point::{ContactState, OperatingPoint};
 use super::spectrum::Spectrum;
+use super::stribeck::Stribeck;
 use crate::contact::{Smoothness, Statics, SteadyState};
 
 /// The contact of a model whose springs follow the state of steady sliding.
@@ -47,8 +48,10 @@ pub(super) struct SteadyContact {
     relaxation_s: Vec<f64>,
     /// `1 / r` of each pair, 1/m; empty without lateral damping.
     inverse_radius: Vec<f64>,
-    /// `dμ/dv`, s/m.
+    /// `dμ/dv` at every speed, s/m.
     slope_s_per_m: f64,
+    /// Friction that falls with the sliding speed, and the radius of each pair, m.
+    falling: Option<(Stribeck, Vec<f64>)>,
     /// `R_nn` and `R_nt`.
     residual: Option<[Mat<f64>; 2]>,
 }
@@ -62,6 +65,17 @@ pub struct Situation {
 }
 
 impl Situation {
+    /// The situation at `p` of a model with contact pairs; its springs follow the states of `statics` if there are any, and
+    /// are always closed otherwise.
+    ///
+    /// # Errors
+    /// [`ModelError::State`] if there is no state of steady sliding.
+    pub(crate) fn of_contact(p: &OperatingPoint, statics: Option<&Statics>) -> Result<Self, ModelError> {
+        let statics = statics.filter(|_| p.contact_state() != ContactState::Open);
+        let state = statics.map(|statics| statics.state(p.normal_load_n, signed_friction(p)).map(Arc::new)).transpose();
+        Ok(Self { point: *p, state: state.map_err(ModelError::State)? })
+    }
+
     /// The operating point.
     pub fn point(&self) -> &OperatingPoint {
         &self.point
@@ -92,24 +106,19 @@ impl Model {
         if statics.pairs() != count {
             return Err(ModelError::PairCount { what: "statics", found: statics.pairs(), expected: count });
         }
-        let ContactLaw { exponent, reference_n: _, slope_s_per_m, lateral_damping } = self.contact_law;
-        if exponent != 0.0 {
-            return Err(ModelError::StateLoadExponent { exponent });
-        }
+        let ContactLaw { exponent: _, reference_n: _, slope_s_per_m, stribeck, lateral_damping } = self.contact_law;
+        let relaxation_s = relaxation_s(&self.contact_law, &pairs.stiffness_n_per_m, &pairs.damping_n_s_per_m)?;
         for (what, rows) in [("normal", &pairs.normal), ("sliding", &pairs.sliding), ("lateral", &pairs.lateral)] {
             finite(&format!("contact rows `{what}`"), rows)?;
         }
-        let mut relaxation_s = vec![0.0; count];
-        for (pair, relaxation_s) in relaxation_s.iter_mut().enumerate() {
-            let (stiffness, damping) = (pairs.stiffness_n_per_m[pair], pairs.damping_n_s_per_m[pair]);
-            if damping != 0.0 {
-                *relaxation_s = damping / stiffness;
-                if !relaxation_s.is_finite() {
-                    return Err(ModelError::StateDamping { pair, stiffness, damping });
-                }
-            }
-        }
         let inverse_radius = if lateral_damping { pairs.inverse_radius()? } else { vec![] };
+        let falling = match stribeck {
+            Some(stribeck) => {
+                pairs.check_radius()?;
+                Some((stribeck, pairs.radius_m.clone()))
+            }
+            None => None,
+        };
         let residual = match residual {
             None => None,
             Some(ResidualFlexibility { inertia: Some(_), .. }) => return Err(ModelError::StateInertia),
@@ -126,8 +135,17 @@ impl Model {
             }
         };
         let [normal, sliding, lateral] = [&pairs.normal, &pairs.sliding, &pairs.lateral].map(Mat::clone);
-        let contact =
-            SteadyContact { statics, normal, sliding, lateral, relaxation_s, inverse_radius, slope_s_per_m, residual };
+        let contact = SteadyContact {
+            statics,
+            normal,
+            sliding,
+            lateral,
+            relaxation_s,
+            inverse_radius,
+            slope_s_per_m,
+            falling,
+            residual,
+        };
         self.steady = Some(Box::new(contact));
         self.has_contact = true;
         Ok(self.finished())
@@ -156,15 +174,28 @@ impl Model {
                 friction_coefficient: p.friction_coefficient,
             });
         }
-        let state = match &self.steady {
-            Some(contact) if self.contact_state(p) != ContactState::Open => {
-                let state = contact.statics.state(p.normal_load_n, signed_friction(p));
-                Some(Arc::new(state.map_err(ModelError::State)?))
-            }
-            _ => None,
-        };
-        Ok(Situation { point: *p, state })
+        Situation::of_contact(p, self.steady.as_ref().map(|contact| &*contact.statics))
     }
+}
+
+/// `c_ref / k_ref` of each pair, s: the damping coefficient of a pair is this times its tangent stiffness.
+///
+/// # Errors
+/// [`ModelError::StateLoadExponent`]; [`ModelError::StateDamping`] for a damped pair without stiffness.
+pub(crate) fn relaxation_s(
+    law: &ContactLaw,
+    stiffness_n_per_m: &[f64],
+    damping_n_s_per_m: &[f64],
+) -> Result<Vec<f64>, ModelError> {
+    if law.exponent != 0.0 {
+        return Err(ModelError::StateLoadExponent { exponent: law.exponent });
+    }
+    let of_pair = |(pair, (&stiffness, &damping)): (usize, (&f64, &f64))| {
+        let relaxation_s = if damping == 0.0 { 0.0 } else { damping / stiffness };
+        let valid = relaxation_s.is_finite();
+        valid.then_some(relaxation_s).ok_or(ModelError::StateDamping { pair, stiffness, damping })
+    };
+    stiffness_n_per_m.iter().zip(damping_n_s_per_m).enumerate().map(of_pair).collect()
 }
 
 /// `s μ` where the contact slides, else 0.
@@ -244,13 +275,13 @@ impl SteadyContact {
             ContactState::Sliding => (true, true),
         };
         closed && self.relaxation_s.iter().any(|&s| s != 0.0)
-            || sliding && self.slope_s_per_m != 0.0
+            || sliding && (self.slope_s_per_m != 0.0 || self.falling.is_some())
             || sliding && !self.inverse_radius.is_empty() && p.friction_coefficient != 0.0
     }
 
     /// Whether damping depends on the disc speed.
     pub(super) fn depends_on_speed(&self) -> bool {
-        !self.inverse_radius.is_empty()
+        !self.inverse_radius.is_empty() || self.falling.is_some()
     }
 
     /// Whether any pair has a damper.
@@ -326,6 +357,7 @@ impl SteadyContact {
                 return add(c, &dampers, response.x == 0.0);
             }
             Parameter::Speed if sliding => {
+                self.add_speed_derivative(p, &state.force_n, c);
                 return self.add_lateral_damping(-across / p.disc_speed_rad_s, &state.force_n, c);
             }
             Parameter::Friction | Parameter::Speed | Parameter::ContactDamping => return,
@@ -371,12 +403,35 @@ impl SteadyContact {
 
     /// Adds `μ'(v) B_tᵀ diag(N) B_t`, if the contact slides.
     fn add_friction_damping(&self, p: &OperatingPoint, force_n: &[f64], c: &mut Mat<f64>) {
-        let factor = self.slope_s_per_m;
-        if factor != 0.0 && p.contact_state() == ContactState::Sliding {
-            let weights: Vec<f64> = force_n.iter().map(|force| factor * force).collect();
-            let rows = by_row(&weights, self.sliding.as_ref());
-            add(c, &product(self.sliding.transpose(), rows.as_ref()), true);
+        if p.contact_state() != ContactState::Sliding {
+            return;
         }
+        let constant = self.slope_s_per_m;
+        let slopes = match &self.falling {
+            Some((stribeck, radius_m)) => {
+                let speed = p.disc_speed_rad_s.abs();
+                radius_m.iter().map(|radius| constant + stribeck.slope(speed * radius)).collect()
+            }
+            None if constant != 0.0 => vec![constant; force_n.len()],
+            None => return,
+        };
+        self.add_along(&slopes, force_n, c);
+    }
+
+    /// Adds the derivative `B_tᵀ diag(N ∂μ'(v)/∂Ω) B_t` of that damping by the disc speed, of a contact that slides.
+    fn add_speed_derivative(&self, p: &OperatingPoint, force_n: &[f64], c: &mut Mat<f64>) {
+        let Some((stribeck, radius_m)) = &self.falling else { return };
+        let (speed, sign) = (p.disc_speed_rad_s.abs(), p.disc_speed_rad_s.signum());
+        let slopes: Vec<f64> =
+            radius_m.iter().map(|radius| sign * radius * stribeck.slope_per_speed(speed * radius)).collect();
+        self.add_along(&slopes, force_n, c);
+    }
+
+    /// Adds `B_tᵀ diag(s N) B_t` for the slopes `s`.
+    fn add_along(&self, slopes: &[f64], force_n: &[f64], c: &mut Mat<f64>) {
+        let weights: Vec<f64> = slopes.iter().zip(force_n).map(|(slope, force)| slope * force).collect();
+        let rows = by_row(&weights, self.sliding.as_ref());
+        add(c, &product(self.sliding.transpose(), rows.as_ref()), true);
     }
 
     /// Adds `factor · B_bᵀ diag(N / r) B_b`.

@@ -15,6 +15,7 @@ use super::operating_point::OperatingPoint;
 use super::solver::Solver;
 use super::spectrum::{SolveError, Vectors};
 use super::stability_map::{MapOptions, StabilityMap};
+use super::stribeck::Stribeck;
 use crate::contact::{FreeModes, MeasuredLoad, PressureLaw, StaticResponse, Statics, StaticsParts, TruncatedResponse};
 use crate::proof::held_out::hold_out;
 use crate::proof::identities::compare;
@@ -98,7 +99,10 @@ impl Rig {
 }
 
 const FRICTION: ContactLaw =
-    ContactLaw { exponent: 0.0, reference_n: 500.0, slope_s_per_m: -1e-4, lateral_damping: true };
+    ContactLaw { exponent: 0.0, reference_n: 500.0, slope_s_per_m: -1e-4, stribeck: None, lateral_damping: true };
+/// Pairs are 1 km from the axis: they slide with some 10 km/s.
+const FALLING: ContactLaw =
+    ContactLaw { stribeck: Some(Stribeck { drop: 1.0, speed_m_s: 1e4, exponent: 2.0 }), ..FRICTION };
 
 fn point(normal_load_n: f64, disc_speed_rad_s: f64, friction_coefficient: f64) -> OperatingPoint {
     OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient }
@@ -185,8 +189,8 @@ fn friction_damps_with_the_forces_of_the_state() {
 #[test]
 fn matrices_follow_load_friction_and_speed() {
     let mut checked = 0;
-    for seed in 0..6 {
-        let rig = Rig::new(seed, 1e-2, FRICTION, 20.0);
+    for (seed, law) in (0..6).zip([FRICTION, FALLING].into_iter().cycle()) {
+        let rig = Rig::new(seed, 1e-2, law, 20.0);
         for flexible in [false, true] {
             let model = rig.model(&ROUGH, flexible);
             for p in
@@ -370,11 +374,15 @@ fn chart_options(high_speed: f64) -> ChartOptions {
 /// broken and no root missing. Its words give the same chart.
 #[test]
 fn charts_hold_through_the_state() {
-    for (seed, damping, law, axes) in
-        [(1, 0.0, ContactLaw::default(), 2), (4, 2e-2, ContactLaw::default(), 2), (7, 2e-2, FRICTION, 3)]
-    {
+    // Without friction that depends on the speed, the chart has no axis of the speed.
+    for (seed, damping, law, high_speed) in [
+        (1, 0.0, ContactLaw::default(), 20.0),
+        (4, 2e-2, ContactLaw::default(), 20.0),
+        (7, 2e-2, FRICTION, 12.0),
+        (7, 2e-2, FALLING, 10.5),
+    ] {
         let model = Rig::new(seed, damping, law, 20.0).model(&ROUGH, seed == 4);
-        let options = chart_options(if axes == 3 { 12.0 } else { 20.0 });
+        let options = chart_options(high_speed);
         let chart = build(&model, &options, &|_| true).expect("it can be charted");
         let found = hold_out(&model, &options, &chart, 1000, seed).expect("it solves");
         assert_eq!((found.violations, found.incomplete), (0, 0), "{found:?}");

@@ -332,7 +332,7 @@ fn friction() -> Result<String, String> {
 
 /// Everything that depends on load and speed.
 fn slipping() -> ContactLaw {
-    ContactLaw { exponent: 1.0 / 3.0, reference_n: 500.0, slope_s_per_m: -0.02, lateral_damping: true }
+    ContactLaw { exponent: 1.0 / 3.0, reference_n: 500.0, slope_s_per_m: -0.02, lateral_damping: true, stribeck: None }
 }
 
 fn vanishing_load() -> Result<String, String> {

@@ -251,11 +251,12 @@ pub fn full_windows(
         roots = roots.max(found.roots.len());
         Ok(found)
     };
-    let mut next: Vec<f64> = [0.0, 0.5, 1.0].iter().map(|share| share * options.mu_max).collect();
+    let last = model.last_friction(p, options.mu_max);
+    let mut next: Vec<f64> = [0.0, 0.5, 1.0].iter().map(|share| share * last).collect();
     let (mut sampled, mut ends): (Vec<f64>, Vec<f64>) = (vec![], vec![]);
     let (mut moved, mut error) = (f64::INFINITY, f64::INFINITY);
     // 1/4, 3/4, 1/8, ...
-    let mut checks = (2..).map(|index| options.mu_max * radical_inverse(index, 2));
+    let mut checks = (2..).map(|index| last * radical_inverse(index, 2));
     let (rounds, limit) = (MOST_ROUNDS, CHECKED);
     #[cfg(test)]
     let (rounds, limit) = tests::spoilt(rounds, limit);

@@ -4,6 +4,7 @@ use faer::{Mat, MatRef, c64};
 
 use super::ReductionError;
 use super::full_root::{CoveredDisc, FullRoot, FullSpectrum};
+use crate::physics::Situation;
 
 /// Largest distance, relative to `|λ|`, of two computed values of the same root: ten times the square root of the
 /// residual limit of an eigenpair, because merging roots are only that accurate.
@@ -62,7 +63,7 @@ pub(super) fn agree(what: &str, found: &[Found]) -> Result<(), ReductionError> {
 
 /// Joins the discs into one spectrum. Neighbouring discs are separated at a frequency, and every root is taken from the
 /// disc on its side.
-pub(super) fn assemble(found: &[Found], band_rad_s: f64) -> FullSpectrum {
+pub(super) fn assemble(here: Situation, found: &[Found], band_rad_s: f64) -> FullSpectrum {
     let mut chosen: Vec<(FullRoot, usize, usize)> = vec![];
     let (mut from, mut half_width) = (0.0, f64::INFINITY);
     for (index, part) in found.iter().enumerate() {
@@ -106,6 +107,7 @@ pub(super) fn assemble(found: &[Found], band_rad_s: f64) -> FullSpectrum {
         gathered
     };
     FullSpectrum {
+        here,
         right: gather(&|found| found.right.as_ref()),
         left: gather(&|found| found.left.as_ref()),
         roots: chosen.iter().map(|(root, ..)| *root).collect(),

@@ -1,6 +1,6 @@
 //! Errors of model reduction.
 
-use crate::physics::SolveError;
+use crate::physics::{ModelError, SolveError};
 
 /// Bytes in a GiB.
 pub const GIB: f64 = (1_u64 << 30) as f64;
@@ -223,6 +223,9 @@ pub enum ReductionError {
         /// Why.
         source: Box<SolveError>,
     },
+    /// There is no state of steady sliding.
+    #[error(transparent)]
+    State(Box<ModelError>),
     /// A factorisation or a small dense problem failed.
     #[error("{what}: {reason}")]
     Factorisation {

@@ -8,11 +8,14 @@
 //! `B_n`, `B_t` and `B_b` are the rows of the contact pairs along the normal, the sliding and the lateral direction.
 //! `K_c` and `C_c` hold stiffness and damping of the pairs on their diagonals. `κ(N)` is the load dependence of the
 //! contact stiffness, `s` the sign of the disc speed, `N_0` the normal load per pair and `v` the sliding speed at the
-//! pair. Friction terms vanish without sliding, all contact terms if the contact is open.
+//! pair. Friction terms vanish without sliding, all contact terms if the contact is open. About a state of steady sliding
+//! (`full_state`) `κ K_c`, `C_c` and `N_0` are those of the state.
 //!
 //! All matrices are sparse. The parts are symmetric and not coupled to each other, terms may have any symmetry, and the
 //! rows `B` of the contact pairs couple the parts. [`FullModel::project`] projects everything on a basis, which gives
 //! an ordinary [`Model`].
+
+use std::sync::Arc;
 
 use faer::sparse::Triplet;
 use faer::{Mat, MatRef};
@@ -20,7 +23,8 @@ use faer::{Mat, MatRef};
 use super::dense::symmetric_eigen;
 use super::sparse::{SparseMatrix, entries, is_symmetric, times, times_transposed, weighted_sum, worst_asymmetry};
 use super::{ReductionError, SparseModes, project_dense, project_sparse, whiten};
-use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Term};
+use crate::contact::Statics;
+use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Situation, Term};
 
 /// A part of a full model: a substructure with its contact interface free, or a whole system.
 #[derive(Clone, Debug)]
@@ -60,6 +64,19 @@ pub struct FullContact {
     pub damping_n_s_per_m: Vec<f64>,
     /// Distance of each pair from the disc's axis, m.
     pub radius_m: Vec<f64>,
+    /// Steady sliding of pairs that open and close; `None` for pairs that are always closed.
+    pub steady: Option<FullSteady>,
+}
+
+/// The load of a full model, and its statics of steady sliding.
+#[derive(Clone, Debug)]
+pub struct FullSteady {
+    /// `p`: generalised force of a load of 1 N, over the rows of all parts.
+    pub load: SparseRow,
+    /// Statics of the contact pairs, in their order.
+    pub statics: Arc<Statics>,
+    /// `c_ref / k_ref` of each pair, s.
+    pub(super) relaxation_s: Vec<f64>,
 }
 
 /// A full model. The rows of its parts are concatenated in order.
@@ -88,6 +105,8 @@ pub struct Projected {
     pub omega_squared: Vec<f64>,
     /// The contact pairs in the coordinates of the basis.
     pub contact: Option<ContactPairs>,
+    /// Statics of the full model if its pairs open and close: on the basis they are the same.
+    pub statics: Option<Arc<Statics>>,
     /// Terms of `K` in the coordinates of the basis, without parts and contact pairs.
     pub stiffness: Vec<Term>,
     /// Terms of `C` in the coordinates of the basis, without contact pairs.
@@ -166,7 +185,8 @@ impl FullModel {
     /// sliding: `(load, speed)`.
     pub fn depends_on_load_and_speed(&self) -> (bool, bool) {
         let of_terms = self.stiffness.iter().chain(&self.damping).map(|term| &term.law);
-        of_terms.chain(&self.contact_laws()).fold((false, false), |(load, speed), law| {
+        let by_state = self.statics().is_some();
+        of_terms.chain(&self.contact_laws()).fold((by_state, false), |(load, speed), law| {
             let (by_load, by_speed) = law.depends_on_load_and_speed(&self.contact_law);
             (load | by_load, speed | by_speed)
         })
@@ -179,13 +199,16 @@ impl FullModel {
         }
         let mut laws = vec![Law::ContactStiffness, Law::FrictionStiffness, Law::ContactDamping, Law::FrictionDamping];
         laws.extend((self.contact_law.slope_s_per_m != 0.0).then_some(Law::FrictionSlope));
+        let radius_m = self.contact.iter().flat_map(|contact| &contact.radius_m).copied().next().unwrap_or(0.0);
+        laws.extend(self.contact_law.stribeck.map(|_| Law::FallingFriction { radius_m }));
         laws.extend(self.contact_law.lateral_damping.then_some(Law::LateralFriction));
         laws
     }
 
     /// Whether `C` vanishes at every operating point.
     pub(super) fn is_undamped(&self) -> bool {
-        let rubs = self.contact_law.slope_s_per_m != 0.0 || self.contact_law.lateral_damping;
+        let ContactLaw { exponent: _, reference_n: _, slope_s_per_m, stribeck, lateral_damping } = self.contact_law;
+        let rubs = slope_s_per_m != 0.0 || stribeck.is_some() || lateral_damping;
         let dampers = |contact: &FullContact| contact.damping_n_s_per_m.iter().any(|damping| *damping != 0.0);
         let inside = !self.damping.is_empty() || !self.modal_damping.is_empty();
         !inside && !self.contact.as_ref().is_some_and(|contact| rubs || dampers(contact))
@@ -200,8 +223,14 @@ impl FullModel {
     /// fill it.
     ///
     /// # Errors
-    /// [`ReductionError::Factorisation`] if memory is insufficient.
+    /// [`ReductionError::Factorisation`] if memory is insufficient; [`ReductionError::State`].
     pub fn matrices_at(&self, p: &OperatingPoint) -> Result<[SparseMatrix; 3], ReductionError> {
+        self.matrices_in(&self.at(p)?)
+    }
+
+    /// Does the same as [`Self::matrices_at`] where the contact state is known.
+    pub(super) fn matrices_in(&self, here: &Situation) -> Result<[SparseMatrix; 3], ReductionError> {
+        let p = here.point();
         let n = self.dimension();
         let (mut mass, mut damping, mut stiffness) = (vec![], vec![], vec![]);
         for (part, offset) in self.parts.iter().zip(self.offsets()) {
@@ -215,7 +244,7 @@ impl FullModel {
                 triplets.extend(entries(&term.matrix).map(|(i, j, value)| Triplet::new(i, j, factor * value)));
             }
         }
-        let [contact_stiffness, contact_damping] = self.contact_terms(p);
+        let [contact_stiffness, contact_damping] = self.contact_terms(here);
         for (terms, triplets) in [(contact_stiffness, &mut stiffness), (contact_damping, &mut damping)] {
             for term in &terms {
                 for ((left, weight), right) in term.left.iter().zip(&term.weights).zip(term.right) {
@@ -234,9 +263,10 @@ impl FullModel {
         Ok([build(&mass)?, build(&damping)?, build(&stiffness)?])
     }
 
-    /// Low-rank contributions of the contact to `K` and `C` at `p`; terms whose weights are all 0 are omitted.
-    fn contact_terms(&self, p: &OperatingPoint) -> [Vec<ContactTerm<'_>>; 2] {
+    /// Low-rank contributions of the contact to `K` and `C`; terms whose weights are all 0 are omitted.
+    fn contact_terms(&self, here: &Situation) -> [Vec<ContactTerm<'_>>; 2] {
         let Some(contact) = &self.contact else { return [vec![], vec![]] };
+        let (p, pairs) = (here.point(), contact.pairs_in(here));
         let [kappa, damper, friction, slope, lateral] = [
             Law::ContactStiffness,
             Law::ContactDamping,
@@ -252,30 +282,43 @@ impl FullModel {
             .map(|(n, t)| n.iter().copied().chain(t.iter().map(|&(row, weight)| (row, friction * weight))).collect())
             .collect();
         let scaled = |values: &[f64], factor: f64| values.iter().map(|value| factor * value).collect::<Vec<f64>>();
-        let each = 1.0 / contact.normal.len().max(1) as f64;
-        let along = vec![each * slope * self.contact_law.slope_s_per_m; contact.normal.len()];
+        let slopes = self.slopes(contact, p);
+        let along = slopes.iter().zip(&pairs.load_share).map(|(by_speed, share)| share * slope * by_speed).collect();
         let across = if self.contact_law.lateral_damping {
-            contact.radius_m.iter().map(|radius_m| each * lateral / radius_m).collect()
+            let shares = pairs.load_share.iter().zip(&contact.radius_m);
+            shares.map(|(share, radius_m)| share * lateral / radius_m).collect()
         } else {
             vec![0.0; contact.normal.len()]
         };
         let some = |term: &ContactTerm<'_>| term.weights.iter().any(|weight| *weight != 0.0);
         let stiffness = vec![ContactTerm {
             left: pushed.clone(),
-            weights: scaled(&contact.stiffness_n_per_m, kappa),
+            weights: scaled(&pairs.stiffness_n_per_m, kappa),
             right: &contact.normal,
         }];
         let damping = vec![
-            ContactTerm { left: pushed, weights: scaled(&contact.damping_n_s_per_m, damper), right: &contact.normal },
+            ContactTerm { left: pushed, weights: scaled(&pairs.damping_n_s_per_m, damper), right: &contact.normal },
             ContactTerm { left: contact.sliding.clone(), weights: along, right: &contact.sliding },
             ContactTerm { left: contact.lateral.clone(), weights: across, right: &contact.lateral },
         ];
         [stiffness, damping].map(|terms| terms.into_iter().filter(some).collect())
     }
 
-    /// Contact contributions at `p`, pair by pair: `Σ leftᵀ (k + λ c) right`.
-    pub(super) fn low_rank(&self, p: &OperatingPoint) -> LowRank {
-        let [stiffness, damping] = self.contact_terms(p);
+    /// `dμ/dv` of each pair at `p`, s/m.
+    fn slopes(&self, contact: &FullContact, p: &OperatingPoint) -> Vec<f64> {
+        let ContactLaw { slope_s_per_m, stribeck, .. } = self.contact_law;
+        match stribeck {
+            None => vec![slope_s_per_m; contact.normal.len()],
+            Some(stribeck) => {
+                let speed = p.disc_speed_rad_s.abs();
+                contact.radius_m.iter().map(|radius| slope_s_per_m + stribeck.slope(speed * radius)).collect()
+            }
+        }
+    }
+
+    /// Contact contributions, pair by pair: `Σ leftᵀ (k + λ c) right`.
+    pub(super) fn low_rank(&self, here: &Situation) -> LowRank {
+        let [stiffness, damping] = self.contact_terms(here);
         let mut sum = LowRank::default();
         for term in &stiffness {
             sum.left.extend(term.left.iter().cloned());
@@ -338,7 +381,7 @@ impl FullModel {
             damping.extend(of_modes.map(|matrix| Term { matrix, law: Law::Constant }));
         }
         let contact = self.contact.as_ref().map(|contact| contact.on(basis.as_ref()));
-        Ok(Projected { basis, omega_squared, contact, stiffness, damping })
+        Ok(Projected { basis, omega_squared, contact, statics: self.statics().cloned(), stiffness, damping })
     }
 
     /// Adds the terms of part `part`, which turns with the disc speed `Ω`: `2 Ω H` to `C` and `Ω² (K_σ - L)` to `K`.
@@ -418,10 +461,10 @@ impl FullModel {
     }
 
     /// `C(p) X`, or `C(p)ᵀ X` if `transposed`, without assembling `C`.
-    pub(super) fn damping_times(&self, p: &OperatingPoint, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
+    pub(super) fn damping_times(&self, here: &Situation, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
         let mut product = self.modal_damping_times(x);
-        let [_, contact] = self.contact_terms(p);
-        self.add_terms(&self.damping, &contact, p, x, transposed, &mut product);
+        let [_, contact] = self.contact_terms(here);
+        self.add_terms(&self.damping, &contact, here.point(), x, transposed, &mut product);
         product
     }
 
@@ -479,10 +522,10 @@ impl FullModel {
     }
 
     /// `K(p) X`, or `K(p)ᵀ X` if `transposed`, without assembling `K`.
-    pub(super) fn stiffness_times(&self, p: &OperatingPoint, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
+    pub(super) fn stiffness_times(&self, here: &Situation, x: MatRef<'_, f64>, transposed: bool) -> Mat<f64> {
         let mut product = self.parts_times(|part| &part.stiffness, x);
-        let [contact, _] = self.contact_terms(p);
-        self.add_terms(&self.stiffness, &contact, p, x, transposed, &mut product);
+        let [contact, _] = self.contact_terms(here);
+        self.add_terms(&self.stiffness, &contact, here.point(), x, transposed, &mut product);
         product
     }
 
@@ -596,6 +639,7 @@ impl Projected {
             basis: &self.basis * &turn,
             omega_squared,
             contact,
+            statics: self.statics.clone(),
             stiffness: terms(&self.stiffness),
             damping: terms(&self.damping),
         })
@@ -604,16 +648,17 @@ impl Projected {
     /// The reduced equation of motion in the coordinates of the basis, with `contact_law`.
     ///
     /// # Errors
-    /// Those of [`Model::new`] and [`Model::with_contact`].
+    /// Those of [`Model::new`], [`Model::with_contact`] and [`Model::with_steady_contact`].
     pub fn model(&self, contact_law: ContactLaw) -> Result<Model, ModelError> {
         let k = self.omega_squared.len();
         let mut stiffness = self.stiffness.clone();
         let free = Mat::from_fn(k, k, |i, j| if i == j { self.omega_squared[i] } else { 0.0 });
         stiffness.insert(0, Term { matrix: free, law: Law::Constant });
         let model = Model::new(k, stiffness, self.damping.clone(), contact_law, None)?;
-        match &self.contact {
-            Some(pairs) => model.with_contact(pairs),
-            None => Ok(model),
+        match (&self.contact, &self.statics) {
+            (Some(pairs), Some(statics)) => model.with_steady_contact(pairs, statics.clone(), None),
+            (Some(pairs), None) => model.with_contact(pairs),
+            (None, _) => Ok(model),
         }
     }
 }
@@ -621,7 +666,7 @@ impl Projected {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::physics::{Solver, Vectors};
+    use crate::physics::{Solver, Stribeck, Vectors};
 
     fn sparse(n: usize, triplets: &[(usize, usize, f64)]) -> SparseMatrix {
         let triplets: Vec<_> = triplets.iter().map(|&(i, j, value)| Triplet::new(i, j, value)).collect();
@@ -658,8 +703,15 @@ mod tests {
                 stiffness_n_per_m: vec![2e5, 3e5],
                 damping_n_s_per_m: vec![4.0, 5.0],
                 radius_m: vec![0.1, 0.2],
+                steady: None,
             }),
-            contact_law: ContactLaw { exponent: 0.5, reference_n: 400.0, slope_s_per_m: -0.02, lateral_damping: true },
+            contact_law: ContactLaw {
+                exponent: 0.5,
+                reference_n: 400.0,
+                slope_s_per_m: -0.02,
+                stribeck: Some(Stribeck { drop: 0.1, speed_m_s: 1.5, exponent: 2.0 }),
+                lateral_damping: true,
+            },
         }
     }
 

@@ -228,7 +228,7 @@ impl<'a> FullSolver<'a> {
     /// [`FullSpectrum::covered_growth_per_s`]. Small models are solved densely and yield all roots of the band.
     ///
     /// # Errors
-    /// [`ReductionError`]: `Factorisation`, `NotConverged`, `NotCovered`, `MissedRoot`, `Residual`.
+    /// [`ReductionError`]: `Factorisation`, `NotConverged`, `NotCovered`, `MissedRoot`, `Residual`, `State`.
     pub fn roots(
         &mut self,
         p: &OperatingPoint,
@@ -239,7 +239,8 @@ impl<'a> FullSolver<'a> {
         if self.model.dimension() < DENSE_BELOW {
             return self.dense(p, band_rad_s, vectors);
         }
-        let mut problem = Problem::new(&self.what, self.model, p, vectors, self.parts.is_some(), GROWTH * band_rad_s)?;
+        let (here, by_parts) = (self.model.at(p)?, self.parts.is_some());
+        let mut problem = Problem::new(&self.what, self.model, here.clone(), vectors, by_parts, GROWTH * band_rad_s)?;
         let mut found: Vec<Found> = vec![];
         while let Some(gap) = first_gap(&found, band_rad_s) {
             #[cfg(not(test))]
@@ -267,7 +268,7 @@ impl<'a> FullSolver<'a> {
             tests::lose_a_root(&mut found);
         }
         agree(&self.what, &found)?;
-        Ok(assemble(&found, band_rad_s))
+        Ok(assemble(here, &found, band_rad_s))
     }
 
     /// Index in `kept` of the factors at the shift: `ω` itself or, if solves there are inaccurate because a root is too
@@ -302,6 +303,7 @@ impl<'a> FullSolver<'a> {
     fn dense(&self, p: &OperatingPoint, band_rad_s: f64, vectors: FullVectors) -> Result<FullSpectrum, ReductionError> {
         let n = self.model.dimension();
         let failed = |reason: String| ReductionError::Factorisation { what: self.what.clone(), reason };
+        let here = self.model.at(p)?;
         let projected = self.model.project(Mat::<f64>::identity(n, n).as_ref())?;
         let model = projected.model(self.model.contact_law).map_err(|error| failed(error.to_string()))?;
         let which = if vectors == FullVectors::Both { Vectors::Both } else { Vectors::Right };
@@ -320,6 +322,7 @@ impl<'a> FullSolver<'a> {
             unit(&basis * shapes)
         };
         Ok(FullSpectrum {
+            here,
             roots: chosen
                 .iter()
                 .map(|&(lambda, k)| FullRoot { lambda, residual: spectrum.roots[k].residual })
@@ -337,7 +340,7 @@ pub(super) mod tests {
     use super::super::SparseMatrix;
     use super::super::full_model::{FullContact, FullPart, SparseTerm};
     use super::*;
-    use crate::physics::{ContactLaw, Law};
+    use crate::physics::{ContactLaw, Law, Stribeck};
     use faer::sparse::Triplet;
 
     fn sparse(n: usize, triplets: &[(usize, usize, f64)]) -> SparseMatrix {
@@ -472,6 +475,7 @@ pub(super) mod tests {
             damping: vec![],
             modal_damping: vec![],
             contact: Some(FullContact {
+                steady: None,
                 normal: rows(1),
                 sliding: rows(0),
                 lateral: rows(2),
@@ -486,7 +490,13 @@ pub(super) mod tests {
     /// Roots agree with a dense solve of the same matrices, undamped and with every kind of contact damping.
     #[test]
     fn touching_parts_against_a_dense_solve() {
-        let law = ContactLaw { exponent: 0.5, reference_n: 500.0, slope_s_per_m: -0.01, lateral_damping: true };
+        let law = ContactLaw {
+            exponent: 0.5,
+            reference_n: 500.0,
+            slope_s_per_m: -0.01,
+            stribeck: Some(Stribeck { drop: 0.02, speed_m_s: 1.5, exponent: 2.0 }),
+            lateral_damping: true,
+        };
         for (damping, law) in [(0.0, ContactLaw::default()), (3.0, law)] {
             let model = touching(60, damping, law);
             let n = model.dimension();

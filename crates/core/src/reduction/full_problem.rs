@@ -14,7 +14,7 @@ use super::krylov::{Number, random};
 use super::krylov_schur::{Iteration, Largest};
 use super::sparse::{entries, one_norm, times, times_transposed};
 use super::{ReductionError, SparseMatrix};
-use crate::physics::OperatingPoint;
+use crate::physics::Situation;
 
 /// Largest residual of an eigenpair of the inverse, relative to its `θ`.
 const KRYLOV_LIMIT: f64 = 1e-12;
@@ -37,7 +37,7 @@ const ZERO: c64 = c64::new(0.0, 0.0);
 pub(super) struct Problem<'a> {
     pub what: &'a str,
     model: &'a FullModel,
-    p: OperatingPoint,
+    here: Situation,
     vectors: FullVectors,
     pub undamped: bool,
     low_rank: LowRank,
@@ -53,13 +53,13 @@ impl<'a> Problem<'a> {
     pub fn new(
         what: &'a str,
         model: &'a FullModel,
-        p: &OperatingPoint,
+        here: Situation,
         vectors: FullVectors,
         by_parts: bool,
         growth_per_s: f64,
     ) -> Result<Self, ReductionError> {
         if by_parts {
-            let low_rank = model.low_rank(p);
+            let low_rank = model.low_rank(&here);
             let largest = |matrix: &dyn Fn(usize) -> f64| (0..model.parts.len()).map(matrix).fold(0.0, f64::max);
             // 1-norm of one contact pair: `|leftᵀ k right|₁ ≤ |k| |left|₁ |right|∞`. The largest pair represents the
             // sum, because pairs share few columns.
@@ -77,9 +77,9 @@ impl<'a> Problem<'a> {
                 largest(&|part| one_norm(&model.parts[part].stiffness)) + pairs(&low_rank.stiffness),
             ];
             let undamped = low_rank.damping.iter().all(|value| *value == 0.0);
-            return Ok(Self { what, model, p: *p, vectors, undamped, low_rank, matrices: None, norms, growth_per_s });
+            return Ok(Self { what, model, here, vectors, undamped, low_rank, matrices: None, norms, growth_per_s });
         }
-        let matrices = model.matrices_at(p)?;
+        let matrices = model.matrices_in(&here)?;
         // Upper bound of the 1-norm of `W diag(r) Wᵀ`: the largest sum over its columns.
         let (modes, rates) = model.modal_factors();
         let sizes: Vec<f64> = modes.col_iter().zip(&rates).map(|(column, rate)| rate * column.norm_l1()).collect();
@@ -90,7 +90,7 @@ impl<'a> Problem<'a> {
         Ok(Self {
             what,
             model,
-            p: *p,
+            here,
             vectors,
             undamped: false,
             low_rank,
@@ -118,8 +118,8 @@ impl<'a> Problem<'a> {
             (Some(matrices), _) if transposed => times_transposed(&matrices[which], parts.as_ref()),
             (Some(matrices), _) => times(&matrices[which], parts.as_ref()),
             (None, 0) => self.model.mass_times(parts.as_ref()),
-            (None, 1) => self.model.damping_times(&self.p, parts.as_ref(), transposed),
-            (None, _) => self.model.stiffness_times(&self.p, parts.as_ref(), transposed),
+            (None, 1) => self.model.damping_times(&self.here, parts.as_ref(), transposed),
+            (None, _) => self.model.stiffness_times(&self.here, parts.as_ref(), transposed),
         };
         let mut sum = Mat::<c64>::zeros(x.nrows(), k);
         for (which, factor) in [a, b, c].into_iter().enumerate().filter(|(_, factor)| *factor != ZERO) {

@@ -2,6 +2,8 @@
 
 use faer::{Mat, c64};
 
+use crate::physics::Situation;
+
 /// Half the stretch of the imaginary axis that a disc counts as covering, relative to its radius. At the ends of that
 /// stretch the half width of the disc is 0.31 of its radius.
 const CHORD: f64 = 0.95;
@@ -28,6 +30,8 @@ pub struct FullRoot {
 /// The roots of a frequency band and the discs that were searched.
 #[derive(Clone, Debug)]
 pub struct FullSpectrum {
+    /// The operating point with its contact state.
+    pub here: Situation,
     /// Ascending in frequency.
     pub roots: Vec<FullRoot>,
     /// Right eigenvectors, `n×roots`, 2-norm 1; no columns unless requested.

@@ -31,6 +31,7 @@ mod full_model;
 mod full_order;
 mod full_problem;
 mod full_root;
+mod full_state;
 mod krylov;
 mod krylov_schur;
 mod lanczos;
@@ -57,7 +58,8 @@ pub use compare::{
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use error::{GIB, ReductionError};
 pub use full_model::{
-    FullContact, FullModel, FullPart, ModalDamping, PartMatrices, PartTurning, Projected, SparseRow, SparseTerm,
+    FullContact, FullModel, FullPart, FullSteady, ModalDamping, PartMatrices, PartTurning, Projected, SparseRow,
+    SparseTerm,
 };
 pub use full_order::FullSolver;
 pub use full_root::{CoveredDisc, FullProgress, FullRoot, FullSpectrum, FullVectors};

@@ -35,8 +35,13 @@ impl FullModel {
     /// all parts. `None` for a model without contact pairs.
     ///
     /// # Errors
-    /// [`ReductionError`]: those of a factorisation and, for free-floating parts, of their modes.
-    pub fn static_response(&self, load: &SparseRow) -> Result<Option<StaticResponse>, ReductionError> {
+    /// [`ReductionError`]: `Memory` if it needs more than `memory_limit_bytes` in addition to what is already held; those of
+    /// a factorisation and, for free-floating parts, of their modes.
+    pub fn static_response(
+        &self,
+        load: &SparseRow,
+        memory_limit_bytes: Option<usize>,
+    ) -> Result<Option<StaticResponse>, ReductionError> {
         let Some(contact) = &self.contact else { return Ok(None) };
         let c = contact.normal.len();
         let mut sum = StaticResponse {
@@ -52,7 +57,7 @@ impl FullModel {
                 inside.map(|&(index, weight)| (index - offset, weight)).collect()
             };
             let rows = [&contact.normal, &contact.sliding].map(|rows| rows.iter().map(within).collect::<Vec<_>>());
-            add_part(part, &rows, &within(load), &mut sum)?;
+            add_part(part, &rows, &within(load), memory_limit_bytes, &mut sum)?;
         }
         let flexibility = &mut sum.normal_flexibility;
         for j in 0..c {
@@ -70,10 +75,17 @@ fn add_part(
     part: &FullPart,
     [normal, sliding]: &[Vec<SparseRow>; 2],
     load: &SparseRow,
+    memory_limit_bytes: Option<usize>,
     sum: &mut StaticResponse,
 ) -> Result<(), ReductionError> {
     let pencil = Pencil::new(&part.name, &part.mass, &part.stiffness)?;
     let n = pencil.dimension();
+    // The factor, and for one set of loads: loads, responses, products and permuted copies, with rigid motions.
+    let columns = size_of::<f64>() * n * (5 * TOGETHER + 12);
+    let bytes = pencil.held_bytes() + pencil.factor_bytes() + pencil.factoring_bytes().max(columns);
+    if let Some(limit) = memory_limit_bytes.filter(|limit| bytes > *limit) {
+        return Err(ReductionError::Memory { what: format!("statics of {}", part.name), bytes, limit });
+    }
     let diagonal = |matrix: &SparseMatrix, k: usize| matrix.get(k, k).copied().unwrap_or(0.0);
     let largest = (0..n).map(|k| diagonal(&part.stiffness, k) / diagonal(&part.mass, k)).fold(0.0, f64::max);
     let free = pencil.count_below(RIGID * largest)?;
@@ -81,7 +93,7 @@ fn add_part(
         (0.0, Mat::zeros(n, 0))
     } else {
         let wanted = Wanted::Lowest((free + 1).min(n));
-        let found = normal_modes(&part.name, &part.mass, &part.stiffness, wanted, None, &mut |_| {})?;
+        let found = normal_modes(&part.name, &part.mass, &part.stiffness, wanted, memory_limit_bytes, &mut |_| {})?;
         // Nothing but rigid motions: any shift serves.
         let lowest = found.omega_squared.get(free).copied().unwrap_or(1.0);
         (SHIFT * lowest, found.phi.subcols(0, free).to_owned())
@@ -189,7 +201,7 @@ mod tests {
             let model = model(held);
             let contact = model.contact.as_ref().unwrap();
             let load: SparseRow = vec![(3, -0.4), (8, -0.6)];
-            let response = model.static_response(&load).unwrap().unwrap();
+            let response = model.static_response(&load, None).unwrap().unwrap();
             assert_eq!(response.rigid.load.len(), usize::from(!held));
             let law = PressureLaw::Linear { stiffness: 4e6 };
             let gap_m = vec![0.0, 1e-6, 4e-5, 2e-6];

@@ -30,6 +30,7 @@ pub fn chains(damping: f64, contact_law: ContactLaw) -> FullModel {
         damping: vec![],
         modal_damping: vec![],
         contact: Some(FullContact {
+            steady: None,
             normal: vec![row(12, 9), row(22, 18), row(33, 30)],
             sliding: vec![row(13, 11), row(20, 19), row(35, 28)],
             lateral: vec![row(5, 4), row(17, 16), row(38, 33)],

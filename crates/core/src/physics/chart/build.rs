@@ -391,6 +391,7 @@ mod tests {
     use crate::physics::law::{ContactLaw, Law};
     use crate::physics::model::Term;
     use crate::physics::spectrum::Vectors;
+    use crate::physics::stribeck::Stribeck;
     use crate::physics::test_models::nine_dof;
     use crate::proof::held_out::{HoldOut, hold_out};
     use crate::proof::synthetic::{Synthetic, Uniform, rig};
@@ -441,6 +442,22 @@ mod tests {
             let options = options((0.0, 50.0, 1.0), (1.0, 2000.0, 60.0), Some(5000.0));
             let found = held_out(&model, &options, 300);
             assert!(found.charted > 290, "{modes} modes: {found:?}");
+        }
+    }
+
+    /// Friction that falls with speed: the damping of each of 48 pairs at different radii follows the disc speed. On the
+    /// reciprocal of the speed, which is the coordinate of a chart, the slope is a function with every derivative 0 at
+    /// infinite speed.
+    #[test]
+    fn falling_friction_over_speed() {
+        for (exponent, low, high) in
+            [(2.0, (0.0, 500.0, 1.0), (0.8, 501.0, 60.0)), (1.0, (0.0, 300.0, 5.0), (0.5, 600.0, 20.0))]
+        {
+            let stribeck = Some(Stribeck { drop: 0.02, speed_m_s: 0.5, exponent });
+            let contact_law = ContactLaw { stribeck, ..Default::default() };
+            let model = rig(&Synthetic { modes: 12, pairs: 48, damping_ratio: 5e-3, contact_law, seed: 1 }).unwrap();
+            let found = held_out(&model, &options(low, high, Some(5000.0)), 600);
+            assert!(found.charted > 580, "exponent {exponent}: {found:?}");
         }
     }
 

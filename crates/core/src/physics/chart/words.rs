@@ -10,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 33] = [
+pub const BUILDER: [&str; 34] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -33,6 +33,7 @@ pub const BUILDER: [&str; 33] = [
     include_str!("../solver.rs"),
     include_str!("../spectrum.rs"),
     include_str!("../steady_contact.rs"),
+    include_str!("../stribeck.rs"),
     include_str!("../traces.rs"),
     include_str!("../../contact/law.rs"),
     include_str!("../../contact/mod.rs"),

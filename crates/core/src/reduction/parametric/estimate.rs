@@ -84,7 +84,7 @@ impl Building<'_, '_> {
         roots: &[usize],
         left: bool,
     ) -> Vec<f64> {
-        let (size, p) = (projected.omega_squared.len(), &spectrum.point);
+        let (size, here) = (projected.omega_squared.len(), spectrum.situation());
         // Real and imaginary parts.
         let parts = Mat::from_fn(size, 2 * roots.len(), |i, j| {
             let value = shapes[(i, roots[j / 2])];
@@ -92,8 +92,8 @@ impl Building<'_, '_> {
         });
         let vectors = &projected.basis * &parts;
         let of_mass = self.full.mass_times(vectors.as_ref());
-        let of_damping = self.full.damping_times(p, vectors.as_ref(), left);
-        let mut residuals = self.full.stiffness_times(p, vectors.as_ref(), left);
+        let of_damping = self.full.damping_times(&here, vectors.as_ref(), left);
+        let mut residuals = self.full.stiffness_times(&here, vectors.as_ref(), left);
         for (j, &k) in roots.iter().enumerate() {
             // yᴴ Q = (Qᴴ y)ᴴ.
             let lambda = if left { spectrum.roots[k].lambda.conj() } else { spectrum.roots[k].lambda };

@@ -6,7 +6,7 @@ use super::super::full_model::FullModel;
 use super::super::sparse::{SparseMatrix, transposed};
 use super::super::{ReductionError, weighted_sum};
 use super::request::ParametricRequest;
-use crate::physics::OperatingPoint;
+use crate::physics::Situation;
 
 /// Square root of the shift `σ` of `S`, relative to the end of the band. The shift only makes `S` definite where the
 /// model has rigid-body modes.
@@ -18,20 +18,22 @@ const TOGETHER: usize = 16;
 pub struct Metric<'a> {
     full: &'a FullModel,
     /// Middle of the box, without friction.
-    pub middle: OperatingPoint,
+    pub middle: Situation,
     /// The shift, rad²/s².
     pub sigma: f64,
 }
 
 impl<'a> Metric<'a> {
-    pub fn new(full: &'a FullModel, request: &ParametricRequest) -> Self {
-        let middle = request.range.at([0.5; 3]).with_friction(0.0);
-        Self { full, middle, sigma: (SHIFT * request.counted.band_rad_s).powi(2) }
+    /// # Errors
+    /// [`ReductionError::State`] if the middle has no contact state.
+    pub fn new(full: &'a FullModel, request: &ParametricRequest) -> Result<Self, ReductionError> {
+        let middle = full.at(&request.range.at([0.5; 3]).with_friction(0.0))?;
+        Ok(Self { full, middle, sigma: (SHIFT * request.counted.band_rad_s).powi(2) })
     }
 
     /// `M` and `sym K`.
     pub fn assembled(&self) -> Result<[SparseMatrix; 2], ReductionError> {
-        let [mass, _, stiffness] = self.full.matrices_at(&self.middle)?;
+        let [mass, _, stiffness] = self.full.matrices_in(&self.middle)?;
         let symmetric = weighted_sum(self.full.dimension(), &[(0.5, &stiffness), (0.5, &transposed(&stiffness)?)])?;
         Ok([mass, symmetric])
     }

@@ -91,7 +91,7 @@ pub fn parametric_basis(
 ) -> Result<ParametricBasis, ReductionError> {
     request.range.check()?;
     let most_roots = solver.count_below(BAND_MARGIN * request.counted.band_rad_s)?;
-    let metric = Metric::new(full, request);
+    let metric = Metric::new(full, request)?;
     let assembled = if solver.has_parts() { None } else { Some(metric.assembled()?) };
     let pencil = assembled.as_ref().map(|[mass, stiffness]| Pencil::new("full model", mass, stiffness)).transpose()?;
     let mut build = Building {
@@ -191,7 +191,7 @@ mod tests {
     use crate::reduction::test_models::chains;
 
     const LAW: ContactLaw =
-        ContactLaw { exponent: 0.5, reference_n: 500.0, slope_s_per_m: -0.01, lateral_damping: true };
+        ContactLaw { exponent: 0.5, reference_n: 500.0, slope_s_per_m: -0.01, lateral_damping: true, stribeck: None };
 
     fn request(tolerance: f64) -> ParametricRequest {
         ParametricRequest {

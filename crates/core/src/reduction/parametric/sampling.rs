@@ -110,7 +110,7 @@ impl Building<'_, '_> {
             }
         }
         self.most_roots = self.most_roots.max(chosen.len());
-        let columns = self.columns(&point, &spectrum, &chosen);
+        let columns = self.columns(&spectrum, &chosen);
         drop(spectrum);
         self.extend(columns)?;
         if ratio.is_finite() {
@@ -128,7 +128,7 @@ impl Building<'_, '_> {
 
     /// Real and imaginary parts of right and left vectors, `n×(4·chosen)`. They are scaled so that a component `d`
     /// omitted from both moves the root by about `dᵀ S d` times `|λ|`.
-    fn columns(&self, p: &OperatingPoint, spectrum: &FullSpectrum, chosen: &[usize]) -> Mat<f64> {
+    fn columns(&self, spectrum: &FullSpectrum, chosen: &[usize]) -> Mat<f64> {
         let n = self.full.dimension();
         let mut columns = Mat::<f64>::zeros(n, 4 * chosen.len());
         for (k, &root) in chosen.iter().enumerate() {
@@ -139,7 +139,7 @@ impl Building<'_, '_> {
                 if j % 2 == 0 { value.re } else { value.im }
             });
             let of_mass = self.full.mass_times(of_root.as_ref());
-            let of_damping = self.full.damping_times(p, of_root.as_ref(), false);
+            let of_damping = self.full.damping_times(&spectrum.here, of_root.as_ref(), false);
             let at = |m: &Mat<f64>, i: usize, side: usize| c64::new(m[(i, 2 * side)], m[(i, 2 * side + 1)]);
             let slope: c64 = (0..n)
                 .map(|i| at(&of_root, i, 1).conj() * (lambda * 2.0 * at(&of_mass, i, 0) + at(&of_damping, i, 0)))
