@@ -148,10 +148,7 @@ impl<F: Form> ShmWriter<F> {
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|source| ShmError::Publisher { service: service.clone(), source })?;
-        let notifier = event
-            .notifier_builder()
-            .create()
-            .map_err(|source| ShmError::Notifier { service: service.clone(), source })?;
+        let notifier = new_notifier(&event, &service)?;
         Ok(Self { service, publisher, notifier, topic, _node: node })
     }
 
@@ -377,6 +374,12 @@ impl<T: FnMut(&Counters) -> bool> Reading<T> {
     fn drain(&mut self) {
         while !self.stop.load(Ordering::Acquire) && (self.take)(&self.counters) {}
     }
+}
+
+/// A notifier of the listeners of a service.
+pub(super) fn new_notifier(event: &event::PortFactory<Ipc>, service: &str) -> Result<Notifier<Ipc>, ShmError> {
+    let created = event.notifier_builder().create();
+    created.map_err(|source| ShmError::Notifier { service: service.to_owned(), source })
 }
 
 /// A listener for the events of a service.

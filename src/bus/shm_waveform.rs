@@ -14,7 +14,7 @@ use super::Bus;
 use super::received::{Counters, Counts, Received};
 use super::shm::{
     Ipc, MAX_NODES, MAX_PUBLISHERS, ReadingThread, ShmError, ShmOptions, event_in_flux, new_listener, new_node,
-    open_event, retry, topic_in_flux, wake,
+    new_notifier, open_event, retry, topic_in_flux, wake,
 };
 use crate::msgs::Waveform;
 use crate::msgs::shm::WaveformHeader;
@@ -52,10 +52,7 @@ impl ShmWaveformSource {
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
             .create()
             .map_err(|source| ShmError::Publisher { service: service.clone(), source })?;
-        let notifier = event
-            .notifier_builder()
-            .create()
-            .map_err(|source| ShmError::Notifier { service: service.clone(), source })?;
+        let notifier = new_notifier(&event, &service)?;
         Ok(Self { service, publisher, notifier, topic, _node: node })
     }
 

@@ -6,15 +6,17 @@ use clap::Args;
 use super::buses::BusOptions;
 use super::run::{Inputs, NodeOptions, serve};
 use super::simulate::{Measuring, VibrationOption, period, rate_hz};
+use super::simulated_sound::LiveSound;
 use super::{Outcome, not_negative};
 use crate::bus::ros_args::RosArgs;
-use crate::bus::{Bus, Received};
-use crate::node::{Incoming, Inlet};
+use crate::bus::{Bus, Received, Sink};
+use crate::node::{Incoming, Inlet, Watch};
 use crate::rig::{EMBEDDED, Rig};
 use crate::simulator::{Profile, Simulator};
 use crate::system::clock;
 
-/// Run the node with a simulated rig, to try it out. It takes no other inputs and is visible on this machine only
+/// Run the node with a simulated rig, to try it out: modes that are predicted to be unstable sound, and the node hears
+/// them. It takes no other inputs and is visible on this machine only
 #[derive(Debug, Args)]
 #[command(after_help = super::ROS_ARGS_HELP)]
 pub struct Options {
@@ -43,9 +45,10 @@ impl Options {
         let rig = Arc::new(Rig::load(&self.rig)?);
         let period = period(self.rate);
         let mut measuring = Measuring::new(Simulator::new(Profile::demo(), self.seed), self.vibration, period);
-        let duration = self.duration;
-        let simulate = move |node: Inlet| {
+        let (duration, seed) = (self.duration, self.seed);
+        let simulate = move |node: Inlet, watch: Watch| {
             let started = Instant::now();
+            let mut microphone = LiveSound::new(seed, clock::now_ns());
             for seq in 0u32.. {
                 let time_s = measuring.time_s(seq);
                 if duration.is_some_and(|duration| time_s >= duration) {
@@ -54,6 +57,9 @@ impl Options {
                 }
                 let due = started + Duration::from_secs_f64(time_s);
                 std::thread::sleep(due.saturating_duration_since(Instant::now()));
+                while let Some(block) = microphone.next_before(time_s, || watch.snapshot().prediction) {
+                    node.waveform(Received::now(Bus::Simulator, block));
+                }
                 let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
                 let conditions = Incoming::Input(Received::now(Bus::Simulator, conditions));
                 let vibration = vibration.map(|measured| Incoming::Vibration(Received::now(Bus::Simulator, measured)));

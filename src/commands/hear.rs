@@ -49,13 +49,13 @@ pub struct Options {
 
 /// What the samples of a file mean
 #[derive(Clone, Debug, Args)]
-struct CalibrationArgs {
+pub struct CalibrationArgs {
     /// Unit of the samples: FS (parts of full scale), V, Pa, m/s² or g [default: as the file says; of a WAV file, FS]
     #[arg(long, value_name = "UNIT")]
     unit: Option<Unit>,
-    /// Output of the sensor, such as '0.05 FS/Pa', '50 mV/Pa' or '100 mV/g'
+    /// Output of the sensor, such as '0.05 FS/Pa', '50 mV/Pa' or '100 mV/g'; once for all channels, or repeated for each
     #[arg(long, value_name = "VALUE")]
-    sensitivity: Option<Sensitivity>,
+    sensitivity: Vec<Sensitivity>,
     /// File of a sound calibrator, recorded with the same settings, instead of --sensitivity
     #[arg(long, value_name = "FILE", conflicts_with = "sensitivity")]
     calibration: Option<PathBuf>,
@@ -252,10 +252,7 @@ impl Options {
         let mut detectors = vec![];
         for &channel in &wanted {
             let index = usize::from(channel - 1);
-            let unit = self.calibration.unit.or(file.unit(index)).unwrap_or(Unit::FullScale);
-            let sensitivity = self.calibration.sensitivity(channel, unit)?;
-            let sample_rate_hz = file.sample_rate_hz(index);
-            let channel = Channel { name: channel.to_string(), sample_rate_hz, unit, sensitivity };
+            let channel = self.calibration.channel(file, index, channel.to_string()).with_context(|| path.clone())?;
             let detector = Detector::new(&channel, settings).with_context(|| path.clone())?;
             detectors.push((detector, vec![]));
         }
@@ -377,9 +374,27 @@ impl Options {
 }
 
 impl CalibrationArgs {
-    /// The sensitivity of a channel: as given, or from the recording of a calibrator.
-    fn sensitivity(&self, channel: u16, unit: Unit) -> anyhow::Result<Option<Sensitivity>> {
-        let Some(path) = &self.calibration else { return Ok(self.sensitivity) };
+    /// What the samples of channel `index` of `file`, counted from 0, mean.
+    ///
+    /// # Errors
+    /// Sensitivities for another number of channels; a calibrator that cannot be read or is not steady.
+    pub fn channel(&self, file: &SampleFile, index: usize, name: String) -> anyhow::Result<Channel> {
+        let unit = self.unit.or(file.unit(index)).unwrap_or(Unit::FullScale);
+        let channels = file.channel_count();
+        let sensitivity = match &self.sensitivity[..] {
+            [] => self.calibrated(index, unit)?,
+            [all] => Some(*all),
+            each if each.len() == channels => Some(each[index]),
+            each => {
+                bail!("--sensitivity is given {} times, expected once or for each of {channels} channels", each.len())
+            }
+        };
+        Ok(Channel { name, sample_rate_hz: file.sample_rate_hz(index), unit, sensitivity })
+    }
+
+    /// The sensitivity of a channel from the recording of a calibrator, if there is one.
+    fn calibrated(&self, channel: usize, unit: Unit) -> anyhow::Result<Option<Sensitivity>> {
+        let Some(path) = &self.calibration else { return Ok(None) };
         let file = path.display();
         if !matches!(unit, Unit::FullScale | Unit::Volt) {
             bail!("--calibration: the samples are in {unit}, which needs no calibrator");
@@ -387,8 +402,8 @@ impl CalibrationArgs {
         let mut calibrator = SampleFile::open(path)?;
         let channels = calibrator.channel_count();
         // A calibrator is recorded microphone by microphone, or on all channels.
-        let index = if channels == 1 { 0 } else { usize::from(channel) - 1 };
-        ensure!(index < channels, "{file}: has {channels} channels and no channel {channel}");
+        let index = if channels == 1 { 0 } else { channel };
+        ensure!(index < channels, "{file}: has {channels} channels and no channel {}", channel + 1);
         let length = frame_length(calibrator.sample_rate_hz(index));
         let mut spectra = Spectra::new(length);
         let mut powers = vec![];

@@ -3,10 +3,11 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::Outcome;
+use super::sound_files::SoundFileArgs;
 use crate::import::tribometer_log::{Field, LogOptions, TribometerLog};
-use crate::import::{ImportOptions, import};
+use crate::import::{ReadLog, import_with_sound, read_log};
 
-/// Convert a tribometer log to a recording
+/// Convert a tribometer log, and samples taken beside it, to a recording
 #[derive(Debug, Args)]
 pub struct Options {
     /// Delimited text with named columns, units in their names
@@ -16,6 +17,8 @@ pub struct Options {
     output: PathBuf,
     #[command(flatten)]
     log: LogArgs,
+    #[command(flatten)]
+    sound: SoundFileArgs,
     /// Replace an existing recording
     #[arg(long)]
     overwrite: bool,
@@ -66,11 +69,17 @@ impl LogArgs {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let options = ImportOptions { log: self.log.options(), overwrite: self.overwrite };
-        let imported = import(&self.session, &self.output, &options)?;
-        let outcome = describe(&imported.log);
+        let (bytes, log) = read_log(&self.session, &self.log.options())?;
+        let mut sound = self.sound.open(&self.session, log.samples.first().map_or(0, |first| first.stamp_ns), None)?;
+        let read = ReadLog { path: self.session.clone(), bytes, log };
+        let imported = import_with_sound(read, &mut sound.blocks, &self.output, self.overwrite)?;
+        let outcome = describe(&imported.log).max(sound.outcome);
         let path = imported.path.display();
-        note!("{path}: {} operating points", imported.messages);
+        let points = imported.log.samples.len() as u64;
+        note!("{path}: {points} operating points");
+        if imported.messages > points {
+            note!("{path}: {} blocks of samples", imported.messages - points);
+        }
         note!("to predict them: squealcast predict-log {path} --rig RIG -o DIR");
         Ok(outcome)
     }

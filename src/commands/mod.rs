@@ -30,9 +30,11 @@ mod reproduce;
 mod rigs;
 mod ros2_side;
 mod run;
+mod score;
 mod signals;
 mod simulate;
 mod simulated_sound;
+mod sound_files;
 mod steps;
 mod sweep;
 mod tribometer;
@@ -91,6 +93,7 @@ enum Command {
     Import(import::Options),
     PredictLog(predict_log::Options),
     Hear(hear::Options),
+    Score(score::Options),
     Recover(recover::Options),
     Rigs(rigs::Options),
     Check(check::Options),
@@ -138,6 +141,7 @@ pub fn main() -> ExitCode {
         Command::Import(options) => options.run(),
         Command::PredictLog(options) => options.run(),
         Command::Hear(options) => options.run(),
+        Command::Score(options) => options.run(),
         Command::Recover(options) => options.run(),
         Command::Predict(options) => options.run(),
         Command::Sweep(options) => options.run(),

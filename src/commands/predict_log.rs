@@ -1,26 +1,31 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, ensure};
 use clap::Args;
 
+use super::hear::DetectionArgs;
 use super::import::LogArgs;
 use super::recordings::Recordings;
+use super::sound_files::SoundFileArgs;
 use super::{Outcome, print};
 use crate::files::chart_file::ChartFile;
+use crate::import::sound_blocks::{Beside, join};
 use crate::import::{operating_point, read_log};
 use crate::msgs::schema::Topic;
 use crate::node::kept_chart;
-use crate::offline::{self, Measured, Predicted, Quantity};
+use crate::offline::{self, Measured, Predicted, Quantity, SoundFound};
 use crate::physics::Chart;
 use crate::recording::message::Payload;
-use crate::recording::reader::{Recorded, is_recording};
+use crate::recording::reader::{Recorded, Recording, is_recording};
 use crate::rig::Rig;
 use crate::session::computed::session_chart;
 use crate::session::conditions;
+use crate::sound::search::end_ns;
 
 /// Predict recorded conditions as fast as possible, from recordings with operating points and from tribometer logs. For
-/// each, a recording with predictions is written, with the rig's own settings and the original stamps
+/// each, a recording with predictions is written, with the rig's own settings and the original stamps. Sound and
+/// acceleration, recorded or in files beside the log, are searched for squeal, which is compared with the predictions
 #[derive(Debug, Args)]
 pub struct Options {
     #[command(flatten)]
@@ -37,11 +42,16 @@ pub struct Options {
     chart: bool,
     #[command(flatten)]
     log: LogArgs,
+    #[command(flatten)]
+    sound: SoundFileArgs,
+    #[command(flatten)]
+    detection: DetectionArgs,
 }
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let paths = self.recordings.paths()?;
+        self.sound.check(paths.len())?;
         let rig = Arc::new(Rig::load(&self.rig)?);
         let chart = if self.chart { Some(Arc::new(chart(&rig)?)) } else { None };
         let mut outcome = Outcome::Done;
@@ -69,6 +79,7 @@ impl Options {
             let quantity = match entry.message {
                 Recorded::Known(Payload::OperatingPoint(input)) => Quantity::Conditions(input),
                 Recorded::Known(Payload::Vibration(vibration)) => Quantity::Vibration(vibration),
+                Recorded::Known(Payload::Waveform(block)) => Quantity::Samples(block),
                 // Of the rig's messages only these are predicted or recorded again; the node's own are made anew.
                 Recorded::Known(
                     Payload::Prediction(_)
@@ -76,7 +87,6 @@ impl Options {
                     | Payload::RigInfo(_)
                     | Payload::Sensitivity(_)
                     | Payload::Diagnostics(_)
-                    | Payload::Waveform(_)
                     | Payload::Heard(_),
                 )
                 | Recorded::Unreadable(_)
@@ -84,31 +94,63 @@ impl Options {
             };
             Some(Measured { log_time_ns: entry.log_time_ns, publish_time_ns: entry.publish_time_ns, quantity })
         });
-        let predicted =
-            offline::record(rig, chart, points, measured, &self.output).with_context(|| path.display().to_string())?;
+        let (first_ns, ahead_ns) = first(&recording);
+        let with_sound = recording.topics().name_of(Topic::Waveform).is_some();
+        ensure!(
+            !(with_sound && self.sound.is_given()),
+            "{}: already holds samples, and --sound is given",
+            path.display()
+        );
+        let settings = (with_sound || self.sound.is_given()).then(|| self.detection.settings());
+        let mut sound = self.sound.open(path, first_ns, settings)?;
+        let timed = measured.map(|measured| (measured.log_time_ns as i64 - ahead_ns, measured));
+        let measured = join(timed, &mut sound.blocks).map(|beside| match beside {
+            Beside::Other(measured) => measured,
+            Beside::Samples(block) => {
+                let time_ns = u64::try_from(end_ns(&block).saturating_add(ahead_ns)).unwrap_or(0);
+                let quantity = Quantity::Samples(block);
+                Measured { log_time_ns: time_ns, publish_time_ns: time_ns, quantity }
+            }
+        });
+        let predicted = offline::record(rig, chart, points, measured, settings, &self.output);
+        let predicted = predicted.with_context(|| path.display().to_string())?;
         let found = messages.damage().iter().filter(|damage| !recording.damage().contains(damage));
         for damage in found {
             note!("damaged: {damage}");
         }
         report(path, &predicted)?;
+        sound.blocks.take_error().map_or(Ok(()), Err)?;
         let lost = recording.damage().iter().chain(messages.damage()).any(|damage| damage.damage.loses_data);
-        Ok(if lost { Outcome::Differences } else { Outcome::Done })
+        Ok(if lost { Outcome::Differences } else { sound.outcome })
     }
 
     fn log(&self, path: &Path, rig: &Arc<Rig>, chart: Option<Arc<Chart>>) -> anyhow::Result<Outcome> {
         let (_, log) = read_log(path, &self.log.options())?;
         let outcome = super::import::describe(&log);
-        let points = log.samples.iter().zip(0..).map(|(sample, seq)| conditions(&operating_point(seq, sample)));
-        let measured = log
-            .samples
-            .iter()
-            .zip(0..)
-            .map(|(sample, seq)| Measured::at_its_stamp(Quantity::Conditions(operating_point(seq, sample))));
-        let predicted =
-            offline::record(rig, chart, points, measured, &self.output).with_context(|| path.display().to_string())?;
+        let settings = self.sound.is_given().then(|| self.detection.settings());
+        let mut sound = self.sound.open(path, log.samples.first().map_or(0, |first| first.stamp_ns), settings)?;
+        let inputs = || log.samples.iter().zip(0..).map(|(sample, seq)| operating_point(seq, sample));
+        let timed = inputs().map(|input| (input.header.stamp.as_ns(), input));
+        let measured = join(timed, &mut sound.blocks).map(|beside| match beside {
+            Beside::Other(input) => Measured::at_its_stamp(Quantity::Conditions(input)),
+            Beside::Samples(block) => Measured::at_its_stamp(Quantity::Samples(block)),
+        });
+        let points = inputs().map(|input| conditions(&input));
+        let predicted = offline::record(rig, chart, points, measured, settings, &self.output);
+        let predicted = predicted.with_context(|| path.display().to_string())?;
         report(path, &predicted)?;
-        Ok(outcome)
+        sound.blocks.take_error().map_or(Ok(()), Err)?;
+        Ok(outcome.max(sound.outcome))
     }
+}
+
+/// Stamp of the first operating point of a recording, and by how much its log time is ahead of it.
+fn first(recording: &Recording) -> (i64, i64) {
+    let first = recording.messages().find_map(|entry| match entry.message {
+        Recorded::Known(Payload::OperatingPoint(input)) => Some((input.header.stamp.as_ns(), entry.log_time_ns as i64)),
+        _ => None,
+    });
+    first.map_or((0, 0), |(stamp_ns, log_ns)| (stamp_ns, log_ns.saturating_sub(stamp_ns)))
 }
 
 /// The chart of a rig, stored on disk for later runs.
@@ -123,11 +165,17 @@ fn chart(rig: &Rig) -> anyhow::Result<Chart> {
 }
 
 fn report(path: &Path, predicted: &Predicted) -> anyhow::Result<()> {
-    let Predicted { directory, inputs, levels: [ok, warn, squeal, fault], map_failure } = predicted;
+    let Predicted { directory, inputs, levels: [ok, warn, squeal, fault], map_failure, sound } = predicted;
     let path = path.display();
     note!("{path}: {inputs} operating points predicted: OK {ok}, WARN {warn}, SQUEAL {squeal}, FAULT {fault}");
     if let Some(reason) = map_failure {
         note!("{path}: no stability map for some of them: {reason}");
+    }
+    if let Some(SoundFound { channels, samples, missing_samples, squeals, refused, why_refused }) = sound {
+        note!("{path}: {samples} samples of {channels} channels, {missing_samples} missing: {squeals} squeals");
+        if let Some(why) = why_refused {
+            note!("{path}: {refused} blocks of samples not searched: {why}");
+        }
     }
     print(&format!("{}\n", directory.display()))
 }

@@ -85,8 +85,8 @@ impl Options {
 /// Source of a node's inputs.
 pub enum Inputs {
     Buses,
-    /// This process: the function hands inputs to the node, on a thread of its own.
-    Simulator(Box<dyn FnOnce(Inlet) + Send>),
+    /// This process: the function hands inputs to the node, whose state it can watch, on a thread of its own.
+    Simulator(Box<dyn FnOnce(Inlet, Watch) + Send>),
 }
 
 /// Runs a node for `rig` until it is stopped.
@@ -130,13 +130,13 @@ pub fn serve(
         options.record.as_ref().map(|directory| start_recorder(rig, directory, options.sound.options())).transpose()?;
     let outputs =
         Outputs { buses: joined, recorder: recorder.as_ref().map(Recorder::handle), node_name, ..Outputs::default() };
-    let shown = live::show(frame(rig, sources, display.as_ref(), inlet.clone()), watch, options.plain);
+    let shown = live::show(frame(rig, sources, display.as_ref(), inlet.clone()), watch.clone(), options.plain);
     if !options.no_chart {
         let kept = || ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);
         node = node.with_chart(if options.no_chart_cache { None } else { kept() });
     }
     if let Some(simulate) = simulate {
-        std::thread::spawn(move || simulate(inlet));
+        std::thread::spawn(move || simulate(inlet, watch));
     }
     let outputs = node.run(outputs);
     // The recording first: the view may be blocked by a reader that does not read.

@@ -138,7 +138,7 @@ impl Options {
                 vibration.into_iter().chain([Measured::at_its_stamp(Quantity::Conditions(conditions))])
             });
             // A simulation cannot be run twice, so no inputs are known in advance.
-            let predicted = offline::record(&rig, None, std::iter::empty(), measured, directory)?;
+            let predicted = offline::record(&rig, None, std::iter::empty(), measured, None, directory)?;
             note!("{}", predicted.directory.display());
             self.sound.write(&predicted.directory, self.seed)?;
             return Ok(Outcome::Done);

@@ -6,12 +6,16 @@ use anyhow::{Context, bail};
 use clap::Args;
 use serde::Serialize;
 
-use super::against::{for_each_prediction, unstable};
+use super::against::for_each_prediction;
 use super::{finite, write_file};
 use crate::files::whole_file::write_whole;
 use crate::import::wav;
+use crate::msgs::{Header, Prediction, Time, Waveform};
+use crate::offline::score::unstable;
 use crate::recording::reader::Recording;
+use crate::simulator;
 use crate::sound::simulated::{Drive, Planted, SimulatedSound, SoundSettings};
+use crate::sound::waveform::stamp_ns;
 
 /// Modes that are not unstable decay at least at this rate, 1/s.
 const LEAST_DECAY_PER_S: f64 = 50.0;
@@ -32,6 +36,11 @@ pub struct SoundOptions {
     snr_db: f64,
 }
 
+/// Samples in a block of live sound: 20 ms.
+const BLOCK: usize = 1024;
+/// Level of the squeals of live sound above the noise, dB.
+const LIVE_SNR_DB: f64 = 30.0;
+
 /// The JSON file with the squeals of the sound.
 #[derive(Serialize)]
 struct Truth {
@@ -51,6 +60,62 @@ struct Sounding {
     drives: Vec<Drive>,
 }
 
+/// Squeals `snr_db` above the noise.
+fn settings(seed: u64, snr_db: f64) -> SoundSettings {
+    let defaults = SoundSettings::default();
+    SoundSettings { seed, noise_db: defaults.saturated_db - snr_db, ..defaults }
+}
+
+/// The unstable modes of a prediction, which grow.
+fn drives(prediction: &Prediction) -> Vec<Drive> {
+    let growing = unstable(prediction).into_iter().map(|mode| Drive {
+        mode_id: mode.mode_id,
+        frequency_hz: mode.frequency_hz,
+        growth_rate_per_s: mode.growth_rate_per_s,
+    });
+    growing.collect()
+}
+
+/// The microphone of a rig that is simulated while the node runs.
+pub struct LiveSound {
+    sound: SimulatedSound,
+    sample_rate_hz: f64,
+    /// Stamp of the first sample.
+    start_ns: i64,
+    /// Number of samples so far.
+    count: u64,
+}
+
+impl LiveSound {
+    /// Sound whose first sample has the stamp `start_ns`.
+    pub fn new(seed: u64, start_ns: i64) -> Self {
+        let settings = settings(seed, LIVE_SNR_DB);
+        Self { sample_rate_hz: settings.sample_rate_hz, sound: SimulatedSound::new(settings), start_ns, count: 0 }
+    }
+
+    /// The next block, in which the unstable modes of the `latest` prediction grow; `None` if it is not complete before
+    /// `time_s`, the time since the first sample.
+    pub fn next_before(&mut self, time_s: f64, latest: impl FnOnce() -> Option<Prediction>) -> Option<Waveform> {
+        let end_s = (self.count + BLOCK as u64) as f64 / self.sample_rate_hz;
+        if end_s > time_s {
+            return None;
+        }
+        let mut samples = Vec::with_capacity(BLOCK);
+        let drives = latest().as_ref().map(drives).unwrap_or_default();
+        self.sound.advance(&drives, LEAST_DECAY_PER_S, BLOCK, &mut samples);
+        let stamp = Time::from_ns(stamp_ns(self.start_ns, self.count, self.sample_rate_hz));
+        self.count += BLOCK as u64;
+        Some(Waveform {
+            header: Header { stamp, frame_id: simulator::FRAME_ID.to_owned() },
+            channel: "microphone".to_owned(),
+            sample_rate_hz: self.sample_rate_hz,
+            unit: "Pa".to_owned(),
+            sensitivity: String::new(),
+            samples,
+        })
+    }
+}
+
 impl SoundOptions {
     /// Writes the sound of a recorded session.
     ///
@@ -61,12 +126,7 @@ impl SoundOptions {
         let recording = Recording::open(recording)?;
         let mut predictions: Vec<Sounding> = vec![];
         for_each_prediction(&recording, |prediction| {
-            let growing = unstable(prediction).into_iter().map(|mode| Drive {
-                mode_id: mode.mode_id,
-                frequency_hz: mode.frequency_hz,
-                growth_rate_per_s: mode.growth_rate_per_s,
-            });
-            predictions.push(Sounding { stamp_ns: prediction.header.stamp.as_ns(), drives: growing.collect() });
+            predictions.push(Sounding { stamp_ns: prediction.header.stamp.as_ns(), drives: drives(prediction) });
         });
         let (Some(first), Some(last)) = (predictions.first(), predictions.last()) else {
             bail!("--sound: the session holds no predictions");
@@ -76,8 +136,7 @@ impl SoundOptions {
         if !(0.0..=LONGEST_S).contains(&duration_s) {
             bail!("--sound: the session lasts {duration_s:.0} s, expected at most {LONGEST_S}");
         }
-        let defaults = SoundSettings::default();
-        let settings = SoundSettings { seed, noise_db: defaults.saturated_db - self.snr_db, ..defaults };
+        let settings = settings(seed, self.snr_db);
         let SoundSettings { sample_rate_hz, saturated_db, noise_db, threshold_db, .. } = settings;
         let count = (duration_s * sample_rate_hz) as u32;
         let mut sound = SimulatedSound::new(settings);
@@ -110,5 +169,40 @@ impl SoundOptions {
             .with_context(|| json.display().to_string())?;
         note!("{}: {duration_s:.1} s of sound; {}: {} squeals", path.display(), json.display(), truth.squeals.len());
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::msgs::Mode;
+    use crate::sound::{Channel, Detection, Detector, Settings, Unit};
+
+    /// A mode of 3112.7 Hz that grows by 400 1/s from 0.5 s on. From 30 to 95 dB(A) it needs 0.02 s, and it passes the
+    /// threshold of 70 dB(A) after 0.012 s.
+    #[test]
+    fn live_sound_squeals_at_the_predicted_frequency() {
+        let mode = Mode { id: 15, frequency_hz: 3112.7, growth_rate_per_s: 400.0, ..Mode::default() };
+        let unstable = Prediction { modes: vec![mode], unstable_modes: 1, ..Prediction::default() };
+        let mut microphone = LiveSound::new(1, 7);
+        let channel =
+            Channel { name: "microphone".to_owned(), sample_rate_hz: 51_200.0, unit: Unit::Pascal, sensitivity: None };
+        let mut detector = Detector::new(&channel, Settings::default()).expect("the defaults are valid");
+        let (mut blocks, mut found) = (0, vec![]);
+        for millisecond in 0..=1500 {
+            let time_s = 1e-3 * f64::from(millisecond);
+            while let Some(block) = microphone.next_before(time_s, || (time_s >= 0.5).then(|| unstable.clone())) {
+                assert!(block.header.stamp.as_ns() == 7 + 20_000_000 * blocks && block.samples.len() == BLOCK);
+                detector.push(block.header.stamp.as_ns(), &block.samples, &mut found);
+                blocks += 1;
+            }
+        }
+        detector.finish(&mut found);
+        assert_eq!(blocks, 75);
+        let squeals: Vec<_> = found.into_iter().filter_map(Detection::ended).collect();
+        let [squeal] = &squeals[..] else { panic!("{squeals:?}") };
+        assert!((squeal.frequency_hz - 3112.7).abs() < 1.0, "{squeal:?}");
+        // The block that is complete at 0.5 s is the first to sound; it begins 0.02 s before.
+        assert!((squeal.onset_ns as f64 * 1e-9 - 0.492).abs() < 0.01, "{squeal:?}");
     }
 }

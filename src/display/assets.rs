@@ -48,6 +48,7 @@ pub static ASSETS: [Asset; 22] = assets! {
     "map.js": JS,
     "modes.js": JS,
     "shape.js": JS,
+    "sound.js": JS,
     "status.js": JS,
     "timeline.js": JS,
     "vendor/three.core.min.js": JS,

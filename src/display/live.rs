@@ -9,8 +9,10 @@ use super::curves::Curves;
 use super::events::{Events, seconds};
 use super::heard::SquealsInSound;
 use super::history::History;
+use super::running_score::RunningScore;
 use super::server::{About, Source};
 use super::shape::shape;
+use super::sound_page::{SoundShown, SpectrogramPicture, picture};
 use super::state::{CountersShown, Shown, State, spread, trend_per_s};
 use crate::msgs::Heard;
 use crate::node::{Sample, VibrationSample, Watch};
@@ -41,6 +43,7 @@ struct Followed {
     history: History,
     events: Events,
     heard: Vec<Heard>,
+    score: RunningScore,
     squeals_in_sound: SquealsInSound,
     event_changes: u64,
     /// Number of the last bin in the state sent before.
@@ -57,12 +60,14 @@ impl Live {
     /// Follows the node from the first tick on; without a server nothing is collected.
     pub fn new(rig: Arc<Rig>, watch: Watch, about: About) -> Self {
         let solver = Mutex::new(Solver::new(rig.model.dimension()));
+        watch.sound().follow();
         let followed = Followed {
             samples: vec![],
             vibrations: vec![],
             history: History::new(BIN_NS, BINS),
             events: Events::default(),
             heard: vec![],
+            score: RunningScore::default(),
             squeals_in_sound: SquealsInSound::default(),
             event_changes: 0,
             sent: i64::MIN,
@@ -86,6 +91,7 @@ impl Followed {
         watch.take_samples(&mut self.samples);
         for sample in &self.samples {
             self.history.push(sample);
+            self.score.predicted(sample);
             self.event_changes += u64::from(self.events.push(sample));
         }
         watch.take_vibrations(&mut self.vibrations);
@@ -95,6 +101,7 @@ impl Followed {
         watch.take_heard(&mut self.heard);
         for heard in &self.heard {
             self.squeals_in_sound.push(heard, heard.header.stamp.as_ns());
+            self.score.heard(heard);
             self.event_changes += 1;
         }
         let now = Instant::now();
@@ -167,6 +174,15 @@ impl Source for Live {
         self.followed().squeals_in_sound.clone()
     }
 
+    fn sound(&self) -> SoundShown {
+        let view = self.watch.sound();
+        view.with(|shown| SoundShown::new(shown, &self.followed().score.meet(shown)))
+    }
+
+    fn spectrogram(&self, channel: &str) -> Option<SpectrogramPicture> {
+        self.watch.sound().with(|shown| picture(shown.get(channel)?))
+    }
+
     fn map(&self, number: u64) -> Option<Arc<str>> {
         let map = {
             let followed = self.followed();
@@ -191,6 +207,12 @@ impl Source for Live {
         let shape = shape(&self.rig, &mut solver, snapshot.map.as_deref(), &conditions(&input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
     }
+
+    fn contact(&self, _at_s: Option<f64>) -> Result<String, String> {
+        let input = self.watch.snapshot().input.ok_or("no conditions were received yet")?;
+        let contact = contact(&self.rig, &conditions(&input))?;
+        Ok(serde_json::to_string(&contact).unwrap_or_default())
+    }
 }
 
 #[cfg(test)]
@@ -207,12 +229,6 @@ mod tests {
         let inputs = Some(InputSources { places: vec!["/rig/operating_point".to_owned()], start: None });
         let about = About { simulated: true, inputs, ..About::new(&rig, "live", 70.0) };
         let live = Live::new(rig, watch.clone(), about);
-
-    fn contact(&self, _at_s: Option<f64>) -> Result<String, String> {
-        let input = self.watch.snapshot().input.ok_or("no conditions were received yet")?;
-        let contact = contact(&self.rig, &conditions(&input))?;
-        Ok(serde_json::to_string(&contact).unwrap_or_default())
-    }
         let state = || serde_json::from_str::<serde_json::Value>(&live.state(None)).expect("JSON");
         let about = serde_json::to_value(live.about()).expect("JSON");
         assert_eq!(

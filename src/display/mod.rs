@@ -5,19 +5,23 @@
 //! [`recorded`] provide the data; [`server`] serves browsers. Nothing here can affect a node: a node only updates its
 //! [`crate::node::Watch`], whether or not it is displayed. Text is only encoded while a page is connected.
 
+mod applications;
 mod assets;
 pub mod change;
 pub mod comparison;
 mod connections;
-pub mod curves;
 pub mod contact;
+pub mod curves;
 pub mod events;
 pub mod heard;
 pub mod history;
 pub mod live;
 pub mod recorded;
 pub mod report;
+mod running_score;
 pub mod server;
 pub mod shape;
+pub mod sound_page;
+mod sound_report;
 pub mod state;
 mod time_line;

@@ -11,11 +11,14 @@ use super::heard::SquealsInSound;
 use super::history::History;
 use super::server::{About, Note, Source};
 use super::shape::shape;
+use super::sound_page::{SoundShown, SpectrogramPicture, picture};
 use super::state::{Shown, State, spread, trend_per_s};
 use super::time_line::TimeLine;
-use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, SessionEventKind, level};
+use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, SessionEventKind, Waveform, level};
 use crate::node::status::{Assessment, Inputs, Status};
 use crate::node::{Sample, VibrationSample};
+use crate::offline::score::HeardAndPredicted;
+use crate::offline::verify_sound::recorded_settings;
 use crate::physics::{Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded as Content, Recording};
@@ -23,6 +26,9 @@ use crate::rig::Rig;
 use crate::session::computed::session_map;
 use crate::session::conditions;
 use crate::simulator;
+use crate::sound;
+use crate::sound::search::channel_of;
+use crate::sound::spectrogram::Spectrogram;
 
 /// Bins of the history; their length grows with the recording.
 const BINS: usize = 3000;
@@ -33,6 +39,10 @@ const FIRST_BIN_NS: i64 = 50_000_000;
 const MOST_MOMENTS: usize = 40_000;
 /// Inputs remembered until their prediction is read.
 const INPUTS: usize = 1024;
+/// Channels of sound with a spectrogram.
+pub const MOST_SPECTROGRAMS: usize = 8;
+/// Columns of a spectrogram.
+const SPECTROGRAM_COLUMNS: usize = 1200;
 /// Stability maps kept in memory.
 const MAPS: usize = 8;
 
@@ -56,6 +66,12 @@ pub struct Recorded {
     pub history: History,
     pub events: Events,
     pub squeals_in_sound: SquealsInSound,
+    /// Of each channel of sound whose samples were recorded, by name; of the first [`MOST_SPECTROGRAMS`].
+    pub spectrograms: BTreeMap<String, Spectrogram>,
+    /// Predictions and squeals in sound for comparison, by their stamps.
+    pub heard_and_predicted: HeardAndPredicted,
+    /// The definition of squeal in sound.
+    pub sound_settings: sound::Settings,
     /// The measured vibration.
     pub vibration: Measurements,
     /// The predictions kept, in order; see [`Recorded::stride`].
@@ -85,7 +101,11 @@ pub struct Recorded {
 impl Recorded {
     /// Reads `recording`, which was made with `rig`. `criteria` define squeal in a measured vibration.
     pub fn read(recording: &Recording, rig: Arc<Rig>, criteria: Criteria) -> Self {
+        let sound_settings = recorded_settings(recording);
         let mut recorded = Self {
+            spectrograms: BTreeMap::new(),
+            heard_and_predicted: HeardAndPredicted::new(sound_settings.band_hz),
+            sound_settings,
             solver: Mutex::new(Solver::new(rig.model.dimension())),
             rig,
             history: History::coarsening(FIRST_BIN_NS, BINS),
@@ -111,6 +131,9 @@ impl Recorded {
         let mut messages = recording.messages();
         for entry in messages.by_ref() {
             let log_ns = i64::try_from(entry.log_time_ns).unwrap_or(i64::MAX);
+            if let Content::Known(payload) = &entry.message {
+                recorded.heard_and_predicted.take(payload);
+            }
             match entry.message {
                 Content::Known(Payload::OperatingPoint(input)) => {
                     recorded.inputs += 1;
@@ -149,13 +172,30 @@ impl Recorded {
                     }
                     recorded.session_events.push((line.unstamped(log_ns), event));
                 }
-                Content::Known(Payload::RigInfo(_) | Payload::Sensitivity(_) | Payload::Waveform(_))
+                Content::Known(Payload::Waveform(block)) => {
+                    recorded.samples(line.of_stamp(block.header.stamp, log_ns), &block);
+                }
+                Content::Known(Payload::RigInfo(_) | Payload::Sensitivity(_))
                 | Content::Unreadable(_)
                 | Content::Other => {}
             }
         }
         recorded.damage = messages.damage().to_vec();
         recorded
+    }
+
+    /// Adds samples to the spectrogram of their channel. Of a channel that changes, those before the change are shown.
+    fn samples(&mut self, time_ns: i64, block: &Waveform) {
+        let band_hz = self.sound_settings.band_hz;
+        if !self.spectrograms.contains_key(&block.channel) && self.spectrograms.len() < MOST_SPECTROGRAMS {
+            let new = channel_of(block).ok();
+            let new = new.and_then(|channel| Spectrogram::coarsening(&channel, band_hz, SPECTROGRAM_COLUMNS).ok());
+            self.spectrograms.extend(new.map(|new| (block.channel.clone(), new)));
+        }
+        let same = |shown: &&mut Spectrogram| channel_of(block).is_ok_and(|channel| channel == *shown.channel());
+        if let Some(shown) = self.spectrograms.get_mut(&block.channel).filter(same) {
+            shown.push(time_ns, &block.samples);
+        }
     }
 
     fn take(&mut self, time_ns: i64, input: Option<&OperatingPoint>, prediction: Prediction) {
@@ -338,6 +378,14 @@ impl Source for Recorded {
         self.comparison()
     }
 
+    fn sound(&self) -> SoundShown {
+        SoundShown::new(&self.spectrograms, &self.heard_and_predicted.meet(&sound::matching::Criteria::default()))
+    }
+
+    fn spectrogram(&self, channel: &str) -> Option<SpectrogramPicture> {
+        picture(self.spectrograms.get(channel)?)
+    }
+
     fn map(&self, number: u64) -> Option<Arc<str>> {
         let map = self.stability_map(number)?;
         serde_json::to_string(&Curves::new(&map, self.rig.band_max_hz)).ok().map(Into::into)
@@ -351,6 +399,14 @@ impl Source for Recorded {
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
         let shape = shape(&self.rig, &mut solver, map.as_deref(), &conditions(input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
+    }
+
+    fn contact(&self, at_s: Option<f64>) -> Result<String, String> {
+        let time_s = at_s.or(self.span_s().map(|span| span.0)).unwrap_or(0.0);
+        let moment = self.moment(time_s).ok_or("the recording holds no prediction")?;
+        let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
+        let contact = contact(&self.rig, &conditions(input))?;
+        Ok(serde_json::to_string(&contact).unwrap_or_default())
     }
 }
 
@@ -400,14 +456,6 @@ mod tests {
             assert_eq!(state["simulated"], true, "{text}");
             let growth = state["fastest"]["growth_rate_per_s"].as_f64();
             assert_eq!(growth, (prediction.unstable_modes > 0).then_some(prediction.max_growth_rate_per_s), "{text}");
-
-    fn contact(&self, at_s: Option<f64>) -> Result<String, String> {
-        let time_s = at_s.or(self.span_s().map(|span| span.0)).unwrap_or(0.0);
-        let moment = self.moment(time_s).ok_or("the recording holds no prediction")?;
-        let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
-        let contact = contact(&self.rig, &conditions(input))?;
-        Ok(serde_json::to_string(&contact).unwrap_or_default())
-    }
             if prediction.friction_margin.is_finite() {
                 let next = &state["next"];
                 assert_eq!(next["margin"].as_f64(), Some(prediction.friction_margin), "{text}");

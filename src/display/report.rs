@@ -6,14 +6,16 @@ use super::comparison::{Comparison, Judged, Verdict};
 use super::contact::contact;
 use super::curves::Curves;
 use super::events::{Event, EventColumn, EventKind, EventMoment, Events, MomentColumn, iso, seconds};
-use super::heard::SquealsInSound;
 use super::recorded::Recorded;
+use super::sound_report;
+use crate::figures::contact as contact_figure;
 use crate::figures::html::{escaped, facts, figure, page, section};
 use crate::figures::plot;
 use crate::msgs::{SessionEvent, SessionEventKind};
 use crate::node::status::Status;
-
 use crate::session::conditions;
+use crate::sound::matching::median;
+
 /// Number of stability maps drawn.
 const WORST: usize = 3;
 /// Number of events listed; all of them are in the CSV file.
@@ -52,9 +54,7 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         ),
     );
     html += &section("Events", &events(&recorded.events, from_s));
-    if recorded.squeals_in_sound.iter().len() > 0 {
-        html += &section("Squeal in sound", &squeals_in_sound(&recorded.squeals_in_sound, from_s));
-    }
+    html += &sound_report::sections(recorded, from_s)?;
     let measured = recorded.comparison().map_or_else(
         || {
             "<p>The recording holds no measured vibration (topic /rig/vibration): nothing to compare with.</p>\n"
@@ -99,13 +99,14 @@ pub fn report(recorded: &Recorded, origin: &Origin) -> Result<String, plot::Plot
         }
         .to_owned();
     }
-    html += &contacts(recorded, from_s, to_s)?;
     html += &section("Stability maps at the worst moments", &maps);
+    html += &contacts(recorded, from_s, to_s)?;
     html += &section("Error bounds", &error_bounds(recorded));
     html += &section("Skipped work and damage", &skipped(recorded));
     html += &section("Rig", &format!("<pre>{}</pre>\n", escaped(&rig.describe())));
     Ok(page(&format!("squealcast report: {title}"), &html))
 }
+
 /// The contact at the worst moments, or at the last one if nothing squealed, for a rig with a contact state.
 ///
 /// # Errors
@@ -145,7 +146,6 @@ fn contacts(recorded: &Recorded, from_s: f64, to_s: f64) -> Result<String, plot:
     }
     Ok(section("Contact", &html))
 }
-
 
 /// One sentence that summarises the recording.
 fn verdict(recorded: &Recorded, to_s: f64) -> String {
@@ -250,38 +250,6 @@ fn events(events: &Events, from_s: f64) -> String {
     html
 }
 
-/// The squeals found in samples while the session ran, and the predictions they were compared with then.
-fn squeals_in_sound(squeals: &SquealsInSound, from_s: f64) -> String {
-    let mut html =
-        "<table><thead><tr><th>channel</th><th>no.</th><th>onset, s</th><th>end, s</th><th>frequency, Hz</th>\
-                    <th>level</th><th>growth, 1/s</th><th>prediction</th><th>mode</th><th>predicted, Hz</th>\
-                    <th>predicted growth, 1/s</th></tr></thead><tbody>\n"
-            .to_owned();
-    for squeal in squeals.iter().take(LISTED) {
-        let cells = [
-            escaped(&squeal.channel),
-            squeal.number.to_string(),
-            format!("{:.3}", squeal.onset_s - from_s),
-            squeal.end_s.map_or_else(|| "lasts".to_owned(), |end_s| format!("{:.3}", end_s - from_s)),
-            format!("{:.1}", squeal.frequency_hz),
-            format!("{:.1} {}", squeal.level_db, squeal.level_unit),
-            optional(squeal.growth_rate_per_s),
-            squeal.verdict.to_owned(),
-            squeal.mode_id.map_or_else(|| "–".to_owned(), |id| id.to_string()),
-            optional(squeal.predicted_frequency_hz),
-            optional(squeal.predicted_growth_rate_per_s),
-        ];
-        let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
-        let _ = writeln!(html, "<tr>{cells}</tr>");
-    }
-    html += "</tbody></table>\n";
-    let count = squeals.iter().len();
-    if count > LISTED {
-        let _ = writeln!(html, "<p>{} more in the recording.</p>", count - LISTED);
-    }
-    html
-}
-
 /// The cell for what an event has once; `None` if the column has no heading.
 fn event_cell(column: EventColumn, event: &Event, from_s: f64) -> Option<String> {
     column.heading()?;
@@ -323,13 +291,9 @@ fn comparison(found: &Comparison, measurements: u64, from_s: f64) -> String {
         all => format!("{part} of {all} ({:.1} %)", 100.0 * part as f64 / all as f64),
     };
     let leads = found.leads_s();
-    let lead = match leads.as_slice() {
-        [] => "–".to_owned(),
-        [first, .., last] => {
-            let median_s = 0.5 * (leads[(leads.len() - 1) / 2] + leads[leads.len() / 2]);
-            format!("{median_s:.3} s median, {first:.3} s to {last:.3} s")
-        }
-        [only] => format!("{only:.3} s"),
+    let lead = match (leads.first(), leads.last(), median(&leads)) {
+        (Some(first), Some(last), Some(median)) => format!("{median:.3} s median, {first:.3} s to {last:.3} s"),
+        _ => "–".to_owned(),
     };
     let rows = [
         ("measurements", measurements.to_string()),

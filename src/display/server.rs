@@ -30,6 +30,7 @@ use super::comparison::Comparison;
 use super::connections::{self, Bounds};
 use super::events::{Events, PageColumn, page_columns};
 use super::heard::SquealsInSound;
+use super::sound_page::{SoundShown, SpectrogramPicture};
 use crate::node::status::InputSources;
 use crate::rig::Rig;
 
@@ -52,6 +53,10 @@ pub trait Source: Send + Sync + 'static {
     fn events(&self) -> Events;
     /// The squeals found in samples.
     fn squeals_in_sound(&self) -> SquealsInSound;
+    /// Channels of sound, and the scores of the predictions against it.
+    fn sound(&self) -> SoundShown;
+    /// The spectrogram of a channel; `None` if there is none.
+    fn spectrogram(&self, channel: &str) -> Option<SpectrogramPicture>;
     /// The measured vibration compared with the predictions; `None` without measurements, or while a session is
     /// running.
     fn comparison(&self) -> Option<Comparison> {
@@ -64,16 +69,16 @@ pub trait Source: Send + Sync + 'static {
     /// # Errors
     /// Why it cannot be computed.
     fn shape(&self, id: u32, at_s: Option<f64>) -> Result<String, String>;
-}
-
-/// Constant properties of a source.
-#[derive(Clone, Debug, Serialize)]
-pub struct About {
     /// The force of every contact pair, for a rig with a contact state.
     ///
     /// # Errors
     /// Why it is not known.
     fn contact(&self, at_s: Option<f64>) -> Result<String, String>;
+}
+
+/// Constant properties of a source.
+#[derive(Clone, Debug, Serialize)]
+pub struct About {
     /// `live` or `recording`.
     pub kind: &'static str,
     pub rig: String,
@@ -85,13 +90,13 @@ pub struct About {
     pub instability_threshold: f64,
     /// Level from which on a measured vibration counts as squeal, dB.
     pub vibration_threshold_db: f64,
+    /// Whether contact pairs of the rig open and close, so that their forces are shown.
+    pub contact_state: bool,
     /// Whether the inputs are from the rig simulator.
     pub simulated: bool,
     /// Where a node expects its inputs.
     pub inputs: Option<InputSources>,
     /// First and last moment of a recording, s since the epoch.
-    /// Whether contact pairs of the rig open and close, so that their forces are shown.
-    pub contact_state: bool,
     pub span_s: Option<(f64, f64)>,
     /// When maps and charts of a recording became available.
     pub notes: Vec<Note>,
@@ -121,12 +126,12 @@ impl About {
             warn_margin: rig.warning.margin,
             instability_threshold: rig.instability_threshold,
             vibration_threshold_db,
+            contact_state: rig.model.statics().is_some(),
             simulated: false,
             inputs: None,
             span_s: None,
             notes: vec![],
             event_columns: page_columns(),
-            contact_state: rig.model.statics().is_some(),
         }
     }
 }
@@ -196,8 +201,11 @@ async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Sourc
         .route("/events.csv", get(events_csv))
         .route("/squeals-in-sound.json", get(squeals_in_sound))
         .route("/comparison.json", get(comparison))
+        .route("/sound.json", get(sound))
+        .route("/spectrogram.png", get(spectrogram))
         .route("/map.json", get(map))
         .route("/shape.json", get(shape))
+        .route("/contact.json", get(contact))
         .fallback(get(asset))
         .layer(from_fn_with_state(app.clone(), guard))
         .with_state(app.clone());
@@ -205,7 +213,6 @@ async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Sourc
         () = connections::serve(listener, router, Bounds::default()) => {}
         () = send_states(app) => {}
     }
-        .route("/contact.json", get(contact))
 }
 
 async fn send_states(app: App) {
@@ -330,6 +337,29 @@ async fn squeals_in_sound(Shared(app): Shared<App>) -> Response {
     aside(move || json(app.source.squeals_in_sound().to_json())).await
 }
 
+#[derive(Deserialize)]
+struct ChannelAsked {
+    channel: String,
+}
+
+async fn sound(Shared(app): Shared<App>) -> Response {
+    aside(move || json(serde_json::to_string(&app.source.sound()).unwrap_or_default())).await
+}
+
+async fn spectrogram(Shared(app): Shared<App>, Query(asked): Query<ChannelAsked>) -> Response {
+    aside(move || match app.source.spectrogram(&asked.channel) {
+        Some(picture) => {
+            // Numbers only, so it is a valid header.
+            let covers = serde_json::to_string(&picture.covers).unwrap_or_default();
+            let headers =
+                [(header::CONTENT_TYPE, "image/png".to_owned()), (HeaderName::from_static("x-covers"), covers)];
+            (headers, picture.png()).into_response()
+        }
+        None => (StatusCode::NOT_FOUND, "no samples of this channel").into_response(),
+    })
+    .await
+}
+
 async fn events_csv(Shared(app): Shared<App>) -> Response {
     aside(move || {
         let headers = [
@@ -352,6 +382,14 @@ async fn map(Shared(app): Shared<App>, Query(asked): Query<MapAsked>) -> Respons
 async fn shape(Shared(app): Shared<App>, Query(asked): Query<ShapeAsked>) -> Response {
     aside(move || match app.source.shape(asked.id, asked.at) {
         Ok(shape) => json(shape),
+        Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
+    })
+    .await
+}
+
+async fn contact(Shared(app): Shared<App>, Query(asked): Query<Moment>) -> Response {
+    aside(move || match app.source.contact(asked.at) {
+        Ok(contact) => json(contact),
         Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
     })
     .await
@@ -387,14 +425,6 @@ mod tests {
     use super::*;
 
     #[test]
-async fn contact(Shared(app): Shared<App>, Query(asked): Query<Moment>) -> Response {
-    aside(move || match app.source.contact(asked.at) {
-        Ok(contact) => json(contact),
-        Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
-    })
-    .await
-}
-
     fn only_its_own_addresses_are_names_of_a_display() {
         let (loopback, anywhere): (IpAddr, IpAddr) = ([127, 0, 0, 1].into(), [0, 0, 0, 0].into());
         for host in ["127.0.0.1:8765", "localhost:8765", "LOCALHOST", "[::1]:8765"] {

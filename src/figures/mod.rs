@@ -4,3 +4,5 @@ pub mod contact;
 pub mod html;
 pub mod plane;
 pub mod plot;
+pub mod png;
+pub mod spectrogram;

@@ -79,8 +79,11 @@ struct AgainstCondition<'a> {
 #[error("cannot draw the figure: {0}")]
 pub struct PlotError(String);
 
-/// Growth rates and frequencies of followed modes over the friction coefficient, in two panels, with shaded windows of
-/// instability.
+/// A range of a condition in which a mode is unstable; its end is `None` beyond the figure.
+pub type Shaded = (f64, Option<f64>);
+
+/// Growth rates and frequencies of followed modes over a condition named `x_label`, in two panels, with shaded windows
+/// of instability.
 ///
 /// # Errors
 /// [`PlotError`] if the plotting library fails.

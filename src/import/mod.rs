@@ -2,6 +2,7 @@
 
 pub mod samples;
 pub mod samples_csv;
+pub mod sound_blocks;
 pub mod tribometer_log;
 pub mod uff58;
 pub mod wav;
@@ -19,7 +20,10 @@ use crate::files::input_file;
 use crate::msgs::{Header, OperatingPoint, Time, schema::Topic};
 use crate::recording::mcap_file::{RecordingFile, WriteError};
 use crate::recording::message::Payload;
+use crate::sound::search::end_ns;
 use crate::text::hex::hex;
+use samples::SamplesError;
+use sound_blocks::{Beside, SoundBlocks, join};
 use tribometer_log::{LogError, LogOptions, Sample, TribometerLog};
 
 /// Name of the metadata record that describes the origin of the recording. Its keys: `source`, `source_sha256`,
@@ -43,6 +47,8 @@ pub enum ImportError {
     Log { path: PathBuf, source: LogError },
     #[error(transparent)]
     Write(#[from] WriteError),
+    #[error(transparent)]
+    Samples(#[from] SamplesError),
     #[error("{}: line values cannot be encoded: {reason}", .path.display())]
     Encode { path: PathBuf, reason: String },
 }
@@ -58,6 +64,14 @@ pub struct Imported {
     pub log: TribometerLog,
 }
 
+/// A log that was read.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ReadLog {
+    pub path: PathBuf,
+    pub bytes: Vec<u8>,
+    pub log: TribometerLog,
+}
+
 /// Writes the operating points (`/rig/operating_point`) of the log `input` to the recording `output`, completely or not
 /// at all.
 ///
@@ -66,16 +80,31 @@ pub struct Imported {
 /// The log cannot be read or is invalid, or the output exists or cannot be written.
 pub fn import(input: &Path, output: &Path, options: &ImportOptions) -> Result<Imported, ImportError> {
     let (bytes, log) = read_log(input, &options.log)?;
-    if output.exists() && !options.overwrite {
+    let read = ReadLog { path: input.to_owned(), bytes, log };
+    import_with_sound(read, &mut SoundBlocks::default(), output, options.overwrite)
+}
+
+/// As [`import`], of a log that was read, with blocks of samples (`/rig/waveform`) beside it.
+///
+/// # Errors
+///
+/// The output exists or cannot be written, or the samples cannot be read.
+pub fn import_with_sound(
+    read: ReadLog,
+    sound: &mut SoundBlocks,
+    output: &Path,
+    overwrite: bool,
+) -> Result<Imported, ImportError> {
+    if output.exists() && !overwrite {
         return Err(WriteError::Exists { path: output.to_owned() }.into());
     }
     let mut file = RecordingFile::create_whole(output)?;
-    if let Err(error) = write(&mut file, input, &bytes, &log) {
+    if let Err(error) = write(&mut file, &read, sound) {
         file.abandon();
         return Err(error);
     }
     let summary = file.finish()?;
-    Ok(Imported { path: output.to_owned(), messages: summary.messages(), span_ns: summary.span_ns, log })
+    Ok(Imported { path: output.to_owned(), messages: summary.messages(), span_ns: summary.span_ns, log: read.log })
 }
 
 /// Reads the log `input`; returns its bytes and the parsed log.
@@ -102,8 +131,9 @@ pub fn operating_point(seq: u64, sample: &Sample) -> OperatingPoint {
     }
 }
 
-fn write(file: &mut RecordingFile, input: &Path, bytes: &[u8], log: &TribometerLog) -> Result<(), ImportError> {
-    let source = input.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+fn write(file: &mut RecordingFile, read: &ReadLog, sound: &mut SoundBlocks) -> Result<(), ImportError> {
+    let ReadLog { path, bytes, log } = read;
+    let source = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
     let digest = hex(&Sha256::digest(bytes));
     let mut metadata = BTreeMap::from([
         ("source".to_owned(), source),
@@ -116,12 +146,25 @@ fn write(file: &mut RecordingFile, input: &Path, bytes: &[u8], log: &TribometerL
     }
     file.write_metadata(&Metadata { name: METADATA_NAME.to_owned(), metadata })?;
     let channel = file.own_channel(Topic::OperatingPoint)?;
-    for (seq, sample) in (0_u32..).zip(&log.samples) {
-        let cdr = Payload::OperatingPoint(operating_point(seq.into(), sample))
-            .to_cdr()
-            .map_err(|error| ImportError::Encode { path: input.to_owned(), reason: error.to_string() })?;
-        let stamp_ns = u64::try_from(sample.stamp_ns).unwrap_or(0);
-        file.write(channel, seq, stamp_ns, stamp_ns, &cdr)?;
+    let sound_channel = if sound.is_empty() { None } else { Some(file.own_channel(Topic::Waveform)?) };
+    let points = (0_u32..).zip(&log.samples).map(|(seq, sample)| (sample.stamp_ns, (seq, sample)));
+    let mut block_seq = 0;
+    for entry in join(points, sound) {
+        let (channel, seq, time_ns, payload) = match entry {
+            Beside::Other((seq, sample)) => {
+                let point = operating_point(seq.into(), sample);
+                (Some(channel), seq, sample.stamp_ns, Payload::OperatingPoint(point))
+            }
+            Beside::Samples(block) => {
+                block_seq += 1;
+                (sound_channel, block_seq - 1, end_ns(&block), Payload::Waveform(block))
+            }
+        };
+        let Some(channel) = channel else { continue };
+        let cdr =
+            payload.to_cdr().map_err(|error| ImportError::Encode { path: path.clone(), reason: error.to_string() })?;
+        let time_ns = u64::try_from(time_ns).unwrap_or(0);
+        file.write(channel, seq, time_ns, time_ns, &cdr)?;
     }
-    Ok(())
+    sound.take_error().map_or(Ok(()), |error| Err(error.into()))
 }

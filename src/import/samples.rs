@@ -138,6 +138,17 @@ impl SampleFile {
         }
     }
 
+    /// Files whose channels have one sample rate, together with all channels of this one in their order.
+    pub fn by_rate(self) -> Vec<Self> {
+        match self {
+            Self::Wav(_) => vec![self],
+            Self::Loaded { format, channels, omitted: _, read } => channels
+                .into_iter()
+                .map(|channel| Self::Loaded { format, channels: vec![channel], omitted: vec![], read })
+                .collect(),
+        }
+    }
+
     /// Appends the next samples of each channel, at most `most`; fewer, or none, of a channel that ends. Returns the
     /// largest number appended to a channel.
     ///

@@ -1,7 +1,7 @@
 //! Searches received samples for squeal, on a thread of its own, so that no prediction waits for it.
 //!
 //! Blocks of samples come through a bounded queue; blocks that do not fit are lost and counted, and the stamps of the next
-//! block show the gap. Each channel has a [`Detector`]. What it finds depends on the samples and their stamps alone, so it
+//! block show the gap. Each channel has a [`ChannelSearch`]. What it finds depends on the samples and their stamps alone, so it
 //! is found again in recorded samples, bit for bit. Squeals are compared with the predictions of that time
 //! ([`crate::sound::in_force`]) and handed to the node's queue to be published.
 
@@ -14,14 +14,16 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 
 use super::Incoming;
 use super::outputs::record;
+use super::sound_view::SoundView;
 use super::watch::fastest_modes;
 use crate::bus::{Bus, Received};
-use crate::msgs::{Heard, Prediction, Waveform, heard_state, level};
+use crate::msgs::{Heard, Prediction, Waveform, level};
 use crate::recording::message::Payload;
 use crate::recording::recorder::RecorderHandle;
 use crate::sound::in_force::{self, InForce};
 use crate::sound::matching::{Criteria, Unstable};
-use crate::sound::{Channel, Counts, Detection, Detector, Interruption, Settings, Squeal};
+use crate::sound::search::{ChannelSearch, channel_of};
+use crate::sound::{Channel, Counts, Interruption, Settings, Squeal};
 
 /// Capacity of the queue, in blocks: 5 s of four channels at 51.2 kHz in blocks of 1024, at most 64 MiB.
 const QUEUE: usize = 1024;
@@ -133,15 +135,15 @@ impl Prepared {
     }
 
     /// Starts the thread, which hands what it finds to `node`.
-    pub fn start(self, node: Sender<Incoming>, recorder: Option<RecorderHandle>) -> Running {
+    pub fn start(self, node: Sender<Incoming>, recorder: Option<RecorderHandle>, view: Arc<SoundView>) -> Running {
         let Self { blocks, inlet, options } = self;
         let mut search = Search {
             options,
             recorder: recorder.filter(|_| options.record_samples),
             criteria: Criteria::default(),
+            view,
             channels: BTreeMap::new(),
             shared: inlet.shared.clone(),
-            found: vec![],
             send: Box::new(move |heard| node.try_send(Incoming::Heard(Box::new(heard))).is_ok()),
         };
         let thread = std::thread::Builder::new().name("sound".to_owned()).spawn(move || search.run(&blocks));
@@ -211,41 +213,11 @@ pub fn in_force(prediction: &Prediction) -> InForce {
     InForce { stamp_ns: prediction.header.stamp.as_ns(), input_seq: prediction.input_seq, modes }
 }
 
-/// The channel that a block describes.
-///
-/// # Errors
-/// Why its unit or sensitivity is invalid.
-pub fn channel_of(block: &Waveform) -> Result<Channel, String> {
-    let Waveform { channel, sample_rate_hz, unit, sensitivity, .. } = block;
-    let failed = |error: String| format!("channel `{channel}`: {error}");
-    let sensitivity = if sensitivity.is_empty() {
-        None
-    } else {
-        Some(sensitivity.parse().map_err(|error: crate::sound::waveform::SensitivityError| failed(error.to_string()))?)
-    };
-    let unit = unit.parse().map_err(|error: crate::sound::waveform::UnitError| failed(error.to_string()))?;
-    Ok(Channel { name: channel.clone(), sample_rate_hz: *sample_rate_hz, unit, sensitivity })
-}
-
-/// A squeal that lasts, and the prediction it is compared with.
-struct Lasting {
-    began: Squeal,
-    chosen: Option<InForce>,
-    /// Whether all predictions within the time tolerance have been considered.
-    decided: bool,
-}
-
+/// A channel that is searched, and where its blocks come from.
 struct SearchedChannel {
-    channel: Channel,
-    detector: Detector,
-    /// Squeals of earlier detectors of this channel, and of all.
-    earlier: u64,
-    squeals: u64,
-    lasting: BTreeMap<u64, Lasting>,
+    search: ChannelSearch,
     bus: Bus,
     received_ns: u64,
-    /// Counts of earlier detectors.
-    counts_before: ChannelReport,
 }
 
 /// State of the thread.
@@ -254,9 +226,10 @@ struct Search {
     /// Records the samples, if that was asked for.
     recorder: Option<RecorderHandle>,
     criteria: Criteria,
+    /// What displays see of the samples.
+    view: Arc<SoundView>,
     channels: BTreeMap<String, SearchedChannel>,
     shared: Arc<Shared>,
-    found: Vec<Detection>,
     /// Hands a squeal to the node; returns whether it was accepted.
     send: Box<dyn FnMut(Heard) -> bool + Send>,
 }
@@ -278,15 +251,7 @@ impl Search {
                 }
             }
         }
-        let names: Vec<String> = self.channels.keys().cloned().collect();
-        names.iter().flat_map(|name| self.finish(name)).collect()
-    }
-
-    /// Ends the squeals of a channel that last.
-    fn finish(&mut self, name: &str) -> Vec<Heard> {
-        let Some(searched) = self.channels.get_mut(name) else { return vec![] };
-        searched.detector.finish(&mut self.found);
-        self.found.drain(..).map(|detection| searched.heard(detection, &self.shared, &self.criteria)).collect()
+        self.channels.values_mut().flat_map(|searched| searched.search.finish(choose(&self.shared))).collect()
     }
 
     /// Searches a block.
@@ -307,18 +272,14 @@ impl Search {
             (searched.bus, searched.received_ns) = (bus, at.monotonic_ns);
         }
         let channel = channel_of(&message)?;
-        if self.channels.get(&message.channel).is_none_or(|searched| searched.channel != channel) {
+        if self.channels.get(&message.channel).is_none_or(|searched| *searched.search.channel() != channel) {
             self.begin(channel, bus, at.monotonic_ns)?;
         }
         let Some(searched) = self.channels.get_mut(&message.channel) else { return Ok(()) };
-        let stamp_ns = message.header.stamp.as_ns();
-        searched.detector.push(stamp_ns, &message.samples, &mut self.found);
-        let interruptions = searched.detector.take_interruptions();
-        let found: Vec<Heard> =
-            self.found.drain(..).map(|detection| searched.heard(detection, &self.shared, &self.criteria)).collect();
-        let until_ns =
-            crate::sound::waveform::stamp_ns(stamp_ns, message.samples.len() as u64, searched.channel.sample_rate_hz);
-        searched.decide(until_ns, &self.shared, &self.criteria);
+        let found = searched.search.push(message.header.stamp.as_ns(), &message.samples, choose(&self.shared));
+        let interruptions = searched.search.take_interruptions();
+        let band_hz = self.options.settings.band_hz;
+        self.view.push(searched.search.channel(), band_hz, message.header.stamp.as_ns(), &message.samples);
         let state = searched.report();
         if let Some(recorder) = &self.recorder {
             if recorder.queued() < MOST_WAITING_FOR_RECORDER {
@@ -337,23 +298,18 @@ impl Search {
         if self.channels.len() >= MOST_CHANNELS && !self.channels.contains_key(&channel.name) {
             return Err(format!("channel `{}`: there are {MOST_CHANNELS} channels already", channel.name));
         }
-        let detector = Detector::new(&channel, self.options.settings).map_err(|error| error.to_string())?;
-        let ended = self.finish(&channel.name);
-        self.publish(ended);
-        let before = self.channels.remove(&channel.name);
-        let counts_before = before.as_ref().map(SearchedChannel::report).unwrap_or_default();
-        let earlier = before.map_or(0, |before| before.squeals);
-        let searched = SearchedChannel {
-            detector,
-            earlier,
-            squeals: earlier,
-            lasting: BTreeMap::new(),
-            bus,
-            received_ns,
-            counts_before,
-            channel: channel.clone(),
-        };
-        self.channels.insert(channel.name, searched);
+        match self.channels.get_mut(&channel.name) {
+            Some(known) => {
+                let ended = known.search.change(channel, choose(&self.shared)).map_err(|error| error.to_string())?;
+                self.publish(ended);
+            }
+            None => {
+                let name = channel.name.clone();
+                let search = ChannelSearch::new(channel, self.options.settings, self.criteria);
+                let search = search.map_err(|error| error.to_string())?;
+                self.channels.insert(name, SearchedChannel { search, bus, received_ns });
+            }
+        }
         Ok(())
     }
 
@@ -380,53 +336,18 @@ impl Search {
     }
 }
 
+/// The prediction among those kept that a squeal is compared with.
+fn choose(shared: &Shared) -> impl Fn(&Squeal, &Criteria) -> Option<InForce> + '_ {
+    |squeal, criteria| {
+        let predictions = shared.predictions.lock().unwrap_or_else(PoisonError::into_inner);
+        in_force::choose(squeal, predictions.iter(), criteria)
+    }
+}
+
 impl SearchedChannel {
-    /// The message about a finding.
-    fn heard(&mut self, detection: Detection, shared: &Shared, criteria: &Criteria) -> Heard {
-        let choose = |squeal: &Squeal| {
-            let predictions = shared.predictions.lock().unwrap_or_else(PoisonError::into_inner);
-            in_force::choose(squeal, predictions.iter(), criteria)
-        };
-        let (squeal, state, chosen) = match detection {
-            Detection::Began(squeal) => {
-                let chosen = choose(&squeal);
-                self.lasting.insert(squeal.number, Lasting { began: squeal, chosen, decided: false });
-                self.squeals = self.earlier + squeal.number;
-                (squeal, heard_state::BEGAN, chosen)
-            }
-            Detection::Ended(squeal) => {
-                let decided = self.lasting.remove(&squeal.number).filter(|lasting| lasting.decided);
-                (squeal, heard_state::ENDED, decided.map_or_else(|| choose(&squeal), |lasting| lasting.chosen))
-            }
-        };
-        let quantity = self.detector.quantity();
-        in_force::message(&self.channel.name, quantity, self.earlier, &squeal, state, chosen.as_ref(), criteria)
-    }
-
-    /// Chooses the predictions of lasting squeals once more, when all within the time tolerance have been made: samples
-    /// up to `until_ns` have been received.
-    fn decide(&mut self, until_ns: i64, shared: &Shared, criteria: &Criteria) {
-        let tolerance_ns = (criteria.time_tolerance_s * 1e9) as i64;
-        for lasting in self.lasting.values_mut().filter(|lasting| !lasting.decided) {
-            if until_ns > lasting.began.onset_ns.saturating_add(tolerance_ns) {
-                let predictions = shared.predictions.lock().unwrap_or_else(PoisonError::into_inner);
-                lasting.chosen = in_force::choose(&lasting.began, predictions.iter(), criteria);
-                lasting.decided = true;
-            }
-        }
-    }
-
     fn report(&self) -> ChannelReport {
-        let Counts { samples, missing, repeated, not_finite, .. } = self.detector.counts();
-        let before = &self.counts_before;
-        ChannelReport {
-            name: self.channel.name.clone(),
-            sample_rate_hz: self.channel.sample_rate_hz,
-            samples: before.samples + samples,
-            missing: before.missing.saturating_add(*missing),
-            repeated: before.repeated + repeated,
-            not_finite: before.not_finite + not_finite,
-            squeals: self.squeals,
-        }
+        let Counts { samples, missing, repeated, not_finite, .. } = self.search.counts();
+        let Channel { name, sample_rate_hz, .. } = self.search.channel().clone();
+        ChannelReport { name, sample_rate_hz, samples, missing, repeated, not_finite, squeals: self.search.squeals() }
     }
 }

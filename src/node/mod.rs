@@ -17,6 +17,7 @@ mod outputs;
 #[cfg(test)]
 mod recorded_tests;
 mod sensitivity;
+pub mod sound_view;
 mod statistics;
 pub mod status;
 mod watch;
@@ -28,7 +29,7 @@ use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
 
-pub use detection::{SoundOptions, channel_of, in_force};
+pub use detection::{SoundOptions, in_force};
 pub use inlet::Inlet;
 pub use mapper::{kept_chart, yield_to_predictions};
 pub use outputs::{NodeName, Outputs};
@@ -181,7 +182,7 @@ impl Node {
     /// Runs until [`Incoming::Stop`], then returns the outputs.
     pub fn run(self, outputs: Outputs) -> Outputs {
         let Self { mut worker, sender, queue, running, detection } = self;
-        let detection = detection.start(sender, outputs.recorder.clone());
+        let detection = detection.start(sender, outputs.recorder.clone(), worker.watch.sound());
         worker.outputs = outputs;
         worker.begin();
         let mut next = Next::Wait(worker.deadline());

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::sound_view::SoundView;
 use super::status::{Assessment, Inputs, Status};
 use crate::msgs::{Heard, OperatingPoint, Prediction, Vibration, heard_state, level};
 use crate::physics::{Ends, NextWindow, StabilityMap};
@@ -168,6 +169,7 @@ struct Watched {
     /// The squeals found in samples, for the same follower.
     heard: Vec<Heard>,
     lost: u64,
+    sound: Arc<SoundView>,
 }
 
 impl Watch {
@@ -197,6 +199,11 @@ impl Watch {
     pub fn take_heard(&self, heard: &mut Vec<Heard>) {
         heard.clear();
         self.with(|watched| std::mem::swap(&mut watched.heard, heard));
+    }
+
+    /// Spectrograms of the received samples.
+    pub fn sound(&self) -> Arc<SoundView> {
+        self.with(|watched| watched.sound.clone())
     }
 
     fn with<T>(&self, action: impl FnOnce(&mut Watched) -> T) -> T {

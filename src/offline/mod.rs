@@ -4,6 +4,8 @@
 //! input that needs it.
 
 mod ahead;
+pub mod score;
+mod sound_search;
 pub mod verify;
 pub mod verify_sound;
 
@@ -11,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::msgs::{Header, OperatingPoint, Time, Vibration};
+use crate::msgs::{Header, Heard, OperatingPoint, Time, Vibration, Waveform};
 use crate::node::rig_info;
 use crate::physics::{self, Chart, Solver};
 use crate::recording::message::{Message, Payload};
@@ -20,7 +22,12 @@ use crate::rig::Rig;
 use crate::session::computed::{Request, compute, parameter_record, record_of};
 use crate::session::{Event, Session};
 use crate::session::{conditions, settings::Settings};
+use crate::sound;
+use crate::sound::search::end_ns;
 use ahead::Ahead;
+pub use sound_search::SoundFound;
+use sound_search::SoundSearch;
+use verify_sound::settings_metadata;
 
 /// Stamp of the first input of a simulated offline session, ns since the epoch: 2024-01-01T00:00:00Z. Fixed, so that
 /// equal commands give equal messages.
@@ -51,14 +58,17 @@ pub struct Measured {
 pub enum Quantity {
     Conditions(OperatingPoint),
     Vibration(Vibration),
+    /// Consecutive samples of a channel of sound or acceleration.
+    Samples(Waveform),
 }
 
 impl Measured {
-    /// A quantity whose recording times equal its stamp.
+    /// A quantity whose recording times equal its stamp; of samples, the time of the last one.
     pub fn at_its_stamp(quantity: Quantity) -> Self {
         let stamp = match &quantity {
             Quantity::Conditions(input) => input.header.stamp,
             Quantity::Vibration(vibration) => vibration.header.stamp,
+            Quantity::Samples(block) => Time::from_ns(end_ns(block)),
         };
         let time_ns = u64::try_from(stamp.as_ns()).unwrap_or(0);
         Self { log_time_ns: time_ns, publish_time_ns: time_ns, quantity }
@@ -75,11 +85,14 @@ pub struct Predicted {
     pub levels: [u64; 4],
     /// Why the first stability map that failed could not be computed.
     pub map_failure: Option<String>,
+    /// `None` if samples were not searched.
+    pub sound: Option<SoundFound>,
 }
 
 /// Predicts the `measured` inputs with `rig` and records the session into a new directory in `directory`. Predictions
 /// are charted if `chart` is given. `points` are the conditions in `measured`, in the same order, to be solved ahead of
-/// the session; they may end early.
+/// the session; they may end early. Samples are recorded and searched for squeal as `sound` defines it, against the
+/// predictions made up to then; without a definition they are omitted.
 ///
 /// # Errors
 /// [`OfflineError`].
@@ -88,17 +101,19 @@ pub fn record(
     chart: Option<Arc<Chart>>,
     points: impl Iterator<Item = physics::OperatingPoint>,
     measured: impl Iterator<Item = Measured>,
+    sound: Option<sound::Settings>,
     directory: &Path,
 ) -> Result<Predicted, OfflineError> {
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let mut ahead = Ahead::new(points, &rig.model, threads);
-    let mut offline = Offline::start(rig, directory)?;
+    let mut offline = Offline::start(rig, sound, directory)?;
     let mut chart = Some(chart);
     for Measured { log_time_ns, publish_time_ns, quantity } in measured {
         match quantity {
             Quantity::Vibration(vibration) => {
                 offline.write(log_time_ns, publish_time_ns, Payload::Vibration(vibration));
             }
+            Quantity::Samples(block) => offline.samples(log_time_ns, publish_time_ns, block),
             Quantity::Conditions(input) => {
                 if let Some(chart) = chart.take() {
                     offline.begin(input.header.stamp, log_time_ns, chart);
@@ -126,14 +141,18 @@ struct Offline {
     inputs: u64,
     levels: [u64; 4],
     map_failure: Option<String>,
+    sound: Option<SoundSearch>,
+    /// Log time of the latest message.
+    latest_ns: u64,
 }
 
 impl Offline {
-    fn start(rig: &Arc<Rig>, directory: &Path) -> Result<Self, OfflineError> {
+    fn start(rig: &Arc<Rig>, sound: Option<sound::Settings>, directory: &Path) -> Result<Self, OfflineError> {
         let recorder = Recorder::start(RecorderConfig {
             rig_name: rig.name.clone(),
             rig_content_hash: rig.content_hash.clone(),
             rig_files: rig.files.clone(),
+            metadata: sound.map(settings_metadata).unwrap_or_default(),
             ..RecorderConfig::new(directory)
         })?;
         Ok(Self {
@@ -146,14 +165,17 @@ impl Offline {
             inputs: 0,
             levels: [0; 4],
             map_failure: None,
+            sound: sound.map(SoundSearch::new),
+            latest_ns: 0,
         })
     }
 
-    fn write(&self, log_time_ns: u64, publish_time_ns: u64, payload: Payload) {
+    fn write(&mut self, log_time_ns: u64, publish_time_ns: u64, payload: Payload) {
         // Nothing is live here: wait for the disk instead of dropping messages.
         while self.recorder.status().queued > MOST_QUEUED {
             std::thread::sleep(Duration::from_millis(1));
         }
+        self.latest_ns = self.latest_ns.max(log_time_ns);
         self.recorder.record(Message { log_time_ns, publish_time_ns, payload });
     }
 
@@ -172,6 +194,9 @@ impl Offline {
         let (prediction, request) = (effects.publish.cloned(), effects.request);
         if let Some(prediction) = prediction {
             self.levels[usize::from(prediction.level).min(3)] += 1;
+            if let Some(sound) = &mut self.sound {
+                sound.predicted(&prediction);
+            }
             self.write(log_time_ns, log_time_ns, Payload::Prediction(prediction));
         }
         request
@@ -222,6 +247,20 @@ impl Offline {
         }
     }
 
+    /// Records a block of samples and what is found in it; nothing if samples are not searched.
+    fn samples(&mut self, log_time_ns: u64, publish_time_ns: u64, block: Waveform) {
+        let Some(sound) = &mut self.sound else { return };
+        let heard = sound.block(&block);
+        self.write(log_time_ns, publish_time_ns, Payload::Waveform(block));
+        self.heard(log_time_ns, heard);
+    }
+
+    fn heard(&mut self, log_time_ns: u64, heard: Vec<Heard>) {
+        for heard in heard {
+            self.write(log_time_ns, log_time_ns, Payload::Heard(heard));
+        }
+    }
+
     /// Computes what the session requested, records it and hands it to the session.
     fn compute(&mut self, stamp: Time, log_time_ns: u64, request: Request) {
         let place = request.point().with_friction(0.0);
@@ -242,11 +281,14 @@ impl Offline {
         }
     }
 
-    fn finish(self) -> Result<Predicted, OfflineError> {
-        let Self { recorder, inputs, levels, map_failure, .. } = self;
+    fn finish(mut self) -> Result<Predicted, OfflineError> {
+        let lasting = self.sound.as_mut().map(SoundSearch::finish).unwrap_or_default();
+        self.heard(self.latest_ns, lasting);
+        let Self { recorder, inputs, levels, map_failure, sound, .. } = self;
+        let sound = sound.map(SoundSearch::found);
         let finished = recorder.finish(Duration::from_secs(600))?;
         match finished.status.dropped() {
-            0 => Ok(Predicted { directory: finished.directory, inputs, levels, map_failure }),
+            0 => Ok(Predicted { directory: finished.directory, inputs, levels, map_failure, sound }),
             dropped => {
                 let reason = finished.status.why_dropped().unwrap_or_default();
                 Err(OfflineError::Dropped { dropped, reason })

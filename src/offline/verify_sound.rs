@@ -8,11 +8,12 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use bytes::Bytes;
 
 use crate::msgs::{self, Heard, Time, heard_state};
-use crate::node::{channel_of, in_force};
+use crate::node::in_force;
 use crate::recording::message::Payload;
 use crate::recording::reader::{Recorded, Recording};
 use crate::sound::in_force::{InForce, message};
 use crate::sound::matching::Criteria;
+use crate::sound::search::channel_of;
 use crate::sound::{Channel, Detection, Detector, Quantity, Settings, Squeal};
 
 /// Number of differences described in words; all others are only counted.

@@ -106,18 +106,7 @@ mod tests {
     const S: i64 = 1_000_000_000;
 
     fn squeal(onset_ns: i64, frequency_hz: f64) -> Squeal {
-        Squeal {
-            number: 2,
-            onset_ns,
-            end_ns: onset_ns + S,
-            cut: [false; 2],
-            frequency_hz,
-            level_db: 90.0,
-            peak_level_db: 91.0,
-            prominence_db: 20.0,
-            growth: None,
-            harmonic: None,
-        }
+        Squeal { number: 2, ..Squeal::of_90_db(onset_ns, onset_ns + S, frequency_hz) }
     }
 
     fn prediction(stamp_ns: i64, hz: &[f64]) -> InForce {

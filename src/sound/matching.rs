@@ -17,6 +17,7 @@
 //!   alarm; else, with a hit or a confirmed prediction, a hit; else both sides were silent.
 
 use std::collections::BTreeMap;
+use std::ops::AddAssign;
 
 use serde::Serialize;
 
@@ -175,6 +176,20 @@ impl Predictions {
         }
     }
 
+    /// Forgets predicted squeals that ended before `stamp_ns`; the time of the predictions then begins there.
+    pub fn forget_before(&mut self, stamp_ns: i64) {
+        let kept: Vec<bool> = self.squeals.iter().map(|squeal| squeal.to_ns >= stamp_ns).collect();
+        self.span_ns = self.span_ns.map(|(first, last)| (first.max(stamp_ns).min(last), last));
+        if !kept.contains(&false) {
+            return;
+        }
+        let mut each = kept.iter();
+        self.squeals.retain(|_| each.next() == Some(&true));
+        let mut each = kept.iter();
+        self.growth.retain(|_| each.next() == Some(&true));
+        self.latest = self.squeals.iter().enumerate().map(|(index, squeal)| (squeal.mode_id, index)).collect();
+    }
+
     /// The predicted squeals in the order of their beginnings.
     pub fn squeals(&self) -> &[PredictedSqueal] {
         &self.squeals
@@ -319,6 +334,26 @@ impl Predictions {
     }
 }
 
+impl AddAssign for Score {
+    fn add_assign(&mut self, other: Self) {
+        let Self { hits, misses, confirmed, false_alarms } = other;
+        self.hits += hits;
+        self.misses += misses;
+        self.confirmed += confirmed;
+        self.false_alarms += false_alarms;
+    }
+}
+
+impl AddAssign for Slots {
+    fn add_assign(&mut self, other: Self) {
+        let Self { hits, misses, false_alarms, quiet } = other;
+        self.hits += hits;
+        self.misses += misses;
+        self.false_alarms += false_alarms;
+        self.quiet += quiet;
+    }
+}
+
 impl Score {
     /// Share of the judged predicted squeals that were confirmed; `None` without any.
     pub fn precision(&self) -> Option<f64> {
@@ -359,6 +394,13 @@ impl Meeting {
     }
 }
 
+/// Median of values in ascending order: of an even number, the mean of the two in the middle.
+pub fn median(sorted: &[f64]) -> Option<f64> {
+    let upper = sorted.get(sorted.len() / 2)?;
+    let lower = sorted.get(sorted.len().saturating_sub(1) / 2)?;
+    Some(0.5 * (lower + upper))
+}
+
 fn ratio(part: u64, all: u64) -> Option<f64> {
     (all > 0).then(|| part as f64 / all as f64)
 }
@@ -373,18 +415,7 @@ mod tests {
     }
 
     fn squeal(onset_s: f64, end_s: f64, frequency_hz: f64) -> Squeal {
-        Squeal {
-            number: 1,
-            onset_ns: ns(onset_s),
-            end_ns: ns(end_s),
-            cut: [false; 2],
-            frequency_hz,
-            level_db: 90.0,
-            peak_level_db: 91.0,
-            prominence_db: 20.0,
-            growth: None,
-            harmonic: None,
-        }
+        Squeal::of_90_db(ns(onset_s), ns(end_s), frequency_hz)
     }
 
     /// Predictions every 10 ms over 60 s: modes `(id, frequency, from, to)`, each warned of for 2 s before.
@@ -438,6 +469,14 @@ mod tests {
         // (3·47 - 6·4) / √(9 · 7 · 53 · 51) by hand.
         assert!((met.slots.mcc().unwrap() - 117.0 / 170_289.0_f64.sqrt()).abs() < 1e-12);
         assert_eq!(met.leads_s().len(), 1);
+    }
+
+    #[test]
+    fn the_median_of_an_even_number_is_the_mean_of_two() {
+        assert_eq!(
+            [&[][..], &[2.0], &[2.0, 3.0], &[2.0, 3.0, 7.0]].map(median),
+            [None, Some(2.0), Some(2.5), Some(3.0)]
+        );
     }
 
     #[test]

@@ -157,9 +157,10 @@ export function serve(assets, situation, more = {}) {
     "/events.json": () => (situation === "waiting" ? [] : events()),
     "/squeals-in-sound.json": () => [],
     "/comparison.json": () => null,
+    "/sound.json": () => ({ channels: [], scores: [] }),
     "/map.json": map,
-    "/shape.json": (query) => shape(Number(query.get("id"))),
     "/contact.json": contact,
+    "/shape.json": (query) => shape(Number(query.get("id"))),
   };
   const server = createServer((request, response) => {
     const { pathname, searchParams } = new URL(request.url, "http://localhost");

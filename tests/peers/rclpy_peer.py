@@ -9,10 +9,10 @@ import argparse
 import math
 import os
 import sys
-import threading
 import time
 
 from exchange import Answer, Exchange, arguments, bound_run_time, parameters, run_time_limit, wait_until
+from spinning import spinning
 
 # The node's parameters, all doubles.
 PARAMETERS = tuple(parameters())
@@ -33,33 +33,9 @@ def main() -> int:
     os.environ["ROS_DOMAIN_ID"] = str(args.domain)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
-    import rclpy  # only now: it reads the environment
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-
     exchange = Exchange(args)
-    rclpy.init(args=[])
-    node = rclpy.create_node("squealcast_test_peer")
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    stop = threading.Event()
-
-    def spin() -> None:
-        try:
-            while not stop.is_set():
-                executor.spin_once(timeout_sec=0.1)
-        except ExternalShutdownException:
-            pass
-
-    spinner = threading.Thread(target=spin)
-    spinner.start()
-    try:
+    with spinning("squealcast_test_peer") as node:
         return Peer(exchange, node).run()
-    finally:
-        stop.set()
-        spinner.join()
-        executor.shutdown()
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 class Peer:

@@ -12,6 +12,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use crate::program::{self, PATIENCE, measuring, npz_bytes};
+use crate::sound_beside_logs::simulated;
 use squealcast::msgs::{OperatingPoint, Prediction};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
@@ -375,7 +376,6 @@ fn the_page_shows_every_status_and_the_next_squeal() {
     assert_eq!(serde_json::json!(fields(&disc)), made_up["disc"]);
 }
 
-fn tribometer_axis() -> squealcast::rig::DiscAxis {
 /// The page of a node whose contact pairs open and close shows their forces: those of the state at the conditions it names.
 #[test]
 fn the_page_shows_the_contact() {
@@ -421,6 +421,7 @@ fn the_page_shows_the_contact() {
     }
 }
 
+fn tribometer_axis() -> squealcast::rig::DiscAxis {
     squealcast::rig::Rig::load("tribometer").unwrap().disc_axis.unwrap()
 }
 
@@ -567,7 +568,6 @@ fn a_recording_of_faults_is_not_called_quiet() {
     }
 }
 
-#[test]
 /// A report shows the contact of a rig with a contact state where it squeals worst, or at the end, and of no other rig.
 #[test]
 fn a_report_shows_the_contact() {
@@ -605,6 +605,7 @@ fn a_report_shows_the_contact() {
     assert!(!report("nine-dof-case-2", 0.2).contains("<h2>Contact</h2>"));
 }
 
+#[test]
 fn a_silent_connection_is_closed() {
     let shown = Shown::demo(&[]);
     let mut silent = TcpStream::connect(shown.address).unwrap();
@@ -843,4 +844,36 @@ fn the_foxglove_layout_names_existing_topics_and_fields() {
     for panel in panels.keys() {
         assert!(layout["layout"].to_string().contains(&format!("\"{panel}\"")), "{panel} has no place");
     }
+}
+
+/// The page shows the scores of `score` and the planted squeal in its spectrogram, with the predicted frequency over it.
+#[test]
+fn the_page_shows_the_sound_of_a_recording_with_predictions_over_it_and_their_score() {
+    let _alone = alone();
+    let simulated = simulated();
+    let out = simulated.folder.path().join("out");
+    let out = out.to_str().unwrap();
+    let args = ["predict-log", &simulated.log, "--rig", "tribometer", "-o", out, "--sound", &simulated.sound];
+    program::run(args.iter().chain(&["--unit", "Pa"])).exits(0);
+    let shown = Shown::start(&["view", out]);
+    let sound: serde_json::Value = serde_json::from_str(&shown.get("/sound.json").2).unwrap();
+    let score = program::json(["score", out, "--json"]);
+    for count in ["hits", "misses", "confirmed", "false_alarms", "recall", "precision", "mcc", "judged_s"] {
+        assert_eq!(sound["scores"][0][count], score["rows"][0][count], "{count}");
+    }
+    assert_eq!(sound["channels"], serde_json::json!(["1"]));
+    if browser_ready() {
+        let planted = simulated.truth["squeals"].as_array().unwrap().iter();
+        let planted = planted.filter(|squeal| squeal["frequency_hz"].as_f64().unwrap() > 1250.0).map(|squeal| {
+            let middle_s = 0.5 * (squeal["onset_s"].as_f64().unwrap() + squeal["end_s"].as_f64().unwrap());
+            // Relative times of a log count from 2000-01-01.
+            serde_json::json!({ "hz": squeal["frequency_hz"], "time_s": 946_684_800.0 + middle_s })
+        });
+        let planted = serde_json::Value::from(planted.collect::<Vec<_>>()).to_string();
+        let seen = browse("sound.mjs", &[&format!("http://{}/", shown.address), &planted]);
+        let text = seen["scores"][0].as_str().unwrap();
+        let hits = format!("{} hits, {} misses", score["rows"][0]["hits"], score["rows"][0]["misses"]);
+        assert!(text.contains(&hits), "{text}");
+    }
+    shown.stop();
 }

@@ -41,6 +41,8 @@ mod ros2_side;
 mod scipy;
 mod sessions;
 mod sound;
+mod sound_beside_logs;
+mod sound_reports;
 mod steady_states;
 mod stress;
 mod tribometer;

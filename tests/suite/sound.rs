@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::program::{self, folder, json, number, python, run, text};
+use crate::sound_beside_logs::{Simulated, simulated};
 use serde_json::Value;
 use squealcast::import::samples::SampleFile;
 use squealcast::sound::{self, spectrum::Spectra};
@@ -245,17 +246,7 @@ fn spectra_are_those_of_scipy() {
 /// was predicted.
 #[test]
 fn the_sound_of_a_simulated_session_is_found_and_meets_its_predictions() {
-    let folder = folder();
-    let (sessions, sound) = (text(&folder.path().join("sessions")), text(&folder.path().join("sound.wav")));
-    let profile = "[[point]]\ntime_s = 0\nnormal_load_n = 500\ndisc_speed_rad_s = 13\nfriction_coefficient = 0.3\n\
-        [[point]]\ntime_s = 3\nnormal_load_n = 500\ndisc_speed_rad_s = 13\nfriction_coefficient = 0.9\n\
-        [[point]]\ntime_s = 5\nnormal_load_n = 500\ndisc_speed_rad_s = 13\nfriction_coefficient = 0.9\n\
-        [[point]]\ntime_s = 6\nnormal_load_n = 500\ndisc_speed_rad_s = 13\nfriction_coefficient = 0.3\n";
-    let profile = program::write(folder.path(), "profile.toml", profile);
-    let args = ["simulate", "--rig", "tribometer", "--profile", &profile, "--record", &sessions, "--sound", &sound];
-    run(args.iter().copied().chain(["--rate", "50", "--duration", "8"])).exits(0).complains("s of sound");
-    let truth: Value =
-        serde_json::from_slice(&std::fs::read(folder.path().join("sound.json")).expect("the squeals")).expect("JSON");
+    let Simulated { folder, sessions, sound, truth, .. } = simulated();
     // A mode of 730 Hz, which grows too, is below the band.
     let planted = truth["squeals"].as_array().expect("squeals").iter();
     let planted: Vec<&Value> = planted.filter(|squeal| number(squeal, "frequency_hz") > 1250.0).collect();

@@ -7,6 +7,7 @@ import { History } from "./history.js";
 import { StabilityMap } from "./map.js";
 import { Modes } from "./modes.js";
 import { ShapeView } from "./shape.js";
+import { Sound } from "./sound.js";
 import { Status } from "./status.js";
 import { Timeline } from "./timeline.js";
 import { asserts, forgetColours, known } from "./format.js";
@@ -30,9 +31,11 @@ const map = new StabilityMap(about);
 const history = new History(about);
 const shape = new ShapeView();
 const modes = new Modes(about, choose, () => follow(false));
-let timeline;
 const contact = new ContactView(about, showContact);
+let timeline;
 const events = new Events(about, recording ? (moment) => timeline.go(moment) : undefined);
+
+const sound = new Sound(about, history, recording ? (moment) => timeline.go(moment) : undefined);
 
 let latest = null;
 let heardAt = 0;
@@ -70,9 +73,6 @@ async function choose(id) {
   }
 }
 
-function follow(on) {
-  following = on;
-  at("shape-follow").setAttribute("aria-pressed", String(on));
 let contactAt = 0;
 let contactFor = [];
 let contacts = 0;
@@ -89,6 +89,9 @@ async function showContact() {
   }
 }
 
+function follow(on) {
+  following = on;
+  at("shape-follow").setAttribute("aria-pressed", String(on));
   if (on && latest) numbers();
 }
 at("shape-follow").addEventListener("click", () => follow(!following));
@@ -137,7 +140,9 @@ function take(received) {
   if (!recording && state.events !== eventsShown) {
     once("events", async () => {
       const change = state.events;
-      events.show(...(await Promise.all(["events.json", "squeals-in-sound.json"].map(ask))));
+      const [all, squeals] = await Promise.all(["events.json", "squeals-in-sound.json"].map(ask));
+      events.show(all, squeals);
+      sound.squeals = squeals;
       eventsShown = change;
     });
   }
@@ -150,23 +155,23 @@ function paint() {
   status.level(latest);
   status.needle(latest);
   shape.still(!asserts(latest));
+  contact.still(!asserts(latest));
   map.cursor(latest);
 }
 
 function numbers() {
   if (!latest) return;
-  contact.still(!asserts(latest));
   const age = typeof latest.age_s === "number" ? latest.age_s + (recording ? 0 : (performance.now() - heardAt) / 1000) : undefined;
   status.numbers(latest, age, (id) => (shape.shape?.id === id ? shape.shape.pad_share : undefined));
   modes.numbers(latest);
   at("simulated").hidden = !(about.simulated || latest.simulated);
   if (!asserts(latest)) return;
+  if (contact.chosen && performance.now() - contactAt > FOLLOWED && moved(conditions(latest), contactFor)) showContact();
   const wanted = latest.fastest?.id ?? latest.next?.ids[0] ?? modes.chosen ?? latest.modes?.[0]?.[0];
   const since = performance.now() - chosenAt;
   const settled = since > SETTLED;
   // A recording that is paused sends no further states.
   clearTimeout(later);
-  if (contact.chosen && performance.now() - contactAt > FOLLOWED && moved(conditions(latest), contactFor)) showContact();
   if (recording && !settled) later = setTimeout(numbers, SETTLED);
   if (following && wanted !== undefined && wanted !== modes.chosen && (since > FOLLOWED || modes.chosen === null)) modes.select(wanted);
   // The shape of a mode changes with the conditions.
@@ -181,12 +186,12 @@ function link(kind, text) {
   status.disconnected(kind === "gone");
   if (kind !== "gone") return;
   shape.still(true);
+  contact.still(true);
   if (!latest) return;
   latest = sifted({ ...latest, status: "no_data" });
   status.needle(latest);
   map.cursor(latest);
 }
-  contact.still(true);
 
 /** The page is connected to the node; the sign is green only if the node receives inputs. */
 function connected() {
@@ -203,6 +208,7 @@ function repaint() {
   forgetColours();
   map.draw();
   history.draw();
+  sound.draw();
   shape.draw();
 }
 at("theme").addEventListener("click", () => {
@@ -234,12 +240,14 @@ if (recording) {
     numbers();
     history.mark(moment);
   });
-  const [whole, all, sound, comparison] = await Promise.all(["history.json", "events.json", "squeals-in-sound.json", "comparison.json"].map(ask));
+  const [whole, all, squeals, comparison] = await Promise.all(["history.json", "events.json", "squeals-in-sound.json", "comparison.json"].map(ask));
   history.load(whole);
   const measured = comparison?.measured ?? [];
   timeline.paint(whole, measured);
-  events.show(all, sound, comparison);
-  timeline.events = [...all, ...sound, ...measured.filter((squeal) => squeal.verdict !== "hit")].sort((a, b) => a.onset_s - b.onset_s);
+  events.show(all, squeals, comparison);
+  sound.squeals = squeals;
+  sound.refresh(ask);
+  timeline.events = [...all, ...squeals, ...measured.filter((squeal) => squeal.verdict !== "hit")].sort((a, b) => a.onset_s - b.onset_s);
   new ResizeObserver(() => timeline.paint(whole, measured)).observe(at("track-levels"));
   timeline.go(about.span_s[0]);
 } else {
@@ -271,5 +279,6 @@ if (recording) {
     if (latest && performance.now() - heardAt > 3000) link("gone", "no answer");
     next(numbers);
     next(refresh);
+    sound.refresh(ask);
   }, NUMBERS_EVERY);
 }

@@ -32,6 +32,25 @@ pub struct Squeal {
     pub harmonic: Option<Harmonic>,
 }
 
+#[cfg(test)]
+impl Squeal {
+    /// A squeal of 90 dB that is no harmonic, for tests.
+    pub fn of_90_db(onset_ns: i64, end_ns: i64, frequency_hz: f64) -> Self {
+        Self {
+            number: 1,
+            onset_ns,
+            end_ns,
+            cut: [false; 2],
+            frequency_hz,
+            level_db: 90.0,
+            peak_level_db: 91.0,
+            prominence_db: 20.0,
+            growth: None,
+            harmonic: None,
+        }
+    }
+}
+
 /// A squeal at a multiple of the frequency of another.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Harmonic {

@@ -1,0 +1,280 @@
+// Sound: the scores of predictions with their counts, and a spectrogram with the predicted unstable frequencies over it.
+
+import { NONE, colour, fixed, known, time } from "./format.js";
+
+const at = (id) => document.getElementById(id);
+/** Interval between pictures of a running node, ms. */
+const EVERY = 2000;
+/** Room for the labels of the axes, px. */
+const LEFT = 52;
+const BELOW = 22;
+
+export class Sound {
+  constructor(about, history, go) {
+    this.live = about.kind === "live";
+    this.history = history;
+    this.go = go;
+    this.picture = null;
+    this.covers = null;
+    this.squeals = [];
+    this.view = null;
+    this.asked = -Infinity;
+    this.busy = false;
+    this.canvas = at("spectrogram");
+    at("sound-channel").addEventListener("change", () => this.#load());
+    at("sound-in").addEventListener("click", () => this.#zoom(0.5));
+    at("sound-out").addEventListener("click", () => this.#zoom(2));
+    at("sound-all").addEventListener("click", () => this.#all());
+    this.canvas.addEventListener("wheel", (event) => {
+      if (!this.view) return;
+      event.preventDefault();
+      this.#zoom(event.deltaY > 0 ? 1.25 : 0.8, this.#place(event), event.shiftKey);
+    }, { passive: false });
+    this.canvas.addEventListener("pointerdown", (event) => this.#drag(event));
+    this.canvas.addEventListener("keydown", (event) => this.#key(event));
+    // For tests.
+    this.canvas.position = (seconds, hz) => this.position(seconds, hz);
+    this.canvas.view = () => this.picture && this.view;
+    new ResizeObserver(() => this.draw()).observe(this.canvas.parentElement);
+  }
+
+  /** Asks for scores and picture if it is time; `squeals` are those of the table of events. */
+  async refresh(ask) {
+    if (this.busy || document.hidden || performance.now() - this.asked < EVERY) return;
+    this.busy = true;
+    this.asked = performance.now();
+    try {
+      await this.show(await ask("sound.json"));
+    } catch {
+      // The connection is lost: the next state asks again.
+    } finally {
+      this.busy = false;
+    }
+  }
+
+  async show({ channels, scores }) {
+    const panel = at("sound");
+    panel.hidden = channels.length + scores.length === 0;
+    if (panel.hidden) return;
+    const choice = at("sound-channel");
+    if ([...choice.options].map((option) => option.value).join("\n") !== channels.join("\n")) {
+      const before = choice.value;
+      choice.replaceChildren(...channels.map((name) => new Option(name, name)));
+      if (channels.includes(before)) choice.value = before;
+    }
+    at("sound-scores").replaceChildren(...scores.map(score));
+    await this.#load();
+  }
+
+  async #load() {
+    const name = at("sound-channel").value;
+    if (!name) return;
+    const answer = await fetch(`spectrogram.png?channel=${encodeURIComponent(name)}`);
+    if (!answer.ok) return;
+    const covers = JSON.parse(answer.headers.get("x-covers"));
+    this.picture = await createImageBitmap(await answer.blob());
+    const follows = !this.view || !this.covers || this.view.to >= this.covers.to_s;
+    const whole = !this.view || (this.covers && this.view.from <= this.covers.from_s && follows);
+    this.covers = covers;
+    if (whole) this.view = this.#whole();
+    // At the end of the time shown, new sound moves it on.
+    else if (this.live && follows) this.view = { ...this.view, from: covers.to_s - (this.view.to - this.view.from), to: covers.to_s };
+    this.draw();
+  }
+
+  #whole() {
+    const { from_s: from, to_s: to, top_hz: high } = this.covers;
+    return { from, to, low: 0, high };
+  }
+
+  #all() {
+    if (!this.covers) return;
+    this.view = this.#whole();
+    this.draw();
+  }
+
+  /** Time and frequency below a pointer, as shares of the view. */
+  #place(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const share = (value, from, length) => Math.min(1, Math.max(0, (value - from) / length));
+    return [share(event.clientX, box.left + LEFT, box.width - LEFT), 1 - share(event.clientY, box.top, box.height - BELOW)];
+  }
+
+  /** Makes the view `factor` times as long, or as high, about a place. */
+  #zoom(factor, [x, y] = [0.5, 0.5], frequency = false) {
+    if (!this.view) return;
+    const { from, to, low, high } = this.view;
+    const about = (a, b, share, least) => {
+      const length = Math.max(least, (b - a) * factor);
+      const middle = a + share * (b - a);
+      return [middle - share * length, middle + (1 - share) * length];
+    };
+    if (frequency) [this.view.low, this.view.high] = about(low, high, y, 100);
+    else [this.view.from, this.view.to] = about(from, to, x, 0.2);
+    this.#hold();
+    this.draw();
+  }
+
+  /** Keeps the view inside what there is. */
+  #hold() {
+    const inside = (a, b, first, last) => {
+      const length = Math.min(b - a, last - first);
+      const start = Math.min(Math.max(a, first), last - length);
+      return [start, start + length];
+    };
+    const { from_s: first, to_s: last, top_hz: top } = this.covers;
+    [this.view.from, this.view.to] = inside(this.view.from, this.view.to, first, last);
+    [this.view.low, this.view.high] = inside(this.view.low, this.view.high, 0, top);
+  }
+
+  #move(seconds, hz) {
+    const { from, to, low, high } = this.view;
+    this.view = { from: from + seconds, to: to + seconds, low: low + hz, high: high + hz };
+    this.#hold();
+    this.draw();
+  }
+
+  #drag(event) {
+    if (!this.view) return;
+    const [x, y] = [event.clientX, event.clientY];
+    const began = { ...this.view };
+    const box = this.canvas.getBoundingClientRect();
+    let moved = false;
+    const move = (now) => {
+      moved ||= Math.hypot(now.clientX - x, now.clientY - y) > 4;
+      const seconds = ((x - now.clientX) / (box.width - LEFT)) * (began.to - began.from);
+      const hz = ((now.clientY - y) / (box.height - BELOW)) * (began.high - began.low);
+      this.view = { ...began };
+      this.#move(seconds, hz);
+    };
+    const end = (now) => {
+      this.canvas.removeEventListener("pointermove", move);
+      // A click leads the time line to that moment.
+      if (!moved && this.go) this.go(this.view.from + this.#place(now)[0] * (this.view.to - this.view.from));
+    };
+    this.canvas.setPointerCapture(event.pointerId);
+    this.canvas.addEventListener("pointermove", move);
+    this.canvas.addEventListener("pointerup", end, { once: true });
+  }
+
+  #key(event) {
+    if (!this.view) return;
+    const [length, height] = [this.view.to - this.view.from, this.view.high - this.view.low];
+    const actions = {
+      "+": () => this.#zoom(0.5), "-": () => this.#zoom(2), 0: () => this.#all(),
+      ArrowLeft: () => this.#move(-0.1 * length, 0), ArrowRight: () => this.#move(0.1 * length, 0),
+      ArrowUp: () => this.#move(0, 0.1 * height), ArrowDown: () => this.#move(0, -0.1 * height),
+    };
+    if (!actions[event.key]) return;
+    event.preventDefault();
+    event.stopPropagation();
+    actions[event.key]();
+  }
+
+  /** Where a time and a frequency are drawn, px. */
+  position(seconds, hz) {
+    const { from, to, low, high } = this.view;
+    const [width, height] = [this.canvas.clientWidth - LEFT, this.canvas.clientHeight - BELOW];
+    return [LEFT + ((seconds - from) / (to - from)) * width, height * (1 - (hz - low) / (high - low))];
+  }
+
+  draw() {
+    const { canvas } = this;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width || !height) return;
+    const ratio = window.devicePixelRatio || 1;
+    [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
+    const pen = canvas.getContext("2d");
+    pen.scale(ratio, ratio);
+    if (!this.picture || !this.view) return;
+    pen.save();
+    pen.beginPath();
+    pen.rect(LEFT, 0, width - LEFT, height - BELOW);
+    pen.clip();
+    const { from_s: first, to_s: last, top_hz: top } = this.covers;
+    const [left, upper] = this.position(first, top);
+    const [right, lower] = this.position(last, 0);
+    pen.imageSmoothingEnabled = false;
+    pen.drawImage(this.picture, left, upper, right - left, lower - upper);
+    this.#overlay(pen);
+    pen.restore();
+    this.#axes(pen, width, height);
+    const shown = this.view.to - this.view.from;
+    canvas.setAttribute("aria-label", `Spectrogram of ${at("sound-channel").value}, ${fixed(shown, 1)} s, ${fixed(this.view.low, 0)} to ${fixed(this.view.high, 0)} Hz`);
+  }
+
+  /** Frequencies predicted to be unstable, and frames around the squeals. */
+  #overlay(pen) {
+    const { bins, binS } = this.history;
+    pen.fillStyle = "#40e0ff";
+    for (const bin of bins) {
+      const [from, to] = [bin.k * binS, (bin.k + 1) * binS];
+      if (to < this.view.from || from > this.view.to) continue;
+      for (const [hz] of bin.u ?? []) {
+        const [x, y] = this.position(from, hz);
+        pen.fillRect(x, y - 0.75, Math.max(1, this.position(to, hz)[0] - x), 1.5);
+      }
+    }
+    pen.strokeStyle = "#fff";
+    pen.lineWidth = 1.5;
+    const name = at("sound-channel").value;
+    for (const squeal of this.squeals.filter((squeal) => squeal.channel === name)) {
+      const [x, y] = this.position(squeal.onset_s, squeal.frequency_hz);
+      const end = this.position(squeal.end_s ?? this.covers.to_s, squeal.frequency_hz)[0];
+      pen.strokeRect(x, y - 8, Math.max(2, end - x), 16);
+    }
+  }
+
+  #axes(pen, width, height) {
+    pen.fillStyle = colour("--muted");
+    pen.font = "12px system-ui, sans-serif";
+    pen.textBaseline = "middle";
+    pen.textAlign = "right";
+    for (const hz of ticks(this.view.low, this.view.high, (height - BELOW) / 34)) {
+      const y = this.position(this.view.from, hz)[1];
+      if (y > 7 && y < height - BELOW - 4) pen.fillText(`${fixed(hz / 1000, hz % 1000 ? (hz % 100 ? 2 : 1) : 0)} kHz`, LEFT - 5, y);
+    }
+    pen.textAlign = "center";
+    const start = this.live ? 0 : this.covers.from_s;
+    for (const seconds of ticks(this.view.from - start, this.view.to - start, (width - LEFT) / 90)) {
+      const x = this.position(seconds + start, 0)[0];
+      const decimals = this.view.to - this.view.from < 8 ? 1 : 0;
+      const label = this.live ? time(seconds, decimals) : `${fixed(seconds, decimals)} s`;
+      if (x > LEFT + 24 && x < width - 24) pen.fillText(label, x, height - BELOW / 2);
+    }
+  }
+}
+
+/** Round values from `low` to `high`, at most `most` of them. */
+function ticks(low, high, most) {
+  const rough = (high - low) / Math.max(1, most);
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((factor) => factor * power).find((step) => step >= rough);
+  const found = [];
+  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push(k * step);
+  return found;
+}
+
+/** The scores of a channel, each with its counts. */
+function score(of) {
+  const row = document.createElement("dl");
+  row.className = "score";
+  const share = (value) => (known(value) ? fixed(value, 2) : NONE);
+  const { hits, misses, false_alarms: alarms, quiet } = of.slots;
+  const entries = [
+    [of.channel, "", `${fixed(of.judged_s, 0)} s judged`],
+    ["recall", share(of.recall), `${of.hits} hits, ${of.misses} misses`],
+    ["precision", share(of.precision), `${of.confirmed} found, ${of.false_alarms} false alarms`],
+    ["MCC", share(of.mcc), `of seconds: ${hits} hit, ${misses} missed, ${alarms} false, ${quiet} quiet`],
+    ["lead", known(of.median_lead_s) ? `${fixed(of.median_lead_s, 2)} s` : NONE, `median of ${of.hits} hits`],
+  ];
+  for (const [name, value, counts] of entries) {
+    const box = document.createElement("div");
+    const [term, data, small] = ["dt", "dd", "dd"].map((kind) => document.createElement(kind));
+    small.className = "counts";
+    [term.textContent, data.textContent, small.textContent] = [name, value, counts];
+    box.append(term, ...(value ? [data, small] : [small]));
+    row.append(box);
+  }
+  return row;
+}
