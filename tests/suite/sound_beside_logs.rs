@@ -102,7 +102,7 @@ fn predicted(folder: &Path, name: &str, args: &[&str]) -> (PathBuf, Content) {
 /// recording has the samples too.
 #[test]
 fn sound_beside_a_log_is_recorded_searched_compared_and_verified() {
-    let Simulated { folder, log, sound, truth } = simulated();
+    let Simulated { folder, log, sound, truth, .. } = simulated();
     let folder = folder.path();
     let beside = [&*log, "--sound", &sound, "--unit", "Pa", "--threshold-db", "72"];
     let (output, found) = predicted(folder, "out", &beside);
