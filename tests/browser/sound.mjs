@@ -1,6 +1,7 @@
 // The sound of a recording in the page: node sound.mjs URL PLANTED [pictures], PLANTED a JSON list of frequencies in Hz and times
 // in s since the epoch. Prints the scores shown.
 import { check, launch, open, picture, until, violations } from "./browser.mjs";
+import { column, predicted, settled } from "./spectrogram.mjs";
 
 const [url, list, pictures] = process.argv.slice(2);
 const planted = JSON.parse(list);
@@ -8,45 +9,19 @@ const faults = [];
 const browser = await launch();
 const page = await open(browser, url, {}, faults);
 const canvas = page.locator("#spectrogram");
-const drawn = (page) => page.waitForFunction(() => document.getElementById("spectrogram").view?.());
 await page.waitForSelector("#sound .score");
-await drawn(page);
+await settled(page);
 await canvas.scrollIntoViewIfNeeded();
 
-/** Lightness around a time and frequency, without the overlay; the median of its column; and how far, in px, the nearest
- * overlay is from a frequency. */
-const look = (seconds, hz) => page.evaluate(([seconds, hz]) => {
-  const canvas = document.getElementById("spectrogram");
-  const ratio = canvas.width / canvas.clientWidth;
-  const [x, y] = canvas.position(seconds, hz).map((px) => px * ratio);
-  const copy = new OffscreenCanvas(1, canvas.height).getContext("2d", { willReadFrequently: true });
-  copy.drawImage(canvas, -Math.round(x), 0);
-  const column = copy.getImageData(0, 0, 1, canvas.height).data;
-  const light = [];
-  const lines = [];
-  for (let k = 0; k < canvas.height; k++) {
-    const [r, g, b] = column.slice(4 * k, 4 * k + 3);
-    const isLine = b > r + 60 && g > r + 60;
-    if (isLine) lines.push(k + 0.5);
-    light.push(isLine ? 0 : 0.21 * r + 0.72 * g + 0.07 * b);
-  }
-  const near = light.slice(Math.max(0, Math.round(y) - 6), Math.round(y) + 7);
-  const sorted = light.toSorted((a, b) => a - b);
-  return { near: Math.max(...near), median: sorted[sorted.length >> 1], line: Math.min(...lines.map((k) => Math.abs(k - y))) / ratio };
-}, [seconds, hz]);
-
-/** The predicted frequency nearest to a planted one, as the history has it. */
 const history = await page.evaluate(async () => (await fetch("history.json")).json());
-const predicted = (seconds, hz) => {
-  const bin = history.bins.findLast((bin) => bin.k * history.bin_s <= seconds);
-  return bin.u.map(([hz]) => hz).sort((a, b) => Math.abs(a - hz) - Math.abs(b - hz))[0];
-};
 
-// Unzoomed, a row of 50 Hz is less than a pixel high and below the line.
-for (const { hz, time_s: seconds } of planted) {
-  const overlay = await look(seconds, predicted(seconds, hz));
-  check(overlay.line <= 1.5, `the prediction is drawn ${overlay.line} px off ${hz} Hz`);
+/** The prediction nearest to a planted squeal is drawn where it is, to a pixel. */
+async function overlays(seconds, hz) {
+  const near = predicted(history, seconds, hz);
+  const { off } = await column(page, near.seconds, near.hz);
+  check(off <= 1, `the prediction of ${near.hz} Hz is drawn ${off} px off`);
 }
+for (const { hz, time_s: seconds } of planted) await overlays(seconds, hz);
 
 // Zoomed by the wheel about the squeal, in time and in frequency: the squeal stays under the pointer.
 const view = (page) => page.evaluate(() => ({ ...document.getElementById("spectrogram").view() }));
@@ -61,17 +36,17 @@ for (let k = 0; k < 12; k++) await page.mouse.wheel(0, -100);
 await page.keyboard.up("Shift");
 await until("it is zoomed", async () => {
   const { from, to, low, high } = await view(page);
-  return to - from < 0.5 * (whole.to - whole.from) && high - low < 0.5 * (whole.high - whole.low);
+  return to - from < 0.33 * (whole.to - whole.from) && high - low < 0.07 * (whole.high - whole.low);
 });
+await settled(page);
+const zoomed = await view(page);
 const [zoomedX, zoomedY] = await page.evaluate(([seconds, hz]) => document.getElementById("spectrogram").position(seconds, hz), [seconds, hz]);
 // Browsers round the place of a pointer to whole pixels, which the zoom magnifies.
-const zoomed = await view(page);
 const [timesX, timesY] = [(whole.to - whole.from) / (zoomed.to - zoomed.from), (whole.high - whole.low) / (zoomed.high - zoomed.low)];
 check(Math.abs(zoomedX - x) <= timesX && Math.abs(zoomedY - y) <= timesY, `zooming moved the squeal from ${x}, ${y} to ${zoomedX}, ${zoomedY}`);
-const near = await look(seconds, hz);
-check(near.near > near.median + 40, `${JSON.stringify(near)} at the planted ${hz} Hz`);
-const line = await look(seconds, predicted(seconds, hz));
-check(line.line <= 1.5, `zoomed, the prediction is drawn ${line.line} px off ${hz} Hz`);
+const { light, median, lightest } = await column(page, seconds, hz);
+check(light > median + 40, `lightness ${light} at the planted ${hz} Hz, ${median} elsewhere`);
+await overlays(seconds, hz);
 await picture(page, pictures, "sound-zoomed-1280");
 
 // Keys, the button, and a click that leads the time line there.
@@ -89,7 +64,7 @@ const scores = await page.locator("#sound .score").allInnerTexts();
 for (const width of [360, 1280, 2560]) {
   for (const colorScheme of ["light", "dark"]) {
     const other = await open(browser, url, { viewport: { width, height: width === 2560 ? 1440 : 800 }, colorScheme }, faults);
-    await drawn(other);
+    await settled(other);
     await picture(other, pictures, `sound-${width}-${colorScheme}`);
     const wide = await other.evaluate(() => {
       const panel = document.getElementById("sound");

@@ -239,6 +239,7 @@ if (recording) {
     }
     numbers();
     history.mark(moment);
+    sound.mark(moment);
   });
   const [whole, all, squeals, comparison] = await Promise.all(["history.json", "events.json", "squeals-in-sound.json", "comparison.json"].map(ask));
   history.load(whole);

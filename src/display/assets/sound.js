@@ -1,10 +1,13 @@
 // Sound: the scores of predictions with their counts, and a spectrogram with the predicted unstable frequencies over it.
 
+import { next } from "./clock.js";
 import { NONE, colour, fixed, known, time } from "./format.js";
 
 const at = (id) => document.getElementById(id);
 /** Interval between pictures of a running node, ms. */
 const EVERY = 2000;
+/** A prediction is drawn up to the next one if that follows within this time, s. */
+const HOLDS_S = 2;
 /** Room for the labels of the axes, px. */
 const LEFT = 52;
 const BELOW = 22;
@@ -20,6 +23,8 @@ export class Sound {
     this.view = null;
     this.asked = -Infinity;
     this.busy = false;
+    this.loads = 0;
+    this.moment = null;
     this.canvas = at("spectrogram");
     at("sound-channel").addEventListener("change", () => this.#load());
     at("sound-in").addEventListener("click", () => this.#zoom(0.5));
@@ -35,6 +40,7 @@ export class Sound {
     // For tests.
     this.canvas.position = (seconds, hz) => this.position(seconds, hz);
     this.canvas.view = () => this.picture && this.view;
+    this.canvas.painted = () => this.painted;
     new ResizeObserver(() => this.draw()).observe(this.canvas.parentElement);
   }
 
@@ -69,10 +75,15 @@ export class Sound {
   async #load() {
     const name = at("sound-channel").value;
     if (!name) return;
+    const order = ++this.loads;
     const answer = await fetch(`spectrogram.png?channel=${encodeURIComponent(name)}`);
     if (!answer.ok) return;
     const covers = JSON.parse(answer.headers.get("x-covers"));
-    this.picture = await createImageBitmap(await answer.blob());
+    const picture = await createImageBitmap(await answer.blob());
+    // If two requests overlap, the later one counts.
+    if (order !== this.loads) return;
+    this.picture = picture;
+    this.shown = name;
     const follows = !this.view || !this.covers || this.view.to >= this.covers.to_s;
     const whole = !this.view || (this.covers && this.view.from <= this.covers.from_s && follows);
     this.covers = covers;
@@ -178,51 +189,90 @@ export class Sound {
     return [LEFT + ((seconds - from) / (to - from)) * width, height * (1 - (hz - low) / (high - low))];
   }
 
+  /** Draws with the next frame, once for all changes before it. */
   draw() {
+    next(this.#paint);
+  }
+
+  #paint = () => {
     const { canvas } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !height) return;
     const ratio = window.devicePixelRatio || 1;
-    [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
+    const [across, down] = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (canvas.width !== across || canvas.height !== down) [canvas.width, canvas.height] = [across, down];
     const pen = canvas.getContext("2d");
-    pen.scale(ratio, ratio);
+    pen.setTransform(1, 0, 0, 1, 0, 0);
+    pen.clearRect(0, 0, across, down);
     if (!this.picture || !this.view) return;
     pen.save();
     pen.beginPath();
-    pen.rect(LEFT, 0, width - LEFT, height - BELOW);
+    pen.rect(LEFT * ratio, 0, (width - LEFT) * ratio, (height - BELOW) * ratio);
     pen.clip();
-    const { from_s: first, to_s: last, top_hz: top } = this.covers;
-    const [left, upper] = this.position(first, top);
-    const [right, lower] = this.position(last, 0);
-    pen.imageSmoothingEnabled = false;
-    pen.drawImage(this.picture, left, upper, right - left, lower - upper);
-    this.#overlay(pen);
+    this.#image(pen, ratio);
+    this.#overlay(pen, ratio);
     pen.restore();
+    pen.scale(ratio, ratio);
     this.#axes(pen, width, height);
+    this.#marker();
     const shown = this.view.to - this.view.from;
-    canvas.setAttribute("aria-label", `Spectrogram of ${at("sound-channel").value}, ${fixed(shown, 1)} s, ${fixed(this.view.low, 0)} to ${fixed(this.view.high, 0)} Hz`);
+    canvas.setAttribute("aria-label", `Spectrogram of ${this.shown}, ${fixed(shown, 1)} s, ${fixed(this.view.low, 0)} to ${fixed(this.view.high, 0)} Hz`);
+    this.painted = { channel: this.shown, ...this.view };
+  };
+
+  /** Draws the part of the picture in sight: as a whole, magnified, it would be too large to be placed to a pixel. */
+  #image(pen, ratio) {
+    const { picture, covers, view } = this;
+    const across = (seconds) => ((seconds - covers.from_s) / (covers.to_s - covers.from_s)) * picture.width;
+    const down = (hz) => (1 - hz / covers.top_hz) * picture.height;
+    const [from, to] = [Math.max(view.from, covers.from_s), Math.min(view.to, covers.to_s)];
+    const [low, high] = [Math.max(view.low, 0), Math.min(view.high, covers.top_hz)];
+    if (from >= to || low >= high) return;
+    const [left, upper] = this.position(from, high).map((px) => px * ratio);
+    const [right, lower] = this.position(to, low).map((px) => px * ratio);
+    pen.imageSmoothingEnabled = false;
+    pen.drawImage(picture, across(from), down(high), across(to) - across(from), down(low) - down(high), left, upper, right - left, lower - upper);
   }
 
-  /** Frequencies predicted to be unstable, and frames around the squeals. */
-  #overlay(pen) {
+  /** Frequencies predicted to be unstable, and frames around the squeals; in pixels of the screen. */
+  #overlay(pen, ratio) {
     const { bins, binS } = this.history;
+    const place = (seconds, hz) => this.position(seconds, hz).map((px) => px * ratio);
+    // Whole pixels, at most half a one off.
+    const thick = Math.max(1, Math.round(1.5 * ratio));
     pen.fillStyle = "#40e0ff";
-    for (const bin of bins) {
-      const [from, to] = [bin.k * binS, (bin.k + 1) * binS];
-      if (to < this.view.from || from > this.view.to) continue;
-      for (const [hz] of bin.u ?? []) {
-        const [x, y] = this.position(from, hz);
-        pen.fillRect(x, y - 0.75, Math.max(1, this.position(to, hz)[0] - x), 1.5);
+    for (let k = firstFrom(bins, (this.view.from - HOLDS_S) / binS); k < bins.length && bins[k].k * binS <= this.view.to; k++) {
+      const upTo = bins[k + 1]?.k - bins[k].k <= HOLDS_S / binS ? bins[k + 1].k : bins[k].k + 1;
+      for (const [hz] of bins[k].u ?? []) {
+        const [x, y] = place(bins[k].k * binS, hz);
+        const [end] = place(upTo * binS, hz);
+        pen.fillRect(Math.floor(x), Math.round(y - thick / 2), Math.max(1, Math.round(end) - Math.floor(x)), thick);
       }
     }
     pen.strokeStyle = "#fff";
-    pen.lineWidth = 1.5;
-    const name = at("sound-channel").value;
-    for (const squeal of this.squeals.filter((squeal) => squeal.channel === name)) {
-      const [x, y] = this.position(squeal.onset_s, squeal.frequency_hz);
-      const end = this.position(squeal.end_s ?? this.covers.to_s, squeal.frequency_hz)[0];
-      pen.strokeRect(x, y - 8, Math.max(2, end - x), 16);
+    pen.lineWidth = 1.5 * ratio;
+    for (const squeal of this.squeals.filter((squeal) => squeal.channel === this.shown)) {
+      const [x, y] = place(squeal.onset_s, squeal.frequency_hz);
+      const [end] = place(squeal.end_s ?? this.covers.to_s, squeal.frequency_hz);
+      pen.strokeRect(x, y - 8 * ratio, Math.max(2, end - x), 16 * ratio);
     }
+  }
+
+  /** Marks the moment of a recording that the rest of the page shows, and keeps it in sight. */
+  mark(moment) {
+    const moves = this.moment !== null && moment !== this.moment;
+    this.moment = moment;
+    if (!this.view) return;
+    const { from, to } = this.view;
+    if (moves && (moment < from || moment > to)) return this.#move(moment - from - 0.1 * (to - from), 0);
+    this.#marker();
+  }
+
+  #marker() {
+    const marker = at("sound-moment");
+    const { from, to } = this.view;
+    marker.hidden = this.moment === null || this.moment < from || this.moment > to;
+    if (!marker.hidden) marker.style.transform = `translateX(${this.position(this.moment, 0)[0].toFixed(1)}px)`;
   }
 
   #axes(pen, width, height) {
@@ -243,6 +293,17 @@ export class Sound {
       if (x > LEFT + 24 && x < width - 24) pen.fillText(label, x, height - BELOW / 2);
     }
   }
+}
+
+/** Index of the first bin whose number is at least `number`. */
+function firstFrom(bins, number) {
+  let [low, high] = [0, bins.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (bins[middle].k < number) low = middle + 1;
+    else high = middle;
+  }
+  return low;
 }
 
 /** Round values from `low` to `high`, at most `most` of them. */

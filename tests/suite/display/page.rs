@@ -2,14 +2,17 @@
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::{Shown, alone, browse, browser_ready};
 use crate::program::{self, PATIENCE, measuring, npz_bytes};
 use crate::sound_beside_logs::simulated;
-use squealcast::msgs::{OperatingPoint, Prediction};
+use squealcast::msgs::{Header, OperatingPoint, Prediction, Time, Waveform};
+use squealcast::offline::{self, Measured, Quantity, START_NS};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
+use squealcast::rig::Rig;
 
 /// Predictions of a recording with their conditions, by sequence number.
 fn predictions(directory: &Path) -> HashMap<u64, (OperatingPoint, Prediction)> {
@@ -249,6 +252,85 @@ fn the_page_shows_the_sound_of_a_recording_with_predictions_over_it_and_their_sc
         assert!(text.contains(&hits), "{text}");
     }
     shown.stop();
+}
+
+/// Channels of a long recording: 8 kHz, a tone of its own in each.
+const CHANNELS: [(&str, f64); 4] = [("front", 1500.0), ("rear", 2000.0), ("pad", 2500.0), ("disc", 3000.0)];
+const SAMPLE_RATE_HZ: f64 = 8000.0;
+/// Conditions in a second, and seconds.
+const PER_S: i64 = 2;
+const LENGTH_S: i64 = 600;
+
+/// Records ten minutes of four channels, of which channel `k` sounds from `100 k + 60` s on for 30 s, with predictions of the
+/// tribometer at friction coefficients at which it squeals. Returns the middles of the tones.
+fn ten_minutes_of_sound(directory: &Path) -> Vec<serde_json::Value> {
+    let header =
+        |time_s: f64| Header { stamp: Time::from_ns(START_NS + (time_s * 1e9) as i64), frame_id: String::new() };
+    let conditions = move |seq: i64| OperatingPoint {
+        header: header(seq as f64 / PER_S as f64),
+        seq: seq as u64,
+        normal_load_n: 500.0,
+        disc_speed_rad_s: 13.0,
+        friction_coefficient: 0.75 + 0.15 * (seq as f64 / 40.0).sin(),
+    };
+    // Noise with and without a tone of a whole number of periods, a second each.
+    let mut random = 1_u32;
+    let noise: Vec<f32> = std::iter::repeat_with(|| {
+        random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        0.004 * (random as f32 / u32::MAX as f32 - 0.5)
+    })
+    .take(SAMPLE_RATE_HZ as usize)
+    .collect();
+    let with_tone = |hz: f64| -> Vec<f32> {
+        let tone = (0..).map(|k| (std::f64::consts::TAU * hz * f64::from(k) / SAMPLE_RATE_HZ).sin() as f32);
+        noise.iter().zip(tone).map(|(noise, tone)| noise + tone).collect()
+    };
+    let tones = CHANNELS.map(|(_, hz)| with_tone(hz));
+    let sounds = |k: usize, second: i64| (0..30).contains(&(second - 100 * k as i64 - 60));
+    let block = |k: usize, second: i64| Waveform {
+        header: header(second as f64),
+        channel: CHANNELS[k].0.to_owned(),
+        sample_rate_hz: SAMPLE_RATE_HZ,
+        unit: "Pa".to_owned(),
+        sensitivity: String::new(),
+        samples: if sounds(k, second) { tones[k].clone() } else { noise.clone() },
+    };
+    let measured = (0..LENGTH_S).flat_map(|second| {
+        let inputs = (PER_S * second..PER_S * (second + 1)).map(|seq| Quantity::Conditions(conditions(seq)));
+        inputs.chain((0..CHANNELS.len()).map(|k| Quantity::Samples(block(k, second)))).collect::<Vec<_>>()
+    });
+    let points = (0..PER_S * LENGTH_S).map(|seq| squealcast::session::conditions(&conditions(seq)));
+    let rig = Arc::new(Rig::load("tribometer").unwrap());
+    let measured = measured.map(Measured::at_its_stamp);
+    offline::record(&rig, None, points, measured, Some(squealcast::sound::Settings::default()), directory).unwrap();
+    let middle_s = |k: usize| START_NS as f64 * 1e-9 + 100.0 * k as f64 + 75.0;
+    let planted = CHANNELS.iter().enumerate();
+    planted.map(|(k, (name, hz))| serde_json::json!({ "name": name, "hz": hz, "time_s": middle_s(k) })).collect()
+}
+
+/// The page answers each step through ten minutes of four channels, on the time line and in the spectrogram.
+#[test]
+fn the_page_follows_the_hand_through_ten_minutes_of_four_channels() {
+    let _alone = alone();
+    if !browser_ready() {
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let began = Instant::now();
+    let channels = ten_minutes_of_sound(directory.path());
+    let recorded = began.elapsed();
+    let shown = Shown::start(&["view", directory.path().to_str().unwrap()]);
+    let served = began.elapsed() - recorded;
+    let what = serde_json::json!({ "per_s": PER_S, "channels": channels }).to_string();
+    let speed = browse("scrub.mjs", &[&format!("http://{}/", shown.address), &what]);
+    shown.stop();
+    println!("recorded in {recorded:?}, served in {served:?}: {speed}");
+    if measuring() {
+        for wait in ["step_ms", "choose_ms", "pan_ms"] {
+            assert!(speed[wait]["median"].as_f64().unwrap() < 100.0, "{wait}: {speed}");
+        }
+        assert!(speed["drag"]["longest_frame_ms"].as_f64().unwrap() < 250.0, "{speed}");
+    }
 }
 
 fn tribometer_axis() -> squealcast::rig::DiscAxis {
