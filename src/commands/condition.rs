@@ -1,18 +1,85 @@
-//! One condition of an operating point as the variable of a command: friction coefficient, load or speed.
+//! One condition as the variable of a command: friction coefficient, load, speed or temperature.
 
+use std::borrow::Cow;
 use std::panic::resume_unwind;
 
+use anyhow::Context;
+
+use crate::msgs::listed;
 use crate::physics::{OperatingPoint, Solver};
+use crate::rig::{Rig, RigError};
 
 /// An edge between two operating points is located to this share of their distance.
 const EDGE_TOLERANCE: f64 = 1e-6;
 
-/// A condition.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Condition {
-    Friction,
-    Load,
-    Speed,
+/// An operating point, with the temperature of a rig that has one, °C.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    pub point: OperatingPoint,
+    pub temperature_c: Option<f64>,
+}
+
+impl Place {
+    /// The conditions that every table of places begins with.
+    pub(super) const COLUMNS: [&str; 3] = ["normal_load_n", "disc_speed_rad_s", "friction_coefficient"];
+    /// The column after them, of a rig with a temperature.
+    pub(super) const TEMPERATURE_COLUMN: &str = "temperature_c";
+
+    /// The values of these columns.
+    pub(super) fn cells(&self) -> impl Iterator<Item = String> {
+        let OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient } = self.point;
+        let conditions = [normal_load_n, disc_speed_rad_s, friction_coefficient];
+        conditions.into_iter().chain(self.temperature_c).map(|value| value.to_string())
+    }
+
+    /// The columns of a table of places of `rig`.
+    pub(super) fn columns(rig: &Rig) -> impl Iterator<Item = &'static str> {
+        Self::COLUMNS.into_iter().chain(rig.temperature_c().map(|_| Self::TEMPERATURE_COLUMN))
+    }
+
+    /// The rig at the temperature of this place.
+    ///
+    /// # Errors
+    /// [`RigError`] if the rig has no such temperature.
+    pub(super) fn rig<'a>(&self, rig: &'a Rig) -> Result<Cow<'a, Rig>, RigError> {
+        match self.temperature_c {
+            Some(celsius) if rig.temperature_c() != Some(celsius) => rig.at_temperature(celsius).map(Cow::Owned),
+            Some(_) | None => Ok(Cow::Borrowed(rig)),
+        }
+    }
+
+    /// Checks that `rig` accepts the conditions.
+    ///
+    /// # Errors
+    /// The condition that is out of range.
+    pub(super) fn check(&self, rig: &Rig) -> anyhow::Result<()> {
+        rig.limits.check(&self.point).with_context(|| rig.name.clone())?;
+        Ok(self.temperature_c.map_or(Ok(()), |celsius| rig.accepts_temperature(celsius))?)
+    }
+
+    /// The conditions that are not `varied`, in words.
+    pub(super) fn fixed(&self, varied: &[Condition]) -> String {
+        let words =
+            Condition::ALL.into_iter().filter(|condition| !varied.contains(condition)).filter_map(|condition| {
+                Some(condition.of(self)).filter(|value| !value.is_nan()).map(|value| match condition {
+                    Condition::Friction => format!("friction coefficient {value}"),
+                    Condition::Load => format!("{value} N"),
+                    Condition::Speed => format!("{value} rad/s"),
+                    Condition::Temperature => format!("{value} °C"),
+                })
+            });
+        words.collect::<Vec<_>>().join(", ")
+    }
+}
+
+listed! {
+    /// A condition.
+    pub(super) enum Condition {
+        Friction,
+        Load,
+        Speed,
+        Temperature,
+    }
 }
 
 impl Condition {
@@ -22,24 +89,28 @@ impl Condition {
             Self::Friction => "friction coefficient",
             Self::Load => "normal load, N",
             Self::Speed => "disc speed, rad/s",
+            Self::Temperature => "temperature, °C",
         }
     }
 
-    /// `point` with this condition at `value`.
-    pub(super) fn set(self, point: OperatingPoint, value: f64) -> OperatingPoint {
+    /// `place` with this condition at `value`.
+    pub(super) fn set(self, place: Place, value: f64) -> Place {
+        let point = place.point;
         match self {
-            Self::Friction => point.with_friction(value),
-            Self::Load => OperatingPoint { normal_load_n: value, ..point },
-            Self::Speed => OperatingPoint { disc_speed_rad_s: value, ..point },
+            Self::Friction => Place { point: point.with_friction(value), ..place },
+            Self::Load => Place { point: OperatingPoint { normal_load_n: value, ..point }, ..place },
+            Self::Speed => Place { point: OperatingPoint { disc_speed_rad_s: value, ..point }, ..place },
+            Self::Temperature => Place { temperature_c: Some(value), ..place },
         }
     }
 
-    /// The value of this condition at `point`.
-    pub(super) fn of(self, point: &OperatingPoint) -> f64 {
+    /// The value of this condition at `place`; NaN for the temperature of a rig without one.
+    pub(super) fn of(self, place: &Place) -> f64 {
         match self {
-            Self::Friction => point.friction_coefficient,
-            Self::Load => point.normal_load_n,
-            Self::Speed => point.disc_speed_rad_s,
+            Self::Friction => place.point.friction_coefficient,
+            Self::Load => place.point.normal_load_n,
+            Self::Speed => place.point.disc_speed_rad_s,
+            Self::Temperature => place.temperature_c.unwrap_or(f64::NAN),
         }
     }
 }

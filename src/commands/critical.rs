@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::{LoadAndSpeed, Outcome, RigName, format, not_negative, print, write_file};
+use super::{AtTemperature, LoadAndSpeed, Outcome, RigName, format, not_negative, print, write_file};
 use crate::display::curves::Curves;
 use crate::figures::plot;
 use crate::physics::stability_map::SlidingEnd;
@@ -22,6 +22,8 @@ pub struct Options {
     mu_max: Option<f64>,
     #[command(flatten)]
     load_and_speed: LoadAndSpeed,
+    #[command(flatten)]
+    temperature: AtTemperature,
     /// Draw growth rates and frequencies over the friction coefficient into this file, with shaded windows
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
@@ -82,14 +84,15 @@ impl<'a> WindowReport<'a> {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let rig = Rig::load(&self.rig)?;
+        let rig = self.temperature.of(Rig::load(&self.rig)?)?;
         let point = self.load_and_speed.point(&rig)?;
         let mu_max = self.mu_max.unwrap_or(rig.mu_max);
         let options = MapOptions { mu_max, ..map_options(&rig) };
         let mut solver = Solver::new(rig.model.dimension());
         let map = StabilityMap::build(&rig.model, &mut solver, &point, &options)?;
         if let Some(path) = &self.svg {
-            let title = format!("{}, {} N, {} rad/s", rig.name, point.normal_load_n, point.disc_speed_rad_s);
+            let (load, speed) = (point.normal_load_n, point.disc_speed_rad_s);
+            let title = format!("{}, {load} N, {speed} rad/s{}", rig.name, format::temperature(&rig));
             let curves = Curves::new(&map, rig.band_max_hz);
             write_file(path, plot::map(&title, &curves, mu_max, map.critical_friction())?.as_bytes())?;
         }

@@ -11,11 +11,17 @@ pub use crate::text::number::significant;
 fn conditions(rig: &Rig, point: &OperatingPoint) -> String {
     let OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient } = point;
     let mut text = format!(
-        "{}: {normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}\n",
-        rig.name
+        "{}: {normal_load_n} N, {disc_speed_rad_s} rad/s, friction coefficient {friction_coefficient}{}\n",
+        rig.name,
+        temperature(rig)
     );
     rig.notes(point).for_each(|note| text += &format!("{note}\n"));
     text
+}
+
+/// The temperature of a rig that has one, after other conditions.
+pub fn temperature(rig: &Rig) -> String {
+    rig.temperature_c().map(|celsius| format!(", {celsius} °C")).unwrap_or_default()
 }
 
 /// Pairs closed and contact force, as a line of text.
@@ -63,7 +69,8 @@ pub fn prediction(rig: &Rig, point: &OperatingPoint, summary: &Summary, state: O
 
 /// Windows of instability as a table.
 pub fn windows(rig: &Rig, map: &StabilityMap, mu_max: f64) -> String {
-    let mut text = format!("{}: {} N, {} rad/s\n", rig.name, map.point.normal_load_n, map.point.disc_speed_rad_s);
+    let OperatingPoint { normal_load_n, disc_speed_rad_s, .. } = map.point;
+    let mut text = format!("{}: {normal_load_n} N, {disc_speed_rad_s} rad/s{}\n", rig.name, temperature(rig));
     rig.notes(&map.point).for_each(|note| text += &format!("{note}\n"));
     match map.critical_friction() {
         None => {

@@ -1,14 +1,14 @@
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use clap::Args;
 
-use super::condition::{Condition, change_between, in_parallel};
+use super::condition::{Condition, Place, change_between, in_parallel};
 use super::steps::ProgressOptions;
-use super::{Conditions, Outcome, RigName, finite, print, write_file};
+use super::{AtTemperature, Conditions, Outcome, RigName, finite, print, write_file};
 use crate::figures::plane::{self, Axis, Cell, Edge, Plane};
-use crate::physics::{MapOptions, OperatingPoint, Solver, StabilityMap, Summary, Vectors};
+use crate::physics::{MapOptions, Solver, StabilityMap, Summary, Vectors};
 use crate::rig::Rig;
 use crate::session::map_options;
 
@@ -21,7 +21,7 @@ pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
-    /// Condition along x with its range: mu, load (N) or speed (rad/s)
+    /// Condition along x with its range: mu, load (N), speed (rad/s) or temperature (°C)
     #[arg(long, value_name = "CONDITION=FROM:TO", default_value = "mu=0:1", allow_hyphen_values = true)]
     x: Span,
     /// Condition along y with its range
@@ -32,6 +32,8 @@ pub struct Options {
     points: Grid,
     #[command(flatten)]
     conditions: Conditions,
+    #[command(flatten)]
+    temperature: AtTemperature,
     /// Write the map as CSV to this file, - for standard output [default: -, unless --svg is given]
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
@@ -66,7 +68,8 @@ impl std::str::FromStr for Span {
             "mu" => Condition::Friction,
             "load" => Condition::Load,
             "speed" => Condition::Speed,
-            other => return Err(format!("`{other}` is no condition, expected mu, load or speed")),
+            "temperature" => Condition::Temperature,
+            other => return Err(format!("`{other}` is no condition, expected mu, load, speed or temperature")),
         };
         let Some((from, to)) = range.split_once(':') else { return Err("expected a range FROM:TO".to_owned()) };
         let (from, to) = (finite(from)?, finite(to)?);
@@ -103,17 +106,17 @@ impl Span {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let rig = Rig::load(&self.rig)?;
+        let rig = self.temperature.of(Rig::load(&self.rig)?)?;
         if self.x.condition == self.y.condition {
             bail!(
-                "--x and --y are the same condition, {}: expected two of mu, load and speed",
+                "--x and --y are the same condition, {}: expected two of mu, load, speed and temperature",
                 self.x.condition.label()
             );
         }
-        let fixed = self.conditions.point(&rig.name, &rig.reference, &rig.limits)?;
+        let point = self.conditions.point(&rig.name, &rig.reference, &rig.limits)?;
+        let fixed = Place { point, temperature_c: rig.temperature_c() };
         for (x, y) in [(self.x.from, self.y.from), (self.x.to, self.y.to)] {
-            let corner = self.y.condition.set(self.x.condition.set(fixed, x), y);
-            rig.limits.check(&corner).with_context(|| rig.name.clone())?;
+            self.y.condition.set(self.x.condition.set(fixed, x), y).check(&rig)?;
         }
         let Grid([nx, ny]) = self.points;
         let (xs, ys) = (self.x.values(nx), self.y.values(ny));
@@ -142,28 +145,17 @@ impl Options {
         if across {
             cells = (0..ny).map(|y| (0..nx).map(|x| cells[x][y].clone()).collect()).collect();
         }
-        let csv = to_csv(&cells)?;
+        let csv = to_csv(&rig, &cells)?;
         match (&self.csv, &self.svg) {
             (Some(path), _) => write_file(path, csv.as_bytes())?,
             (None, None) => print(&csv)?,
             (None, Some(_)) => {}
         }
         if let Some(path) = &self.edges {
-            write_file(path, edges_to_csv(&edges)?.as_bytes())?;
+            write_file(path, edges_to_csv(&rig, &edges)?.as_bytes())?;
         }
         if let Some(path) = &self.svg {
             let axis = |span: &Span, values: Vec<f64>| Axis { label: span.condition.label(), values };
-            let rest = match (self.x.condition, self.y.condition) {
-                (Condition::Friction, Condition::Load) | (Condition::Load, Condition::Friction) => {
-                    format!("{} rad/s", fixed.disc_speed_rad_s)
-                }
-                (Condition::Friction, Condition::Speed) | (Condition::Speed, Condition::Friction) => {
-                    format!("{} N", fixed.normal_load_n)
-                }
-                (Condition::Load | Condition::Speed | Condition::Friction, _) => {
-                    format!("friction coefficient {}", fixed.friction_coefficient)
-                }
-            };
             let (x, y) = (self.x.condition, self.y.condition);
             let plane = Plane {
                 x: axis(&self.x, xs),
@@ -172,9 +164,9 @@ impl Options {
                     .iter()
                     .map(|row| row.iter().map(|(_, cell)| cell.clone().map_or(Cell::Fault, Cell::from)).collect())
                     .collect(),
-                edges: edges.iter().map(|(point, edge)| (x.of(point), y.of(point), *edge)).collect(),
+                edges: edges.iter().map(|(place, edge)| (x.of(place), y.of(place), *edge)).collect(),
             };
-            let title = format!("{}: largest growth rate, {rest}", rig.name);
+            let title = format!("{}: largest growth rate, {}", rig.name, fixed.fixed(&[x, y]));
             write_file(path, plane::draw(&title, &plane)?.as_bytes())?;
         }
         Ok(Outcome::Done)
@@ -197,35 +189,36 @@ impl From<Growth> for Cell {
     }
 }
 
-/// The growth rate at each operating point, or why there is none, and the edges of windows.
+/// The growth rate at each place, or why there is none, and the edges of windows.
 struct Line {
-    cells: Vec<(OperatingPoint, Result<Growth, String>)>,
-    edges: Vec<(OperatingPoint, Edge)>,
+    cells: Vec<(Place, Result<Growth, String>)>,
+    edges: Vec<(Place, Edge)>,
 }
 
-/// The operating points of one line: `fixed` with `along` at each of `values`.
-fn line(rig: &Rig, solver: &mut Solver, fixed: OperatingPoint, along: Span, values: &[f64]) -> anyhow::Result<Line> {
+/// The places of one line: `fixed` with `along` at each of `values`.
+fn line(rig: &Rig, solver: &mut Solver, fixed: Place, along: Span, values: &[f64]) -> anyhow::Result<Line> {
+    let rig = fixed.rig(rig)?;
     let mut cells = vec![];
     for &value in values {
-        let point = along.condition.set(fixed, value);
-        cells.push((point, growth(rig, solver, &point)));
+        let place = along.condition.set(fixed, value);
+        cells.push((place, growth(&rig, solver, &place)));
     }
     let mut edges = vec![];
     match along.condition {
         Condition::Friction => {
             // A map is followed from 0.
             let (mu_min, mu_max) = (along.from.min(0.0), along.to.max(0.0));
-            let options = MapOptions { mu_min, mu_max, ..map_options(rig) };
-            let map = StabilityMap::build(&rig.model, solver, &fixed, &options)?;
+            let options = MapOptions { mu_min, mu_max, ..map_options(&rig) };
+            let map = StabilityMap::build(&rig.model, solver, &fixed.point, &options)?;
             for window in &map.windows {
                 let ends = [Some((window.mu_from, Edge::Begins)), window.mu_to.map(|mu| (mu, Edge::Ends))];
                 let inside = |(mu, _): &(f64, Edge)| *mu > along.from && *mu < along.to;
                 edges.extend(
-                    ends.into_iter().flatten().filter(inside).map(|(mu, edge)| (fixed.with_friction(mu), edge)),
+                    ends.into_iter().flatten().filter(inside).map(|(mu, edge)| (along.condition.set(fixed, mu), edge)),
                 );
             }
         }
-        Condition::Load | Condition::Speed => {
+        Condition::Load | Condition::Speed | Condition::Temperature => {
             let unstable = |cell: &Result<Growth, String>| cell.as_ref().ok().map(|growth| growth.unstable_modes > 0);
             for pair in cells.windows(2) {
                 let [(from, left), (to, right)] = pair else { continue };
@@ -233,8 +226,8 @@ fn line(rig: &Rig, solver: &mut Solver, fixed: OperatingPoint, along: Span, valu
                 if before == after {
                     continue;
                 }
-                let [low, high] = [from, to].map(|point| along.condition.of(point));
-                let grows = |value| unstable(&growth(rig, solver, &along.condition.set(fixed, value)));
+                let [low, high] = [from, to].map(|place| along.condition.of(place));
+                let grows = |value| unstable(&growth(&rig, solver, &along.condition.set(fixed, value)));
                 let at = change_between(low, high, before, grows);
                 let edge = if after { Edge::Begins } else { Edge::Ends };
                 edges.push((along.condition.set(fixed, at), edge));
@@ -244,9 +237,10 @@ fn line(rig: &Rig, solver: &mut Solver, fixed: OperatingPoint, along: Span, valu
     Ok(Line { cells, edges })
 }
 
-/// The largest growth rate in the band at `point`, or why there is no prediction.
-fn growth(rig: &Rig, solver: &mut Solver, point: &OperatingPoint) -> Result<Growth, String> {
-    let spectrum = solver.solve(&rig.model, point, Vectors::Right).map_err(|error| error.to_string())?;
+/// The largest growth rate in the band at `place`, or why there is no prediction.
+fn growth(rig: &Rig, solver: &mut Solver, place: &Place) -> Result<Growth, String> {
+    let rig = place.rig(rig).map_err(|error| error.to_string())?;
+    let spectrum = solver.solve(&rig.model, &place.point, Vectors::Right).map_err(|error| error.to_string())?;
     let summary = Summary::of_spectrum(&spectrum, None, rig.band_max_hz, rig.instability_threshold);
     Ok(Growth {
         max_growth_rate_per_s: summary.max_growth_rate_per_s.unwrap_or(f64::NAN),
@@ -256,17 +250,11 @@ fn growth(rig: &Rig, solver: &mut Solver, point: &OperatingPoint) -> Result<Grow
     })
 }
 
-const CONDITIONS: [&str; 3] = ["normal_load_n", "disc_speed_rad_s", "friction_coefficient"];
-
-fn conditions(point: &OperatingPoint) -> [String; 3] {
-    [point.normal_load_n, point.disc_speed_rad_s, point.friction_coefficient].map(|value| value.to_string())
-}
-
-fn to_csv(rows: &[Vec<(OperatingPoint, Result<Growth, String>)>]) -> anyhow::Result<String> {
+fn to_csv(rig: &Rig, rows: &[Vec<(Place, Result<Growth, String>)>]) -> anyhow::Result<String> {
     let mut writer = csv::Writer::from_writer(vec![]);
     let own = ["unstable_modes", "max_growth_rate_per_s", "frequency_hz", "pairs_closed", "fault"];
-    writer.write_record(CONDITIONS.into_iter().chain(own))?;
-    for (point, cell) in rows.iter().flatten() {
+    writer.write_record(Place::columns(rig).chain(own))?;
+    for (place, cell) in rows.iter().flatten() {
         let values = match cell {
             Ok(growth) => [
                 growth.unstable_modes.to_string(),
@@ -277,20 +265,20 @@ fn to_csv(rows: &[Vec<(OperatingPoint, Result<Growth, String>)>]) -> anyhow::Res
             ],
             Err(reason) => [String::new(), String::new(), String::new(), String::new(), reason.clone()],
         };
-        writer.write_record(conditions(point).into_iter().chain(values))?;
+        writer.write_record(place.cells().chain(values))?;
     }
     Ok(String::from_utf8(writer.into_inner()?)?)
 }
 
-fn edges_to_csv(edges: &[(OperatingPoint, Edge)]) -> anyhow::Result<String> {
+fn edges_to_csv(rig: &Rig, edges: &[(Place, Edge)]) -> anyhow::Result<String> {
     let mut writer = csv::Writer::from_writer(vec![]);
-    writer.write_record(CONDITIONS.into_iter().chain(["instability"]))?;
-    for (point, edge) in edges {
+    writer.write_record(Place::columns(rig).chain(["instability"]))?;
+    for (place, edge) in edges {
         let name = match edge {
             Edge::Begins => "begins",
             Edge::Ends => "ends",
         };
-        writer.write_record(conditions(point).into_iter().chain([name.to_owned()]))?;
+        writer.write_record(place.cells().chain([name.to_owned()]))?;
     }
     Ok(String::from_utf8(writer.into_inner()?)?)
 }

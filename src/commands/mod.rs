@@ -201,6 +201,27 @@ struct LoadAndSpeed {
     speed: Option<f64>,
 }
 
+/// The temperature at which a rig is predicted.
+#[derive(Clone, Copy, Debug, Args)]
+struct AtTemperature {
+    /// Temperature of the contact in °C, of a rig with [temperature] [default: the reference of RIG]
+    #[arg(long = "temperature", value_name = "C", value_parser = finite, allow_negative_numbers = true)]
+    temperature_c: Option<f64>,
+}
+
+impl AtTemperature {
+    /// `rig` at this temperature.
+    ///
+    /// # Errors
+    /// A rig that does not follow the temperature, or a temperature out of range.
+    fn of(self, rig: Rig) -> anyhow::Result<Rig> {
+        Ok(match self.temperature_c {
+            Some(celsius) => rig.at_temperature(celsius)?,
+            None => rig,
+        })
+    }
+}
+
 impl Conditions {
     /// The operating point; an error if it is outside the `limits` of the rig or model called `name`.
     ///

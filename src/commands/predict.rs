@@ -3,7 +3,7 @@ use std::sync::Arc;
 use clap::Args;
 use serde::Serialize;
 
-use super::{Conditions, Outcome, RigName, format, print};
+use super::{AtTemperature, Conditions, Outcome, RigName, format, print};
 use crate::contact::SteadyState;
 use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors};
 use crate::rig::Rig;
@@ -17,6 +17,8 @@ pub struct Options {
     rig: String,
     #[command(flatten)]
     conditions: Conditions,
+    #[command(flatten)]
+    temperature: AtTemperature,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -29,6 +31,9 @@ struct Report<'a> {
     normal_load_n: f64,
     disc_speed_rad_s: f64,
     friction_coefficient: f64,
+    /// Only for a rig that follows the temperature.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    temperature_c: Option<f64>,
     unstable_modes: u32,
     max_growth_rate_per_s: Option<f64>,
     nonoscillatory_growth_per_s: &'a [f64],
@@ -89,7 +94,7 @@ impl From<&Mode> for ModeReport {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        let rig = Rig::load(&self.rig)?;
+        let rig = self.temperature.of(Rig::load(&self.rig)?)?;
         let point = self.conditions.point(&rig.name, &rig.reference, &rig.limits)?;
         let (summary, state) = predict(&rig, &point)?;
         let state = state.as_deref();
@@ -99,6 +104,7 @@ impl Options {
                 normal_load_n: point.normal_load_n,
                 disc_speed_rad_s: point.disc_speed_rad_s,
                 friction_coefficient: point.friction_coefficient,
+                temperature_c: rig.temperature_c(),
                 unstable_modes: summary.unstable_modes,
                 max_growth_rate_per_s: summary.max_growth_rate_per_s,
                 nonoscillatory_growth_per_s: &summary.nonoscillatory_growth_per_s,

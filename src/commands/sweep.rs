@@ -1,23 +1,23 @@
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use clap::Args;
 
-use super::condition::{Condition, change_between, in_parallel};
+use super::condition::{Condition, Place, change_between, in_parallel};
 use super::{Outcome, RigName, finite, format, print, write_file};
 use crate::figures::plot::{self, Point, Shaded};
-use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors, Window};
+use crate::physics::{MapOptions, Mode, Solver, StabilityMap, Summary, Vectors, Window};
 use crate::rig::Rig;
 use crate::session::map_options;
 
-/// Sweep friction coefficient, load or speed, following modes through crossings and merging points
+/// Sweep friction coefficient, load, speed or temperature, following modes through crossings and merging points
 #[derive(Debug, Args)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
-    /// Friction coefficients as FROM:TO:STEP, or one of them to sweep load or speed [default: 0:1:0.01, or the reference of
-    /// RIG]
+    /// Friction coefficients as FROM:TO:STEP, or one of them to sweep another condition [default: 0:1:0.01, or the reference
+    /// of RIG]
     #[arg(long, value_name = "FROM:TO:STEP", allow_hyphen_values = true)]
     mu: Option<Values>,
     /// Normal load in N, or loads as FROM:TO:STEP [default: the reference of RIG]
@@ -26,6 +26,9 @@ pub struct Options {
     /// Disc speed in rad/s, or speeds as FROM:TO:STEP; negative turns the other way [default: the reference of RIG]
     #[arg(long, value_name = "RAD_S", allow_hyphen_values = true)]
     speed: Option<Values>,
+    /// Temperature in °C, or temperatures as FROM:TO:STEP, of a rig with [temperature] [default: the reference of RIG]
+    #[arg(long, value_name = "C", allow_hyphen_values = true)]
+    temperature: Option<Values>,
     /// Write the modes as CSV to this file, - for standard output [default: -, unless --svg is given]
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
@@ -92,12 +95,12 @@ const FRICTION: Range = Range { from: 0.0, to: 1.0, step: 0.01 };
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
-        let (condition, range, point) = self.swept(&rig)?;
+        let (condition, range, place) = self.swept(&rig)?;
         let swept = match condition {
-            Condition::Friction => over_friction(&rig, &point, range, self.svg.is_some())?,
-            Condition::Load | Condition::Speed => over_load_or_speed(&rig, &point, condition, range),
+            Condition::Friction => over_friction(place.rig(&rig)?.as_ref(), &place, range, self.svg.is_some())?,
+            Condition::Load | Condition::Speed | Condition::Temperature => over_other(&rig, &place, condition, range),
         };
-        let csv = to_csv(&swept.modes)?;
+        let csv = to_csv(&rig, &swept.modes)?;
         match (&self.csv, &self.svg) {
             (Some(path), _) => write_file(path, csv.as_bytes())?,
             (None, None) => print(&csv)?,
@@ -107,62 +110,59 @@ impl Options {
             let mut points: Vec<Point> =
                 swept.modes.iter().chain(&swept.beside_ends).map(|s| s.drawn(condition)).collect();
             points.sort_by(|a, b| a.x.total_cmp(&b.x));
-            let title = format!("{}, {}", rig.name, rest(condition, &point));
+            let title = format!("{}, {}", rig.name, place.fixed(&[condition]));
             write_file(path, plot::sweep(&title, condition.label(), &points, &swept.windows)?.as_bytes())?;
             note!("{}: {}", path.display(), format::count(swept.windows.len(), "window") + " of instability");
         }
         Ok(Outcome::Done)
     }
 
-    /// The condition that is swept, its range, and the operating point with the other two.
+    /// The condition that is swept, its range, and the others.
     ///
     /// # Errors
-    /// More than one range, no range, or a condition outside the limits of the rig.
-    fn swept(&self, rig: &Rig) -> anyhow::Result<(Condition, Range, OperatingPoint)> {
-        let given = [(Condition::Friction, self.mu), (Condition::Load, self.load), (Condition::Speed, self.speed)];
-        let (mut ranges, mut point) = (vec![], rig.reference);
+    /// More than one range, no range, or a condition that the rig does not accept.
+    fn swept(&self, rig: &Rig) -> anyhow::Result<(Condition, Range, Place)> {
+        let given = [
+            (Condition::Friction, self.mu),
+            (Condition::Load, self.load),
+            (Condition::Speed, self.speed),
+            (Condition::Temperature, self.temperature),
+        ];
+        let (mut ranges, mut place) = (vec![], Place { point: rig.reference, temperature_c: rig.temperature_c() });
         for (condition, values) in given {
             match values {
                 Some(Values::Range(range)) => ranges.push((condition, range)),
-                Some(Values::One(value)) => point = condition.set(point, value),
+                Some(Values::One(value)) => place = condition.set(place, value),
                 None => {}
             }
         }
         let (condition, range) = match (ranges.as_slice(), self.mu) {
             (&[one], _) => one,
             ([], None) => (Condition::Friction, FRICTION),
-            ([], Some(_)) => {
-                bail!("--mu is one friction coefficient: expected a range FROM:TO:STEP of --load or --speed")
-            }
-            (several, _) => bail!("{} ranges, expected one of --mu, --load and --speed as FROM:TO:STEP", several.len()),
+            ([], Some(_)) => bail!(
+                "--mu is one friction coefficient: expected a range FROM:TO:STEP of --load, --speed or --temperature"
+            ),
+            (several, _) => bail!(
+                "{} ranges, expected one of --mu, --load, --speed and --temperature as FROM:TO:STEP",
+                several.len()
+            ),
         };
-        let limits = |point| rig.limits.check(&point).with_context(|| rig.name.clone());
         match condition {
             // Friction coefficients may be swept beyond the limits of inputs.
-            Condition::Friction => limits(point.with_friction(rig.reference.friction_coefficient))?,
-            Condition::Load | Condition::Speed => {
-                limits(condition.set(point, range.from))?;
-                limits(condition.set(point, range.to))?;
+            Condition::Friction => condition.set(place, rig.reference.friction_coefficient).check(rig)?,
+            Condition::Load | Condition::Speed | Condition::Temperature => {
+                condition.set(place, range.from).check(rig)?;
+                condition.set(place, range.to).check(rig)?;
             }
         }
-        Ok((condition, range, point))
+        Ok((condition, range, place))
     }
 }
 
-/// The two conditions that are not swept, in words.
-fn rest(swept: Condition, point: &OperatingPoint) -> String {
-    let OperatingPoint { normal_load_n: load, disc_speed_rad_s: speed, friction_coefficient: mu } = point;
-    match swept {
-        Condition::Friction => format!("{load} N, {speed} rad/s"),
-        Condition::Load => format!("friction coefficient {mu}, {speed} rad/s"),
-        Condition::Speed => format!("friction coefficient {mu}, {load} N"),
-    }
-}
-
-/// A mode at an operating point.
+/// A mode at a place.
 #[derive(Clone, Copy, Debug)]
 struct Swept {
-    point: OperatingPoint,
+    place: Place,
     mode: Mode,
 }
 
@@ -170,7 +170,7 @@ impl Swept {
     /// The mode as a point of a curve over `condition`.
     fn drawn(&self, condition: Condition) -> Point {
         Point {
-            x: condition.of(&self.point),
+            x: condition.of(&self.place),
             id: self.mode.id,
             frequency_hz: self.mode.root.frequency_hz(),
             growth_rate_per_s: self.mode.root.growth_rate_per_s(),
@@ -191,19 +191,19 @@ struct Sweep {
 }
 
 /// All modes of the band at every friction coefficient of the range, and the windows of instability if requested.
-fn over_friction(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool) -> anyhow::Result<Sweep> {
+fn over_friction(rig: &Rig, place: &Place, range: Range, windows: bool) -> anyhow::Result<Sweep> {
     let mut solver = Solver::new(rig.model.dimension());
     // At least the range that a session searches, so that identities are the same.
     let searched = map_options(rig);
     let (mu_min, mu_max) = (range.from.min(searched.mu_min), range.to.max(searched.mu_max));
     let followed = MapOptions { mu_min, mu_max, windows, ..searched };
-    let map = StabilityMap::build(&rig.model, &mut solver, point, &followed)?;
+    let map = StabilityMap::build(&rig.model, &mut solver, &place.point, &followed)?;
     let mut values: Vec<f64> = range.values().collect();
     if let Some(end) = &map.sliding_ends {
         values.retain(|&mu| mu <= end.mu);
         note!("the sweep ends at friction coefficient {:.6}: {}", end.mu, end.reason);
     }
-    let at = |mu: f64, solver: &mut Solver| modes_at(rig, solver, &point.with_friction(mu), &map);
+    let at = |mu: f64, solver: &mut Solver| modes_at(rig, solver, Condition::Friction.set(*place, mu), &map);
     let mut modes = vec![];
     for found in in_parallel(&values, rig.model.dimension(), at) {
         modes.extend(found?);
@@ -222,24 +222,25 @@ fn over_friction(rig: &Rig, point: &OperatingPoint, range: Range, windows: bool)
     Ok(Sweep { modes, beside_ends, windows })
 }
 
-/// All modes of the band at `point`, with the identities that `map` gives.
-fn modes_at(rig: &Rig, solver: &mut Solver, point: &OperatingPoint, map: &StabilityMap) -> anyhow::Result<Vec<Swept>> {
-    let spectrum = solver.solve(&rig.model, point, Vectors::Right)?;
+/// All modes of the band at `place`, at whose temperature `rig` is, with the identities that `map` gives.
+fn modes_at(rig: &Rig, solver: &mut Solver, place: Place, map: &StabilityMap) -> anyhow::Result<Vec<Swept>> {
+    let spectrum = solver.solve(&rig.model, &place.point, Vectors::Right)?;
     let summary = Summary::of_spectrum(&spectrum, Some(map), rig.band_max_hz, rig.instability_threshold);
-    Ok(summary.modes.into_iter().map(|mode| Swept { point: *point, mode }).collect())
+    Ok(summary.modes.into_iter().map(|mode| Swept { place, mode }).collect())
 }
 
-/// All modes of the band at every load or speed of the range, with the ranges of load or speed in which one is unstable.
+/// All modes of the band at every value of a condition other than friction, with the ranges of it in which one is unstable.
 /// Identities at each of them are those of its own stability map. Values without a prediction are named in a note.
-fn over_load_or_speed(rig: &Rig, point: &OperatingPoint, condition: Condition, range: Range) -> Sweep {
+fn over_other(rig: &Rig, place: &Place, condition: Condition, range: Range) -> Sweep {
     let searched = map_options(rig);
-    let mu = point.friction_coefficient;
+    let mu = place.point.friction_coefficient;
     let followed =
         MapOptions { mu_min: mu.min(searched.mu_min), mu_max: mu.max(searched.mu_max), windows: false, ..searched };
     let at = |value: f64, solver: &mut Solver| -> anyhow::Result<Vec<Swept>> {
-        let point = condition.set(*point, value);
-        let map = StabilityMap::build(&rig.model, solver, &point, &followed)?;
-        modes_at(rig, solver, &point, &map)
+        let place = condition.set(*place, value);
+        let rig = place.rig(rig)?;
+        let map = StabilityMap::build(&rig.model, solver, &place.point, &followed)?;
+        modes_at(&rig, solver, place, &map)
     };
     let values: Vec<f64> = range.values().collect();
     let (mut modes, mut stable, mut missing) = (vec![], vec![], vec![]);
@@ -312,23 +313,14 @@ impl Sweep {
     }
 }
 
-fn to_csv(modes: &[Swept]) -> anyhow::Result<String> {
+fn to_csv(rig: &Rig, modes: &[Swept]) -> anyhow::Result<String> {
     let mut writer = csv::Writer::from_writer(vec![]);
-    writer.write_record([
-        "normal_load_n",
-        "disc_speed_rad_s",
-        "friction_coefficient",
-        "mode_id",
-        "frequency_hz",
-        "growth_rate_per_s",
-        "damping_ratio",
-    ])?;
-    for Swept { point, mode } in modes {
+    let own = ["mode_id", "frequency_hz", "growth_rate_per_s", "damping_ratio"];
+    writer.write_record(Place::columns(rig).chain(own))?;
+    for Swept { place, mode } in modes {
         let root = &mode.root;
-        let OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient } = point;
-        let conditions = [normal_load_n, disc_speed_rad_s, friction_coefficient].map(f64::to_string);
         let values = [root.frequency_hz(), root.growth_rate_per_s(), root.damping_ratio()].map(|v| v.to_string());
-        writer.write_record(conditions.iter().chain([&mode.id.to_string()]).chain(&values))?;
+        writer.write_record(place.cells().chain([mode.id.to_string()]).chain(values))?;
     }
     Ok(String::from_utf8(writer.into_inner()?)?)
 }
@@ -341,9 +333,10 @@ mod tests {
     fn a_coarse_sweep_does_not_grow_before_its_window() {
         let rig = Rig::load("nine-dof-case-2").unwrap();
         let range = "0:1.6:0.2".parse().unwrap();
-        let Sweep { modes, beside_ends, windows } = over_friction(&rig, &rig.reference, range, true).unwrap();
+        let place = Place { point: rig.reference, temperature_c: None };
+        let Sweep { modes, beside_ends, windows } = over_friction(&rig, &place, range, true).unwrap();
         assert!(!windows.is_empty());
-        let mu = |swept: &Swept| swept.point.friction_coefficient;
+        let mu = |swept: &Swept| swept.place.point.friction_coefficient;
         for &(from, _) in &windows {
             // Check between the last step before a window and its beginning: no visible growth is drawn there.
             let nearest = beside_ends.iter().map(mu).filter(|mu| *mu < from).fold(0.0, f64::max);

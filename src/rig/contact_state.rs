@@ -19,7 +19,7 @@ use super::settings::{Settings, at_most, spread, within};
 use super::source::Source;
 use crate::contact::{
     FreeModes, MeasuredLoad, PressureLaw, PressureTable, ResponseError, StaticResponse, Statics, StaticsError,
-    StaticsParts, TruncatedResponse,
+    StaticsParts, TableError, TruncatedResponse,
 };
 use crate::physics::{ContactPairs, ContactState, ResidualFlexibility};
 use crate::reduction::Modes;
@@ -129,7 +129,11 @@ pub fn check(
         },
         "table" => {
             let name = raw.table.as_deref().unwrap_or_default();
-            PressureLaw::Table(pressures("contact_state.table", name)?)
+            let table = pressures("contact_state.table", name)?;
+            PressureLaw::Table(match raw.table_closures_times {
+                Some(factor) => table.with_closures_times(factor).map_err(|error| in_file(name, error))?,
+                None => table,
+            })
         }
         _ => PressureLaw::Linear { stiffness: 1.0 },
     };
@@ -164,8 +168,11 @@ pub fn read_table(file: &str, bytes: &[u8]) -> Result<PressureTable, RigError> {
         closure_m.push(closure);
         pressure_pa.push(pressure);
     }
-    PressureTable::new(&closure_m, &pressure_pa)
-        .map_err(|error| RigError::ContactState { file: file.to_owned(), source: StaticsError::Law(error.into()) })
+    PressureTable::new(&closure_m, &pressure_pa).map_err(|error| in_file(file, error))
+}
+
+fn in_file(file: &str, error: TableError) -> RigError {
+    RigError::ContactState { file: file.to_owned(), source: StaticsError::Law(error.into()) }
 }
 
 impl StateTable {

@@ -28,6 +28,7 @@ pub mod scale;
 pub(crate) mod settings;
 mod source;
 pub(crate) mod system;
+pub mod temperature;
 pub mod uff;
 mod warning;
 
@@ -47,6 +48,7 @@ pub use modal_data::{ModalData, Residual};
 pub use patch::Pair;
 pub use residual::{SideResidual, between_patches};
 pub use settings::Settings;
+pub use temperature::Temperature;
 pub use warning::Warning;
 
 use source::Source;
@@ -74,6 +76,8 @@ pub struct Rig {
     pub warning: Warning,
     /// `[chart]`: the box of conditions that the chart covers.
     pub chart: ChartRange,
+    /// `[temperature]`: the temperature that the rig has, and what follows it.
+    pub temperature: Option<Temperature>,
     /// Path of the rig file; `None` for a rig read from memory.
     pub path: Option<std::path::PathBuf>,
     /// SHA-256 of the rig file and all files it refers to, hexadecimal.
@@ -241,6 +245,7 @@ impl Rig {
             RigFile { name, bytes },
             &|name| input_file::read(&directory.join(name), input_file::RIG_PART).map_err(|error| error.to_string()),
             "a readable file, relative to the rig file",
+            None,
         )?;
         Ok(Self { path: Some(path.to_owned()), ..rig })
     }
@@ -250,6 +255,35 @@ impl Rig {
     /// # Errors
     /// [`RigError`], naming file, field, value and limit.
     pub fn from_files(files: &[RigFile]) -> Result<Self, RigError> {
+        Self::from_files_at(files, None)
+    }
+
+    /// The rig at another temperature, built from its files again. Its hash stays that of the files.
+    ///
+    /// # Errors
+    /// [`RigError::MissingKey`] if the rig has no `[temperature]`; [`RigError`] if the temperature is out of range or takes
+    /// the contact out of range.
+    pub fn at_temperature(&self, temperature_c: f64) -> Result<Self, RigError> {
+        self.accepts_temperature(temperature_c)?;
+        Ok(Self { path: self.path.clone(), ..Self::from_files_at(&self.files, Some(temperature_c))? })
+    }
+
+    /// Checks that the rig follows the temperature, and that this one is in range.
+    ///
+    /// # Errors
+    /// [`RigError::MissingKey`], [`RigError::NotFinite`], [`RigError::Range`].
+    pub fn accepts_temperature(&self, temperature_c: f64) -> Result<(), RigError> {
+        if self.temperature.is_none() {
+            return Err(RigError::MissingKey {
+                file: self.name.clone(),
+                field: "temperature".to_owned(),
+                limit: "the table [temperature], which says what follows the temperature".to_owned(),
+            });
+        }
+        temperature::check(&self.name, "temperature_c", temperature_c).map(|_| ())
+    }
+
+    fn from_files_at(files: &[RigFile], temperature_c: Option<f64>) -> Result<Self, RigError> {
         let (first, others) = files.split_first().ok_or_else(|| RigError::NoSuchRig {
             value: "no files at all".to_owned(),
             reason: "the list of files is empty".to_owned(),
@@ -262,11 +296,22 @@ impl Rig {
         let names: Vec<&str> = others.iter().map(|file| file.name.as_str()).collect();
         let limit =
             if names.is_empty() { "a file of the rig".to_owned() } else { format!("one of {}", names.join(", ")) };
-        Self::build(first.clone(), &read, &limit)
+        Self::build(first.clone(), &read, &limit, temperature_c)
     }
 
-    fn build(rig_file: RigFile, read: &dyn Fn(&str) -> Result<Vec<u8>, String>, limit: &str) -> Result<Self, RigError> {
-        let raw: raw::RawRig = raw::parse(&rig_file.name, &rig_file.bytes)?;
+    /// Builds a rig at `temperature_c`, by default that of its reference.
+    fn build(
+        rig_file: RigFile,
+        read: &dyn Fn(&str) -> Result<Vec<u8>, String>,
+        limit: &str,
+        temperature_c: Option<f64>,
+    ) -> Result<Self, RigError> {
+        let mut raw: raw::RawRig = raw::parse(&rig_file.name, &rig_file.bytes)?;
+        let mut temperature = Temperature::read(&rig_file.name, &raw)?;
+        if let (Some(temperature), Some(present_c)) = (&mut temperature, temperature_c) {
+            *temperature = temperature.at(present_c);
+            temperature.apply(&mut raw);
+        }
         let mut source = Source::new(rig_file, read, limit);
         let settings = settings::check(&source.rig_file, &raw.common())?;
         let mut built = match settings::kind(&source.rig_file, &raw)? {
@@ -282,6 +327,7 @@ impl Rig {
         if let Some(basis) = &raw.basis {
             built.contents.extend(basis.describe(&source.rig_file)?);
         }
+        built.contents.extend(temperature.iter().flat_map(Temperature::describe));
         let disc_axis = raw.contact_patch.iter().flatten().next().map(|patch| DiscAxis {
             axis_point_m: patch.axis_point_m,
             axis_direction: patch.axis_direction,
@@ -304,6 +350,7 @@ impl Rig {
             limits: settings.limits,
             warning: settings.warning,
             chart: settings.chart,
+            temperature,
             path: None,
             content_hash: source.content_hash(),
             files: source.into_files(),
@@ -320,12 +367,20 @@ impl Rig {
         })
     }
 
-    /// Notes for a prediction at `p`: the state of the contact, and whether `p` is outside the range of the rig's
-    /// basis.
+    /// Notes for a prediction at `p`: the state of the contact, whether `p` or the temperature is outside the range of the
+    /// rig's basis, and whether the temperature is outside the tables of `[temperature]`.
     pub fn notes(&self, p: &OperatingPoint) -> impl Iterator<Item = &'static str> {
-        let beyond = self.made_for.is_some_and(|made_for| made_for.is_left_at(&self.model, p));
+        let softened = self.temperature.as_ref().is_some_and(|t| t.factors().contact_stiffness != 1.0);
+        let beyond = self.made_for.is_some_and(|made_for| softened || made_for.is_left_at(&self.model, p));
         let beyond = beyond.then_some("beyond the conditions that the basis was made for");
-        self.model.contact_state(p).note().into_iter().chain(beyond)
+        let heat = self.temperature.as_ref().is_some_and(Temperature::is_beyond_a_table);
+        let heat = heat.then_some("temperature beyond the tables of the rig: factors of their ends");
+        self.model.contact_state(p).note().into_iter().chain(beyond).chain(heat)
+    }
+
+    /// The temperature that the rig has, °C; `None` without `[temperature]`.
+    pub fn temperature_c(&self) -> Option<f64> {
+        self.temperature.as_ref().map(Temperature::present_c)
     }
 
     /// Contact stiffness as listed in the rig file, N/m: one value per contact or patch, or one per pair of a patch.
@@ -366,7 +421,7 @@ impl Rig {
         let Some(text) = self.visit_contact_stiffness(&mut |value| factor * value) else { return Ok(self.clone()) };
         let mut files = self.files.clone();
         files[0].bytes = text.into_bytes();
-        Self::from_files(&files)
+        Self::from_files_at(&files, self.temperature_c())
     }
 
     /// The model with the stiffness of every contact pair multiplied by `factor`, valid only at a friction coefficient

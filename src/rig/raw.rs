@@ -4,6 +4,7 @@ use serde::Deserialize;
 
 use super::RigError;
 use super::certificate::Certificate;
+use super::temperature::RawTemperature;
 pub use super::warning::Warning;
 use crate::files::input_file;
 
@@ -80,6 +81,7 @@ with_common_tables!(define_file! {
         system: Option<RawSystem>,
         residual: Option<RawResidual>,
         contact_state: Option<RawContactState>,
+        temperature: Option<RawTemperature>,
         basis: Option<RawBasis>,
         reduction: Option<Certificate>,
     }
@@ -179,6 +181,9 @@ pub struct RawContactState {
     /// Labels of nodes of the pad of a full model, and the direction of the load on them.
     pub load_nodes: Option<Vec<u64>>,
     pub load_direction: Option<[f64; 3]>,
+    /// Factor on the closures of `table` at the temperature of the rig.
+    #[serde(skip)]
+    pub table_closures_times: Option<f64>,
 }
 
 /// `[residual]`: residual flexibility between the contact pairs.

@@ -533,7 +533,7 @@ fn a_map_shows_what_the_load_does_to_a_window() {
     assert!(std::fs::read_to_string(&svg).unwrap().contains("no prediction"));
     run(["map", "nine-dof", "--x", "mu=0:1", "--y", "mu=0:1"]).exits(1).complains("the same condition");
     run(["map", "nine-dof", "--x", "mu=0:1", "--y", "speed=1:20000"]).exits(1).complains("disc_speed_rad_s is 20000");
-    run(["map", "nine-dof", "--x", "heat=0:1"]).exits(2).complains("expected mu, load or speed");
+    run(["map", "nine-dof", "--x", "heat=0:1"]).exits(2).complains("expected mu, load, speed or temperature");
     run(["map", "nine-dof", "--points", "1x5"]).exits(2).complains("expected at least 2");
 }
 

@@ -45,6 +45,7 @@ mod sound_beside_logs;
 mod sound_reports;
 mod steady_states;
 mod stress;
+mod temperature;
 mod tribometer;
 mod upstream;
 mod usage;

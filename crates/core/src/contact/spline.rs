@@ -131,6 +131,15 @@ impl PressureTable {
         Ok(Self { closure_m: closure_m.to_vec(), pressure: pressure.to_vec(), slope, toe })
     }
 
+    /// The same pressures at closures that are `factor > 0` times as large.
+    ///
+    /// # Errors
+    /// [`TableError`] if a closure or a slope is then out of range.
+    pub fn with_closures_times(&self, factor: f64) -> Result<Self, TableError> {
+        let closure_m: Vec<f64> = self.closure_m.iter().map(|closure| factor * closure).collect();
+        Self::new(&closure_m, &self.pressure)
+    }
+
     /// The closure of the last point, m.
     pub fn last_closure_m(&self) -> f64 {
         self.closure_m[self.closure_m.len() - 1]
