@@ -90,26 +90,33 @@ fn wave(seq: u64) -> OperatingPoint {
     OperatingPoint { friction_coefficient: 0.5 + 0.49 * (0.01 * seq as f64).sin(), ..point(seq) }
 }
 
+/// The same while the load moves between 100 and 1900 N, at 1 kHz of stamps.
+fn wave_of_load(seq: u64) -> OperatingPoint {
+    let header = Header { stamp: Time::from_ns(1_000_000 * (1_000_000 + seq as i64)), frame_id: String::new() };
+    OperatingPoint { header, normal_load_n: 1000.0 + 900.0 * (7e-4 * seq as f64).sin(), ..wave(seq) }
+}
+
 /// Sends conditions to a bus and receives the answers.
 struct Asker {
     source: ShmSource,
     received: Receiver<Received<Prediction>>,
     sink: ShmSink,
+    conditions: fn(u64) -> OperatingPoint,
     seq: u64,
 }
 
 impl Asker {
-    fn new(options: &ShmOptions) -> Self {
+    fn new(options: &ShmOptions, conditions: fn(u64) -> OperatingPoint) -> Self {
         let (predictions, received) = unbounded();
         let sink = ShmSink::spawn(options, into(predictions)).expect("sink");
-        Self { source: ShmSource::new(options).expect("source"), received, sink, seq: 0 }
+        Self { source: ShmSource::new(options).expect("source"), received, sink, conditions, seq: 0 }
     }
 
     /// One round trip, from before the condition is written to when its prediction is taken off the bus.
     fn ask(&mut self) -> Duration {
         self.seq += 1;
         let sent_ns = clock::monotonic_ns();
-        self.source.publish(&wave(self.seq)).expect("published");
+        self.source.publish(&(self.conditions)(self.seq)).expect("published");
         let answered = next(&self.received);
         assert_eq!(answered.message.input_seq, self.seq);
         Duration::from_nanos(answered.at.monotonic_ns - sent_ns)
@@ -221,15 +228,16 @@ fn time_of_sound_s() -> f64 {
     ticks.sum::<f64>() / TICKS_PER_S
 }
 
-/// At 1 kHz, alternating in blocks with a bare round trip over the same bus: alone, while four channels of sound arrive, and
-/// while a chart is built; then 10 kHz for a minute, while a chart is built.
+/// At 1 kHz, alternating in blocks with a bare round trip over the same bus: alone, while four channels of sound arrive, for a
+/// rig whose contact state follows load and friction, and while a chart is built; then 10 kHz for a minute, while a chart is
+/// built.
 fn main() {
     let rig = rig_of_160_modes();
     let first = {
         // Nothing is cached, nothing is charted.
         let options = shm("speed-first");
         let _node = NodeOnShm::start(&options, rig.clone(), None);
-        Asker::new(&options).ask()
+        Asker::new(&options, wave).ask()
     };
     let building = Instant::now();
     let chart = Arc::new(session_chart(&rig, 2, &|| true).expect("charted"));
@@ -242,7 +250,7 @@ fn main() {
         bare.publish(&answer(&received.message)).expect("published");
     })
     .expect("input");
-    let (mut ask_node, mut ask_bare) = (Asker::new(&node_bus), Asker::new(&bare_bus));
+    let (mut ask_node, mut ask_bare) = (Asker::new(&node_bus, wave), Asker::new(&bare_bus, wave));
     // The first block lets the node compute its map.
     ask_node.block();
     wait_until("the map", || node.watch.snapshot().map.is_some());
@@ -267,6 +275,18 @@ fn main() {
     // Squeals of 1 s, 2 s apart in each channel; those at the start and at the end may be incomplete.
     assert!(squeals >= 4 * (begun.elapsed().as_secs() / 2 - 2), "squeals are missing");
     let alone_again = alternate("alone again", &mut ask_node, BLOCKS);
+    let with_state = {
+        let rough = Arc::new(Rig::load("rough-pad").expect("embedded"));
+        let chart = Arc::new(session_chart(&rough, 2, &|| true).expect("charted"));
+        let bus = shm("speed-rough-pad");
+        let node = NodeOnShm::start(&bus, rough, Some(chart));
+        let mut ask = Asker::new(&bus, wave_of_load);
+        ask.block();
+        wait_until("the map", || node.watch.snapshot().map.is_some());
+        let ratio = alternate("rough-pad with its contact state, load moving", &mut ask, BLOCKS);
+        println!("rough-pad: {:?}", node.watch.snapshot().counters);
+        ratio
+    };
     let building = Building::start(rig);
     let beside_build = alternate("while a chart is built", &mut ask_node, BLOCKS / 2);
 
@@ -302,7 +322,7 @@ fn main() {
     assert_eq!((answered, missing), (COUNT, 0));
     assert!(sent_in < Duration::from_secs(61), "the sender itself did not keep up: {sent_in:?}");
     assert!(first < Duration::from_millis(50), "{first:?}");
-    for ratio in [alone, beside_sound, alone_again, beside_build] {
+    for ratio in [alone, beside_sound, alone_again, with_state, beside_build] {
         assert!(ratio <= 2.0, "the node takes {ratio} times a bare round trip");
     }
     assert!(share <= SHARE_OF_A_CORE, "sound takes {share} of one core");

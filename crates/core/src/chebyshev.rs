@@ -18,6 +18,20 @@ pub fn coefficients(values: &[f64]) -> Vec<f64> {
     (0..m).map(|degree| weight(degree) * sum(degree)).collect()
 }
 
+/// Replaces values by [`coefficients`]: grids of `count` [`nodes`] along each of `axes` axes, the first axis running fastest,
+/// one grid after the other.
+pub fn transform(values: &mut [f64], count: usize, axes: usize) {
+    for axis in 0..axes {
+        let stride = count.pow(axis as u32);
+        for start in (0..values.len()).filter(|index| index / stride % count == 0) {
+            let line: Vec<f64> = (0..count).map(|k| values[start + k * stride]).collect();
+            for (k, coefficient) in coefficients(&line).into_iter().enumerate() {
+                values[start + k * stride] = coefficient;
+            }
+        }
+    }
+}
+
 /// Writes `T_0(x), T_1(x), ..` to `out`.
 pub fn polynomials(x: f64, out: &mut [f64]) {
     for k in 0..out.len() {

@@ -7,11 +7,13 @@
 
 pub mod lapack;
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use faer::{Mat, c64};
 use serde::Serialize;
 
+use crate::contact::PressureLaw;
 use crate::msgs::listed;
 use crate::physics::chart::Scratch;
 use crate::physics::chart::build::{ChartError, ChartOptions, Progress, resume};
@@ -21,7 +23,7 @@ use crate::physics::{
 };
 use crate::proof::held_out::hold_out;
 use crate::proof::reference::{self, Refined};
-use crate::proof::synthetic::{Synthetic, Uniform, rig};
+use crate::proof::synthetic::{STIFFNESS_N_PER_M, Synthetic, Uniform, parts, statics};
 use lapack::{Lapack, LapackError};
 
 /// Which synthetic rigs are measured.
@@ -35,7 +37,32 @@ pub enum Kind {
     Lateral,
     /// Modal damping of 0.5 %, friction that falls with speed and damps across it, a stiffening contact: everything matters
     Damped,
+    /// No damping, contact pairs that follow the state of steady sliding by the exponential law of rough surfaces: friction
+    /// coefficient and load matter
+    Rough,
+    /// The same with springs that only push: roots jump where pairs open and close
+    Opening,
 }
+
+impl Kind {
+    /// The contact law of the state of steady sliding; `None` for springs that are always closed. Where a pair carries its
+    /// share of 500 N it is as stiff as these.
+    fn contact_state(self, pairs: usize) -> Option<PressureLaw> {
+        let (stiffness, share) = (STIFFNESS_N_PER_M / pairs as f64, 500.0 / pairs as f64);
+        match self {
+            Self::Undamped | Self::Hertzian | Self::Lateral | Self::Damped => None,
+            Self::Rough => Some(PressureLaw::Exponential { pressure: 0.1 * share, roughness_m: share / stiffness }),
+            Self::Opening => Some(PressureLaw::Linear { stiffness }),
+        }
+    }
+}
+
+/// The highest friction coefficient.
+const MU_MAX: f64 = 1.0;
+/// Largest initial gap of a rig with a contact state, m.
+const GAP_M: f64 = 5e-6;
+/// Anchors of its states, along the load and along the friction coefficient.
+const ANCHORS: [u32; 2] = [6, 9];
 
 /// Options of a measurement.
 #[derive(Clone, Copy, Debug)]
@@ -335,6 +362,7 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> Result<Model, ModelError> {
         Kind::Undamped => ContactLaw::default(),
         Kind::Hertzian => ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() },
         Kind::Lateral => ContactLaw { lateral_damping: true, ..ContactLaw::default() },
+        Kind::Rough | Kind::Opening => ContactLaw::default(),
         Kind::Damped => ContactLaw {
             exponent: 1.0 / 3.0,
             reference_n: 500.0,
@@ -344,7 +372,14 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> Result<Model, ModelError> {
         },
     };
     let damping_ratio = if matches!(plan.kind, Kind::Damped | Kind::Lateral) { 5e-3 } else { 0.0 };
-    rig(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })
+    let parts = parts(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })?;
+    let Some(law) = plan.kind.contact_state(plan.pairs) else { return parts.free.with_contact(&parts.pairs) };
+    let statics = statics(&parts, law, GAP_M).map_err(ModelError::State)?;
+    let [loads, frictions] = ANCHORS.map(|count| (0..count).map(move |k| f64::from(k) / f64::from(count - 1)));
+    let loads: Vec<f64> = loads.map(|share| 50.0 * 40f64.powf(share)).collect();
+    let frictions: Vec<f64> = frictions.map(|share| MU_MAX * share).collect();
+    let statics = Arc::new(statics.with_anchors(&loads, &frictions));
+    parts.free.with_steady_contact(&parts.pairs, statics, None)
 }
 
 /// The answers of the dense solver and of LAPACK at one operating point. Those of the chart are in [`Routes`].

@@ -121,6 +121,16 @@ impl PressureLaw {
         }
     }
 
+    /// The closures at which the law is not analytic, in ascending order.
+    pub fn breaks(&self) -> &[f64] {
+        match *self {
+            Self::Linear { .. } => &[0.0],
+            Self::Power { roughness_m: 0.0, .. } => &[0.0],
+            Self::Power { .. } | Self::Exponential { .. } => &[],
+            Self::Table(ref table) => table.breaks(),
+        }
+    }
+
     /// Whether the force of a pair is exactly 0 below some closure. Otherwise every pair carries a force at any closure.
     pub fn opens(&self) -> bool {
         match *self {

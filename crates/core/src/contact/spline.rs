@@ -149,6 +149,11 @@ impl PressureTable {
         self.toe.is_some()
     }
 
+    /// The points at which pieces meet.
+    pub(super) fn breaks(&self) -> &[f64] {
+        &self.closure_m
+    }
+
     pub(super) fn smoothness(&self) -> Smoothness {
         match self.toe {
             Some(exponent) if exponent <= 2.0 => Smoothness::TangentKinks,

@@ -19,6 +19,8 @@ use crate::contact::StateSlope;
 /// Largest relative change of load and speed over which ends are extrapolated with an error bound.
 pub const REACH: f64 = 0.02;
 
+/// Where roots jump or bend as pairs open, ends are followed over REACH, half of it, and so on down to this change.
+const SHORTEST: f64 = REACH / 32.0;
 /// Maximum number of Newton steps.
 const STEPS: usize = 12;
 /// Newton's method stops after a step shorter than this, relative.
@@ -65,6 +67,9 @@ pub struct End {
     pub slope: [f64; 4],
     /// Second derivatives of `mu` with respect to load and speed.
     curvature: [[f64; 2]; 2],
+    /// Largest relative change of load and speed over which it is extrapolated with an error bound: [`REACH`], or less
+    /// where roots jump or bend as contact pairs open and close.
+    reach: [f64; 2],
 }
 
 /// The ends of all windows of a map, at one load and speed.
@@ -143,7 +148,8 @@ impl Ends {
     }
 
     /// The ends of the windows of `map`, recomputed by Newton's method at the load and speed of `point`. `None` if
-    /// one of them is not found: a new map is needed then.
+    /// one of them is not found, or may be another one because contact pairs open or close on the way: a new map is needed
+    /// then.
     ///
     /// # Errors
     /// [`MapError`].
@@ -164,7 +170,15 @@ impl Ends {
                     found => found,
                 },
             };
-            windows.push((from, to));
+            // Where roots jump or bend, Newton's method may find another zero.
+            let kept = |found: &End, there: Bounded| {
+                !search.has_breaks() || (found.mu - there.value).abs() <= there.error + found.error
+            };
+            if !kept(&from, from_there) || to.zip(to_there).is_some_and(|(to, there)| !kept(&to, there)) {
+                return Ok(None);
+            }
+            let left = |end: End| search.within_reach(end, point);
+            windows.push((left(from), to.map(left)));
         }
         Ok(Some(Self { point: point.with_friction(0.0), windows }))
     }
@@ -173,12 +187,12 @@ impl Ends {
     pub fn at(&self, point: &OperatingPoint) -> impl Iterator<Item = (Bounded, Option<Bounded>)> + Clone {
         let (load, speed) = (self.point.normal_load_n, self.point.disc_speed_rad_s);
         let moved = [point.normal_load_n - load, point.disc_speed_rad_s - speed];
-        let within = |moved: f64, at: f64| moved.abs() <= REACH * at.abs();
+        let at = [load, speed];
         self.windows.iter().map(move |(from, to)| {
             // An end that does not depend on a condition is valid for any value of it.
             let reached = |end: &End| {
-                let moves = |k: usize| end.slope[k] != 0.0 || end.curvature[k] != [0.0; 2];
-                (!moves(0) || within(moved[0], load)) && (!moves(1) || within(moved[1], speed))
+                let moves = |k: usize| end.slope[k] != 0.0 || end.curvature[k] != [0.0; 2] || end.reach[k] < REACH;
+                (0..2).all(|k| !moves(k) || moved[k].abs() <= end.reach[k] * at[k].abs())
             };
             (from.at(moved, reached(from)), to.as_ref().map(|to| to.at(moved, reached(to))))
         })
@@ -217,7 +231,8 @@ impl Ends {
     pub fn words(&self) -> impl Iterator<Item = u64> {
         self.windows.iter().flat_map(|(from, to)| std::iter::once(from).chain(to)).flat_map(|end| {
             let numbers = [end.mu, end.error].into_iter().chain(end.slope).chain(end.curvature.into_iter().flatten());
-            numbers.map(f64::to_bits)
+            let shortened = end.reach.into_iter().filter(|reach| *reach < REACH);
+            numbers.chain(shortened).map(f64::to_bits)
         })
     }
 }
@@ -247,7 +262,7 @@ impl Search<'_> {
     fn first(&mut self, window: &Window, mu: f64) -> Result<End, MapError> {
         let edge = [self.map.nodes.first(), self.map.nodes.last()].iter().flatten().any(|node| node.mu() == mu);
         let condition = if edge { Condition::Edge } else { self.condition(window, mu)? };
-        let end = End { condition, mu, error: 0.0, slope: [0.0; 4], curvature: [[0.0; 2]; 2] };
+        let end = End { condition, mu, error: 0.0, slope: [0.0; 4], curvature: [[0.0; 2]; 2], reach: [REACH; 2] };
         if edge {
             return Ok(end);
         }
@@ -266,15 +281,72 @@ impl Search<'_> {
         end.mu = mu;
         let depends: [bool; 2] = self.model.depends_on_load_and_speed().into();
         for k in (0..2).filter(|&k| depends[k]) {
-            let mut probe = map.point;
-            let at = MOVING[k].condition(&mut probe).expect("load and speed are conditions");
-            let step = REACH * *at;
-            *at += step;
-            let guess = mu + end.slope[k] * step;
-            let Some(there) = self.carry(&end, guess, &probe)? else { return Ok(unknown) };
-            end.curvature[k] = std::array::from_fn(|j| (there.slope[j] - end.slope[j]) / step);
+            if self.has_breaks() {
+                (end.curvature[k], end.reach[k]) = self.followed(&end, k)?;
+            } else {
+                let Some((_, curvature)) = self.probe(&end, k, REACH)? else { return Ok(unknown) };
+                end.curvature[k] = curvature;
+            }
         }
         Ok(end)
+    }
+
+    /// Whether roots jump or bend at some load.
+    fn has_breaks(&self) -> bool {
+        self.model.statics().is_some_and(|statics| !statics.parts().law.breaks().is_empty())
+    }
+
+    /// The end where load or speed (`k`) are larger by the share `share`, and its second derivatives with respect to that
+    /// condition and both.
+    fn probe(&mut self, end: &End, k: usize, share: f64) -> Result<Option<(End, [f64; 2])>, MapError> {
+        let mut probe = self.map.point;
+        let at = MOVING[k].condition(&mut probe).expect("load and speed are conditions");
+        let step = share * *at;
+        *at += step;
+        let guess = end.mu + end.slope[k] * step;
+        let there = self.carry(end, guess, &probe)?;
+        Ok(there.map(|there| (there, std::array::from_fn(|j| (there.slope[j] - end.slope[j]) / step))))
+    }
+
+    /// Second derivatives of an end with respect to load or speed (`k`) and both, and the largest relative change over which
+    /// an extrapolation with them is within its bound on both sides. None is, where a pair opens that near: 0 then.
+    fn followed(&mut self, end: &End, k: usize) -> Result<([f64; 2], f64), MapError> {
+        let mut share = REACH;
+        while share >= SHORTEST {
+            let sides = [self.probe(end, k, share)?, self.probe(end, k, -share)?];
+            if let [Some((above, curvature)), Some((below, _))] = sides {
+                let at = if k == 0 { self.map.point.normal_load_n } else { self.map.point.disc_speed_rad_s };
+                let mut bent = *end;
+                bent.curvature[k][k] = curvature[k];
+                let holds = |there: &End, share: f64| {
+                    let moved = std::array::from_fn(|j| if j == k { share * at } else { 0.0 });
+                    let expected = bent.at(moved, true);
+                    (there.mu - expected.value).abs() <= expected.error + there.error
+                };
+                if holds(&above, share) && holds(&below, -share) {
+                    return Ok((curvature, share));
+                }
+            }
+            share /= 2.0;
+        }
+        Ok(([0.0; 2], 0.0))
+    }
+
+    /// `end`, carried to `point`, with what is left there of the reach that was checked at the map. Without jumps and kinks
+    /// it is the same everywhere.
+    fn within_reach(&self, mut end: End, point: &OperatingPoint) -> End {
+        if self.has_breaks() && end.condition != Condition::Edge {
+            let (here, there) = (&self.map.point, point);
+            let moved = [
+                (there.normal_load_n - here.normal_load_n) / there.normal_load_n,
+                (there.disc_speed_rad_s - here.disc_speed_rad_s) / there.disc_speed_rad_s,
+            ];
+            let depends: [bool; 2] = self.model.depends_on_load_and_speed().into();
+            for k in (0..2).filter(|&k| depends[k]) {
+                end.reach[k] = (end.reach[k] - moved[k].abs()).max(0.0);
+            }
+        }
+        end
     }
 
     /// The contact pair that opens or closes at `mu`, at the load and speed of the map.
@@ -412,7 +484,14 @@ mod tests {
 
     #[test]
     fn the_margin_is_the_distance_to_the_nearest_end_of_the_union() {
-        let end = |mu| End { condition: Condition::Edge, mu, error: 0.0, slope: [0.0; 4], curvature: [[0.0; 2]; 2] };
+        let end = |mu| End {
+            condition: Condition::Edge,
+            mu,
+            error: 0.0,
+            slope: [0.0; 4],
+            curvature: [[0.0; 2]; 2],
+            reach: [REACH; 2],
+        };
         let ends = |windows: &[(f64, Option<f64>)]| Ends {
             point: REFERENCE,
             windows: windows.iter().map(|&(from, to)| (end(from), to.map(end))).collect(),
@@ -441,6 +520,7 @@ mod tests {
             error: 1e-12,
             slope: [slope, 0.0, 0.0, 0.0],
             curvature: [[0.0; 2]; 2],
+            reach: [REACH; 2],
         };
         for (slope, load, known) in [(1e-4, 1.019, true), (1e-4, 1.021, false), (1e-4, 0.979, false), (0.0, 2.0, true)]
         {

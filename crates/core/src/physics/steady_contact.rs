@@ -151,12 +151,6 @@ impl Model {
         Ok(self.finished())
     }
 
-    /// Whether roots are analytic in load and friction coefficient as far as the contact is concerned: its springs
-    /// follow no state, or a state with an analytic contact law.
-    pub fn has_analytic_contact(&self) -> bool {
-        self.steady.as_ref().is_none_or(|contact| contact.is_analytic())
-    }
-
     /// The statics of steady sliding, if the contact springs follow its state.
     pub fn statics(&self) -> Option<&Arc<Statics>> {
         self.steady.as_ref().map(|contact| &contact.statics)

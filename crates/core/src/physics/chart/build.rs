@@ -60,11 +60,6 @@ pub enum ChartError {
     /// A dense solve failed.
     #[error(transparent)]
     Solve(#[from] SolveError),
-    /// The contact law is not analytic, so roots have no expansions across the load at which a pair opens.
-    #[error(
-        "the contact law is not analytic: roots jump or bend wherever a pair opens or closes, so every condition is solved"
-    )]
-    NotAnalytic,
     /// The caller stopped the build.
     #[error("stopped")]
     Stopped,
@@ -112,9 +107,6 @@ pub fn resume(
     go_on: &mut dyn FnMut(&Progress<'_>) -> bool,
 ) -> Result<Chart, ChartError> {
     let (axes, low, high) = domain(model, options)?;
-    if !model.has_analytic_contact() {
-        return Err(ChartError::NotAnalytic);
-    }
     let sampler = Sampler { model, traces: Traces::new(model), axes: axes.clone(), low, high, base: options.low };
     let mut solvers: Vec<Solver> = (0..options.threads.max(1)).map(|_| Solver::new(model.dimension())).collect();
     let chart = match begun {
@@ -307,6 +299,9 @@ impl Builder<'_> {
         let axes = self.chart.axes.len();
         let share = |k: usize| (high[k] - low[k]) / (self.chart.high[k] - self.chart.low[k]);
         let longest = (0..axes).max_by(|&a, &b| share(a).total_cmp(&share(b))).unwrap_or(0);
+        if let Some(axis) = self.sampler.pieces().and_then(|pieces| pieces.broken(low, high, longest)) {
+            return Outcome::Split(axis);
+        }
         let half: [f64; MAX_AXES] = std::array::from_fn(|k| 0.5 * (high[k] - low[k]));
         let unit_of = |x: &[f64; MAX_AXES]| -> [f64; MAX_AXES] {
             std::array::from_fn(|k| if k < axes { (x[k] - low[k]) / half[k] - 1.0 } else { 0.0 })

@@ -14,6 +14,7 @@ mod derivatives;
 mod fit;
 mod leaf;
 pub(crate) mod pairing;
+mod pieces;
 mod samples;
 mod totals;
 mod tree;

@@ -27,6 +27,6 @@ pub(crate) fn within(share: f64) -> bool {
 }
 
 /// Whether every charted root has a dense root within the bounds of both, each dense root used once.
-pub(super) fn within_bounds(modes: &[Root], spectrum: &Spectrum) -> bool {
+pub(crate) fn within_bounds(modes: &[Root], spectrum: &Spectrum) -> bool {
     partners(modes, spectrum).iter().all(|partner| partner.is_some_and(|(_, share)| within(share)))
 }

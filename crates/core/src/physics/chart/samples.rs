@@ -4,6 +4,7 @@
 use faer::{Mat, c64};
 
 use super::derivatives::{Change, Derivatives, PAIRS, pairs};
+use super::pieces::Pieces;
 use super::{Axis, MAX_AXES};
 use crate::physics::model::Model;
 use crate::physics::operating_point::OperatingPoint;
@@ -89,6 +90,11 @@ impl Sampler<'_> {
         p
     }
 
+    /// The pieces of a contact law that is not analytic.
+    pub fn pieces(&self) -> Option<Pieces<'_>> {
+        Pieces::new(self.model, &self.axes, self.base)
+    }
+
     /// Solves at coordinates `x`.
     ///
     /// # Errors
@@ -157,7 +163,8 @@ impl Sampler<'_> {
     }
 
     /// First and second derivatives of the matrices of a model with a contact state, which follows the conditions.
-    /// Slopes follow from the derivatives of the state; second derivatives are central differences of slopes.
+    /// Slopes follow from the derivatives of the state; second derivatives are central differences of slopes, and NaN where
+    /// these lie on different pieces of the contact law.
     fn changes_with_state(
         &self,
         x: &[f64; MAX_AXES],
@@ -165,6 +172,7 @@ impl Sampler<'_> {
     ) -> Result<(Vec<Change>, Vec<Change>), SolveError> {
         let axes = self.axes.len();
         let first = (0..axes).map(|axis| self.slope_with_state(here, axis)).collect::<Result<Vec<_>, _>>()?;
+        let pieces = self.pieces();
         let mut second = vec![];
         for b in 0..axes {
             let step = 0.5 * STATE_STEP * (self.high[b] - self.low[b]);
@@ -178,7 +186,17 @@ impl Sampler<'_> {
             });
             let [below, above] = beside;
             let (below, above) = (below?, above?);
+            let agree = |there: &Situation| match (&pieces, here.state(), there.state()) {
+                (Some(pieces), Some(here), Some(there)) => pieces.agree(here, there),
+                (Some(_), _, _) | (None, _, _) => true,
+            };
+            let bent = !(agree(&below) && agree(&above));
             for a in 0..=b {
+                if bent {
+                    let n = self.model.dimension();
+                    second.push([0, 1].map(|_| Some(Mat::full(n, n, f64::NAN))));
+                    continue;
+                }
                 let (below, above) = (self.slope_with_state(&below, a)?, self.slope_with_state(&above, a)?);
                 let quotient = |below: Mat<f64>, above: Mat<f64>| (above - below) * faer::Scale(0.5 / step);
                 let parts = below.into_iter().zip(above).map(|(below, above)| below.zip(above));

@@ -7,9 +7,10 @@
 
 use faer::Mat;
 
+use super::pieces::Pieces;
 use super::tree::{self, Branch};
 use super::{Axis, MAX_AXES, NotCharted};
-use crate::chebyshev::{coefficients, nodes, polynomials};
+use crate::chebyshev::{nodes, polynomials, transform};
 use crate::physics::model::Model;
 use crate::physics::model_error::ModelError;
 use crate::physics::operating_point::OperatingPoint;
@@ -203,6 +204,10 @@ impl Domain<'_> {
         let axes = self.axes.len();
         let width = |k: usize| (high[k] - low[k]) / (self.high[k] - self.low[k]);
         let longest = (0..axes).max_by(|&a, &b| width(a).total_cmp(&width(b))).unwrap_or(0);
+        let pieces = Pieces::new(self.model, self.axes, self.base);
+        if let Some(axis) = pieces.and_then(|pieces| pieces.broken(low, high, longest)) {
+            return Err(axis);
+        }
         let (count, points) = (NODES[axes], nodes(NODES[axes]));
         let all = count.pow(axes as u32);
         let place = |unit: [f64; MAX_AXES]| -> [f64; MAX_AXES] {
@@ -220,15 +225,7 @@ impl Domain<'_> {
                 largest[k] = largest[k].max(value.abs());
             }
         }
-        for axis in 0..axes {
-            let stride = count.pow(axis as u32);
-            for start in (0..values.len()).filter(|index| index / stride % count == 0) {
-                let line: Vec<f64> = (0..count).map(|k| values[start + k * stride]).collect();
-                for (k, coefficient) in coefficients(&line).into_iter().enumerate() {
-                    values[start + k * stride] = coefficient;
-                }
-            }
-        }
+        transform(&mut values, count, axes);
         // Terms of the two highest degrees along an axis.
         let tail = |quantity: usize, axis: usize| -> f64 {
             let high = |index: &usize| index / count.pow(axis as u32) % count >= count - 2;

@@ -10,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 34] = [
+pub const BUILDER: [&str; 35] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -19,6 +19,7 @@ pub const BUILDER: [&str; 34] = [
     include_str!("leaf.rs"),
     include_str!("mod.rs"),
     include_str!("pairing.rs"),
+    include_str!("pieces.rs"),
     include_str!("samples.rs"),
     include_str!("totals.rs"),
     include_str!("tree.rs"),
