@@ -1,5 +1,6 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use anyhow::{Context, ensure};
 use clap::Args;
@@ -40,7 +41,7 @@ impl Options {
 
     /// Writes the report of one recording.
     fn write(&self, path: &Path, directory: &Path) -> anyhow::Result<Outcome> {
-        let recording = self.recordings.open(path)?;
+        let recording = Arc::new(self.recordings.open(path)?);
         let recorded = view::read(path, &recording, self.rig.as_deref(), self.criteria.criteria())?;
         let origin = Origin {
             file: path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),

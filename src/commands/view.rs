@@ -33,7 +33,12 @@ pub struct Options {
 ///
 /// # Errors
 /// The recording contains no prediction or no rig.
-pub fn read(path: &Path, recording: &Recording, rig: Option<&str>, criteria: Criteria) -> anyhow::Result<Recorded> {
+pub fn read(
+    path: &Path,
+    recording: &Arc<Recording>,
+    rig: Option<&str>,
+    criteria: Criteria,
+) -> anyhow::Result<Recorded> {
     if recording.topics().name_of(Topic::Prediction).is_none() {
         return Err(without_predictions(path, recording));
     }
@@ -54,7 +59,7 @@ impl Options {
         let addresses = self.display.addresses()?;
         ensure!(!addresses.is_empty(), "--no-display leaves nothing to view");
         let (path, recording) = self.recordings.only()?;
-        let recorded = read(&path, &recording, self.rig.as_deref(), self.criteria.criteria())?;
+        let recorded = read(&path, &Arc::new(recording), self.rig.as_deref(), self.criteria.criteria())?;
         let (stop, stopped) = bounded::<()>(1);
         signals::on_stop(move || {
             // The receiver may have gone: the command has then stopped already.

@@ -19,6 +19,7 @@ use crate::node::{Sample, VibrationSample, Watch};
 use crate::physics::{Solver, StabilityMap};
 use crate::rig::Rig;
 use crate::session::conditions;
+use crate::sound::spectrogram::Part;
 use crate::system::clock;
 
 /// Length of a bin of the history, ns.
@@ -179,8 +180,15 @@ impl Source for Live {
         view.with(|shown| SoundShown::new(shown, &self.followed().score.meet(shown)))
     }
 
-    fn spectrogram(&self, channel: &str) -> Option<SpectrogramPicture> {
-        self.watch.sound().with(|shown| picture(shown.get(channel)?))
+    fn spectrogram(&self, channel: &str, part: Option<Part>) -> Option<SpectrogramPicture> {
+        // A node does not keep the samples that a part would need.
+        if part.is_some() {
+            return None;
+        }
+        self.watch.sound().with(|shown| {
+            let whole = shown.get(channel)?;
+            picture(whole, whole, 0.0)
+        })
     }
 
     fn map(&self, number: u64) -> Option<Arc<str>> {

@@ -11,6 +11,7 @@ use super::heard::SquealsInSound;
 use super::history::History;
 use super::server::{About, Note, Source};
 use super::shape::shape;
+use super::sound_detail::{SampleIndex, longest_part_s};
 use super::sound_page::{SoundShown, SpectrogramPicture, picture};
 use super::state::{Shown, State, spread, trend_per_s};
 use super::time_line::TimeLine;
@@ -28,7 +29,7 @@ use crate::session::conditions;
 use crate::simulator;
 use crate::sound;
 use crate::sound::search::channel_of;
-use crate::sound::spectrogram::Spectrogram;
+use crate::sound::spectrogram::{Part, Spectrogram};
 
 /// Bins of the history; their length grows with the recording.
 const BINS: usize = 3000;
@@ -68,6 +69,9 @@ pub struct Recorded {
     pub squeals_in_sound: SquealsInSound,
     /// Of each channel of sound whose samples were recorded, by name; of the first [`MOST_SPECTROGRAMS`].
     pub spectrograms: BTreeMap<String, Spectrogram>,
+    /// Where their samples are in the recording.
+    samples: SampleIndex,
+    recording: Arc<Recording>,
     /// Predictions and squeals in sound for comparison, by their stamps.
     pub heard_and_predicted: HeardAndPredicted,
     /// The definition of squeal in sound.
@@ -100,10 +104,12 @@ pub struct Recorded {
 
 impl Recorded {
     /// Reads `recording`, which was made with `rig`. `criteria` define squeal in a measured vibration.
-    pub fn read(recording: &Recording, rig: Arc<Rig>, criteria: Criteria) -> Self {
+    pub fn read(recording: &Arc<Recording>, rig: Arc<Rig>, criteria: Criteria) -> Self {
         let sound_settings = recorded_settings(recording);
         let mut recorded = Self {
             spectrograms: BTreeMap::new(),
+            samples: SampleIndex::default(),
+            recording: recording.clone(),
             heard_and_predicted: HeardAndPredicted::new(sound_settings.band_hz),
             sound_settings,
             solver: Mutex::new(Solver::new(rig.model.dimension())),
@@ -173,7 +179,9 @@ impl Recorded {
                     recorded.session_events.push((line.unstamped(log_ns), event));
                 }
                 Content::Known(Payload::Waveform(block)) => {
-                    recorded.samples(line.of_stamp(block.header.stamp, log_ns), &block);
+                    let time_ns = line.of_stamp(block.header.stamp, log_ns);
+                    recorded.samples.note(log_ns, time_ns, line);
+                    recorded.show_samples(time_ns, &block);
                 }
                 Content::Known(Payload::RigInfo(_) | Payload::Sensitivity(_))
                 | Content::Unreadable(_)
@@ -185,7 +193,7 @@ impl Recorded {
     }
 
     /// Adds samples to the spectrogram of their channel. Of a channel that changes, those before the change are shown.
-    fn samples(&mut self, time_ns: i64, block: &Waveform) {
+    fn show_samples(&mut self, time_ns: i64, block: &Waveform) {
         let band_hz = self.sound_settings.band_hz;
         if !self.spectrograms.contains_key(&block.channel) && self.spectrograms.len() < MOST_SPECTROGRAMS {
             let new = channel_of(block).ok();
@@ -382,8 +390,13 @@ impl Source for Recorded {
         SoundShown::new(&self.spectrograms, &self.heard_and_predicted.meet(&sound::matching::Criteria::default()))
     }
 
-    fn spectrogram(&self, channel: &str) -> Option<SpectrogramPicture> {
-        picture(self.spectrograms.get(channel)?)
+    fn spectrogram(&self, channel: &str, part: Option<Part>) -> Option<SpectrogramPicture> {
+        let whole = self.spectrograms.get(channel)?;
+        let detail = match part {
+            None => None,
+            Some(part) => Some(self.samples.detail(&self.recording, whole, part)?),
+        };
+        picture(detail.as_ref().unwrap_or(whole), whole, longest_part_s(whole))
     }
 
     fn map(&self, number: u64) -> Option<Arc<str>> {
@@ -434,7 +447,7 @@ mod tests {
             Measured::at_its_stamp(Quantity::Conditions(input))
         });
         let predicted = offline::record(&rig, None, std::iter::empty(), inputs, None, directory).expect("recorded");
-        Recorded::read(&Recording::open(&predicted.directory).expect("a recording"), rig, Criteria::default())
+        Recorded::read(&Arc::new(Recording::open(&predicted.directory).expect("a recording")), rig, Criteria::default())
     }
 
     #[test]

@@ -33,6 +33,7 @@ use super::heard::SquealsInSound;
 use super::sound_page::{SoundShown, SpectrogramPicture};
 use crate::node::status::InputSources;
 use crate::rig::Rig;
+use crate::sound::spectrogram::Part;
 
 /// Time between two states: at most 30 per second.
 const EVERY: Duration = Duration::from_millis(34);
@@ -55,8 +56,8 @@ pub trait Source: Send + Sync + 'static {
     fn squeals_in_sound(&self) -> SquealsInSound;
     /// Channels of sound, and the scores of the predictions against it.
     fn sound(&self) -> SoundShown;
-    /// The spectrogram of a channel; `None` if there is none.
-    fn spectrogram(&self, channel: &str) -> Option<SpectrogramPicture>;
+    /// The spectrogram of a channel, whole or a part of it in detail; `None` if there is none.
+    fn spectrogram(&self, channel: &str, part: Option<Part>) -> Option<SpectrogramPicture>;
     /// The measured vibration compared with the predictions; `None` without measurements, or while a session is
     /// running.
     fn comparison(&self) -> Option<Comparison> {
@@ -338,16 +339,47 @@ async fn squeals_in_sound(Shared(app): Shared<App>) -> Response {
 }
 
 #[derive(Deserialize)]
-struct ChannelAsked {
+struct SpectrogramAsked {
     channel: String,
+    from_s: Option<f64>,
+    to_s: Option<f64>,
+    low_hz: Option<f64>,
+    high_hz: Option<f64>,
+}
+
+impl SpectrogramAsked {
+    /// The part asked for, if one is.
+    ///
+    /// # Errors
+    /// Its limits are incomplete, not finite or not ascending.
+    fn part(&self) -> Result<Option<Part>, &'static str> {
+        let limits = [self.from_s, self.to_s, self.low_hz, self.high_hz];
+        if limits.iter().all(Option::is_none) {
+            return Ok(None);
+        }
+        let [Some(from_s), Some(to_s), Some(low_hz), Some(high_hz)] = limits else {
+            return Err("a part of a spectrogram needs from_s, to_s, low_hz and high_hz");
+        };
+        // Times within the range of nanoseconds.
+        let valid = from_s.abs() < 9e9 && to_s.abs() < 9e9 && from_s < to_s && 0.0 <= low_hz && low_hz < high_hz;
+        if !valid || high_hz > 1e6 {
+            return Err("a part of a spectrogram begins before it ends, between 0 and 1 MHz");
+        }
+        let ns = |seconds: f64| (seconds * 1e9) as i64;
+        Ok(Some(Part { from_ns: ns(from_s), to_ns: ns(to_s), low_hz, high_hz }))
+    }
 }
 
 async fn sound(Shared(app): Shared<App>) -> Response {
     aside(move || json(serde_json::to_string(&app.source.sound()).unwrap_or_default())).await
 }
 
-async fn spectrogram(Shared(app): Shared<App>, Query(asked): Query<ChannelAsked>) -> Response {
-    aside(move || match app.source.spectrogram(&asked.channel) {
+async fn spectrogram(Shared(app): Shared<App>, Query(asked): Query<SpectrogramAsked>) -> Response {
+    let part = match asked.part() {
+        Ok(part) => part,
+        Err(reason) => return (StatusCode::BAD_REQUEST, reason).into_response(),
+    };
+    aside(move || match app.source.spectrogram(&asked.channel, part) {
         Some(picture) => {
             // Numbers only, so it is a valid header.
             let covers = serde_json::to_string(&picture.covers).unwrap_or_default();

@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use crate::figures::png::png;
-use crate::figures::spectrogram::pixels;
+use crate::figures::spectrogram::{highest, pixels};
 use crate::offline::score::MetChannel;
 use crate::sound::matching::{Slots, median};
-use crate::sound::spectrogram::Spectrogram;
+use crate::sound::spectrogram::{STEP_DB, Spectrogram};
 
 /// Channels and scores.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -58,9 +58,14 @@ pub struct Covers {
     /// s since the epoch.
     pub from_s: f64,
     pub to_s: f64,
+    pub bottom_hz: f64,
     pub top_hz: f64,
+    /// Height of a row.
+    pub row_hz: f64,
     /// Level of the lightest colour, dB; the darkest is 80 dB below.
     pub highest_db: f64,
+    /// Length up to which a part of it can be shown in detail, s; 0 if none can, since samples are not kept.
+    pub longest_part_s: f64,
 }
 
 impl SoundShown {
@@ -85,16 +90,20 @@ impl SoundShown {
     }
 }
 
-/// The picture of a spectrogram; `None` if it is empty.
-pub fn picture(spectrogram: &Spectrogram) -> Option<SpectrogramPicture> {
+/// The picture of a spectrogram; `None` if it is empty. A part of another one has the colours of that, `whole`.
+pub fn picture(spectrogram: &Spectrogram, whole: &Spectrogram, longest_part_s: f64) -> Option<SpectrogramPicture> {
     let first = spectrogram.columns().front()?.index;
-    let (width, height, pixels, highest_db) = pixels(spectrogram);
+    let highest = highest(whole);
+    let (width, height, pixels) = pixels(spectrogram, highest);
     let column_s = spectrogram.column_ns() as f64 * 1e-9;
     let covers = Covers {
         from_s: first as f64 * column_s,
         to_s: (first + i64::from(width)) as f64 * column_s,
+        bottom_hz: spectrogram.bottom_hz(),
         top_hz: spectrogram.top_hz(),
-        highest_db,
+        row_hz: (spectrogram.top_hz() - spectrogram.bottom_hz()) / f64::from(height),
+        highest_db: spectrogram.lowest_db() + STEP_DB * f64::from(highest),
+        longest_part_s,
     };
     Some(SpectrogramPicture { width, height, pixels, covers })
 }

@@ -93,7 +93,7 @@ fn channel_figure(recorded: &Recorded, name: &str, shown: &Spectrogram, from_s: 
          {low} and {high} Hz in {unit}, and the threshold of {threshold_db} dB.",
         escaped(name),
         shown.column_ns() as f64 * 1e-9,
-        shown.top_hz() / shown.rows() as f64,
+        (shown.top_hz() - shown.bottom_hz()) / shown.rows() as f64,
         overlay.squeals.len(),
     );
     Ok(figure(&spectrogram(shown, &overlay, from_s, threshold_db)?, &caption))

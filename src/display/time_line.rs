@@ -40,6 +40,11 @@ impl TimeLine {
         if stamp == Time::default() { self.unstamped(log_ns) } else { stamp.as_ns().saturating_add(self.shift_ns) }
     }
 
+    /// Whether stamps have the same places as on another time line.
+    pub fn runs_as(&self, other: &Self) -> bool {
+        self.shift_ns == other.shift_ns
+    }
+
     /// The time of something that the node did by its own clock: the time of the latest stamped message plus the log
     /// time elapsed since.
     pub fn unstamped(&self, log_ns: i64) -> i64 {

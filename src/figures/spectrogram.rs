@@ -23,15 +23,13 @@ pub struct Overlay {
 }
 
 /// Colours of a spectrogram as indices of the palette, row by row from the highest frequency down, a pixel for each cell:
-/// the highest level is 255, and 80 dB below it is 0. Times without samples are 0. Returns width, height, pixels and the
-/// highest level in dB.
-pub fn pixels(spectrogram: &Spectrogram) -> (u32, u32, Vec<u8>, f64) {
+/// [`highest`] is 255, and 80 dB below it is 0. Times without samples are 0. Returns width, height and pixels.
+pub fn pixels(spectrogram: &Spectrogram, highest: u8) -> (u32, u32, Vec<u8>) {
     let columns = spectrogram.columns();
-    let Some(first) = columns.front() else { return (0, 0, vec![], 0.0) };
+    let Some(first) = columns.front() else { return (0, 0, vec![]) };
     let (width, rows) = (spectrogram.span() as usize, spectrogram.rows());
-    let highest = columns.iter().flat_map(|column| &column.cells).max().copied().unwrap_or(0);
     let colour = |cell: u8| {
-        let below_db = STEP_DB * f64::from(highest - cell);
+        let below_db = STEP_DB * f64::from(highest.saturating_sub(cell));
         (255.0 * (1.0 - below_db / RANGE_DB)).round() as u8
     };
     let mut pixels = vec![0; width * rows];
@@ -41,7 +39,12 @@ pub fn pixels(spectrogram: &Spectrogram) -> (u32, u32, Vec<u8>, f64) {
             pixels[(rows - 1 - row) * width + x] = colour(cell);
         }
     }
-    (width as u32, rows as u32, pixels, spectrogram.lowest_db() + STEP_DB * f64::from(highest))
+    (width as u32, rows as u32, pixels)
+}
+
+/// The largest cell of a spectrogram.
+pub fn highest(spectrogram: &Spectrogram) -> u8 {
+    spectrogram.columns().iter().flat_map(|column| &column.cells).max().copied().unwrap_or(0)
 }
 
 /// A spectrogram as a picture in a figure, from `from_s` after the epoch on, with the level of the band below it. A line
@@ -55,14 +58,14 @@ pub fn spectrogram(
     from_s: f64,
     threshold_db: f64,
 ) -> Result<String, PlotError> {
-    let (width, height, pixels, _) = pixels(spectrogram);
+    let (width, height, pixels) = pixels(spectrogram, highest(spectrogram));
     let column_s = spectrogram.column_ns() as f64 * 1e-9;
     let at = |index: i64| index as f64 * column_s - from_s;
     let first = spectrogram.columns().front().map_or(0, |column| column.index);
     let time = (at(first), at(first + i64::from(width.max(1))));
     let svg = figure("", (1000, 640), |area| {
         let (upper, lower) = area.split_vertically(68.percent());
-        let y = (0.0, spectrogram.top_hz());
+        let y = (spectrogram.bottom_hz(), spectrogram.top_hz());
         let mut chart = axes(&upper, time, y, "time, s", "frequency, Hz")?;
         let place = Rectangle::new([(time.0, y.0), (time.1, y.1)], PLACE.filled());
         chart.draw_series([place]).map_err(failed)?;

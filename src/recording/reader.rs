@@ -3,6 +3,7 @@
 use std::{
     collections::VecDeque,
     io::{self, Read},
+    ops::RangeInclusive,
     panic::resume_unwind,
     path::{Path, PathBuf},
     sync::Arc,
@@ -222,11 +223,21 @@ impl Recording {
 
     /// All messages in recorded order. In recordings of this program their log times ascend.
     pub fn messages(&self) -> Messages<'_> {
+        self.read_messages(None)
+    }
+
+    /// The messages of some log times, in recorded order. Some before and after them are among those returned: what the
+    /// recorder packed together is read together.
+    pub fn messages_around(&self, log_times_ns: RangeInclusive<u64>) -> Messages<'_> {
+        self.read_messages(Some(log_times_ns))
+    }
+
+    fn read_messages(&self, log_times_ns: Option<RangeInclusive<u64>>) -> Messages<'_> {
         let (batches, received) = bounded(BATCHES_AHEAD);
         let files = self.files.clone();
         // This thread decompresses chunks while the caller decodes and uses messages. It ends when the receiver is
         // dropped.
-        let reader = std::thread::spawn(move || read_ahead(&files, &batches));
+        let reader = std::thread::spawn(move || read_ahead(&files, log_times_ns.as_ref(), &batches));
         Messages {
             recording: self,
             reader: Some(reader),
@@ -257,9 +268,13 @@ struct Batch {
     damage: Vec<FileDamage>,
 }
 
-fn read_ahead(files: &[PathBuf], batches: &Sender<Batch>) {
+fn read_ahead(files: &[PathBuf], log_times_ns: Option<&RangeInclusive<u64>>, batches: &Sender<Batch>) {
     for file in files {
-        let mut walker = match open_walker(file, Depth::Messages) {
+        let walker = match log_times_ns {
+            None => RecordWalker::open(file, Depth::Messages),
+            Some(log_times_ns) => RecordWalker::open_between(file, log_times_ns.clone()),
+        };
+        let mut walker = match opened(file, walker) {
             Ok(walker) => walker,
             Err(error) => {
                 let damage = Damage { offset: 0, what: error.to_string(), loses_data: true };
@@ -388,7 +403,11 @@ fn located<'a>(file: &'a Path, damage: &'a [Damage]) -> impl Iterator<Item = Fil
 }
 
 pub(super) fn open_walker(path: &Path, depth: Depth) -> Result<RecordWalker, RecordingError> {
-    match RecordWalker::open(path, depth) {
+    opened(path, RecordWalker::open(path, depth))
+}
+
+fn opened(path: &Path, walker: io::Result<Option<RecordWalker>>) -> Result<RecordWalker, RecordingError> {
+    match walker {
         Ok(Some(walker)) => Ok(walker),
         Ok(None) => Err(not_mcap(path)),
         Err(source) => Err(RecordingError::Io { path: path.to_owned(), source }),

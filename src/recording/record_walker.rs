@@ -12,6 +12,7 @@ use std::{
     collections::{BTreeMap, HashMap},
     fs::File,
     io::{self, BufReader, Read},
+    ops::RangeInclusive,
     path::Path,
     sync::Arc,
 };
@@ -122,6 +123,8 @@ pub struct RecordWalker {
     length: u64,
     offset: u64,
     depth: Depth,
+    /// Chunks without messages of these log times are not opened.
+    log_times_ns: Option<RangeInclusive<u64>>,
     state: State,
     /// Read but not returned yet.
     next: Option<Item>,
@@ -168,6 +171,7 @@ impl RecordWalker {
             length,
             offset: 0,
             depth,
+            log_times_ns: None,
             state: State::Data,
             next: None,
             chunk: None,
@@ -183,6 +187,26 @@ impl RecordWalker {
         }
         if magic.len() < MAGIC.len() {
             walker.stop(0, "the file ends within its first 8 bytes".to_owned(), true);
+        }
+        Ok(Some(walker))
+    }
+
+    /// Opens a file to read the chunks with messages of some log times. They need the channels that the other chunks
+    /// define: those of the summary. Without a summary all chunks are read.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::open`].
+    pub fn open_between(path: &Path, log_times_ns: RangeInclusive<u64>) -> io::Result<Option<Self>> {
+        let (Some(mut structure), Some(mut walker)) =
+            (Self::open(path, Depth::Structure)?, Self::open(path, Depth::Messages)?)
+        else {
+            return Ok(None);
+        };
+        structure.by_ref().for_each(drop);
+        if structure.damage.is_empty() && !structure.channels.is_empty() {
+            walker.log_times_ns = Some(log_times_ns);
+            (walker.schemas, walker.channels, walker.kept) = (structure.schemas, structure.channels, structure.kept);
         }
         Ok(Some(walker))
     }
@@ -262,6 +286,7 @@ impl RecordWalker {
             return Ok(());
         }
         let skipped = match opcode {
+            op::CHUNK if data && length >= 16 && self.is_elsewhere()? => true,
             op::CHUNK | op::MESSAGE => self.depth == Depth::Structure || !data,
             op::SCHEMA | op::CHANNEL => !data && self.depth == Depth::Messages,
             op::ATTACHMENT | op::METADATA => !data,
@@ -301,6 +326,17 @@ impl RecordWalker {
             }
         }
         Ok(())
+    }
+
+    /// Whether the chunk that follows has no message of the log times that are read.
+    fn is_elsewhere(&mut self) -> io::Result<bool> {
+        let Some(wanted) = &self.log_times_ns else { return Ok(false) };
+        // The first and the last log time are the first fields of a chunk.
+        let mut times = [0; 16];
+        self.input.read_exact(&mut times)?;
+        self.input.seek_relative(-16)?;
+        let mut fields = Fields(&times);
+        Ok(fields.u64().zip(fields.u64()).is_some_and(|(first, last)| last < *wanted.start() || first > *wanted.end()))
     }
 
     fn end(&mut self, start: u64) -> io::Result<()> {

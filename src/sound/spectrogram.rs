@@ -1,8 +1,9 @@
 //! A spectrogram of bounded size: the highest levels of short-time spectra in columns of time and rows of frequency.
 //!
-//! Frames of about 40 ms, half a frame apart, are transformed. A cell holds the highest level of the bins and frames in
-//! it, so a short or narrow tone stays visible at any scale. Next to the cells a column holds the highest weighted level in
-//! the band of squeal, [`Column::level_db`].
+//! Frames of about 40 ms, half a frame apart, are transformed; for a part shown in detail, of a length that resolves its
+//! time and frequency equally well ([`Spectrogram::part`]). A cell holds the highest level of the bins and frames in it, so
+//! a short or narrow tone stays visible at any scale. Next to the cells a column holds the highest weighted level in the band
+//! of squeal, [`Column::level_db`].
 
 use std::collections::VecDeque;
 
@@ -12,11 +13,15 @@ use super::weighting::power_weight;
 use super::{Channel, ChannelError, Quantity};
 
 /// Largest number of rows.
-const MOST_ROWS: usize = 400;
+const MOST_ROWS: usize = 520;
 /// Highest frequency shown, Hz.
 const TOP_HZ: f64 = 20_000.0;
 /// Length of the first columns, ns.
 const COLUMN_NS: i64 = 50_000_000;
+/// Shortest and longest frame of a part shown in detail, s.
+const PART_FRAMES_S: (f64, f64) = (0.005, 0.16);
+/// The most frames of a part that overlap.
+const MOST_OVERLAP: usize = 16;
 /// A step of a cell, dB.
 pub const STEP_DB: f64 = 0.75;
 /// Samples count as continuous up to this difference of their stamps, ns.
@@ -42,9 +47,9 @@ pub struct Spectrogram {
     factor: f64,
     spectra: Spectra,
     band_hz: [f64; 2],
-    rows: usize,
-    /// Row of each bin; `rows` for those above.
-    row_of_bin: Vec<usize>,
+    rows: Rows,
+    /// Samples from the beginning of a frame to that of the next.
+    hop: usize,
     /// Weight of each bin in the level of the band.
     weights: Vec<f64>,
     /// Samples of the frames to come, and the time of the first.
@@ -55,6 +60,50 @@ pub struct Spectrogram {
     /// Whether columns get longer, so that all are kept.
     coarsens: bool,
     columns: VecDeque<Column>,
+}
+
+/// Rows of equally many bins.
+#[derive(Clone, Copy, Debug)]
+struct Rows {
+    bin_hz: f64,
+    first_bin: usize,
+    bins_per_row: usize,
+    count: usize,
+}
+
+impl Rows {
+    /// As few bins in a row as possible, from one frequency to another, of spectra with `bins` bins.
+    fn new(low_hz: f64, high_hz: f64, bin_hz: f64, bins: usize) -> Self {
+        let first_bin = ((low_hz / bin_hz).round() as usize).min(bins - 1);
+        let shown = ((high_hz / bin_hz).round() as usize).clamp(first_bin, bins - 1) - first_bin + 1;
+        let bins_per_row = shown.div_ceil(MOST_ROWS);
+        Self { bin_hz, first_bin, bins_per_row, count: shown.div_ceil(bins_per_row) }
+    }
+
+    /// Lower frequency of a row: half a bin below the middle of its first bin.
+    fn low_hz(&self, row: usize) -> f64 {
+        ((self.first_bin + row * self.bins_per_row) as f64 - 0.5) * self.bin_hz
+    }
+}
+
+/// A stretch of time and frequency to be shown in detail.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Part {
+    pub from_ns: i64,
+    pub to_ns: i64,
+    pub low_hz: f64,
+    pub high_hz: f64,
+}
+
+impl Part {
+    /// Samples in a frame, a power of two: near `√(T / F)` of the part's length `T` and height `F`, so that it has as many
+    /// frames as rows.
+    fn frame_length(&self, sample_rate_hz: f64) -> usize {
+        let (shortest_s, longest_s) = PART_FRAMES_S;
+        let length_s = (self.to_ns - self.from_ns) as f64 * 1e-9;
+        let frame_s = (length_s / (self.high_hz - self.low_hz)).sqrt().clamp(shortest_s, longest_s);
+        1 << (frame_s * sample_rate_hz).log2().round().max(4.0) as u32
+    }
 }
 
 impl Spectrogram {
@@ -72,13 +121,36 @@ impl Spectrogram {
     /// # Errors
     /// [`ChannelError`]: the channel has no calibration.
     pub fn latest(channel: &Channel, band_hz: [f64; 2], column_ns: i64, capacity: usize) -> Result<Self, ChannelError> {
-        let calibration = channel.calibration()?;
         let length = frame_length(channel.sample_rate_hz);
+        Self::new(channel, band_hz, (0.0, TOP_HZ), length, length / 2, column_ns, capacity)
+    }
+
+    /// Shows a part in detail, in about `columns` columns. It is to be given the samples of that time.
+    ///
+    /// # Errors
+    /// [`ChannelError`]: the channel has no calibration.
+    pub fn part(channel: &Channel, band_hz: [f64; 2], part: Part, columns: usize) -> Result<Self, ChannelError> {
+        let length = part.frame_length(channel.sample_rate_hz);
+        let column_ns = (part.to_ns - part.from_ns) / columns as i64;
+        let column = (column_ns as f64 * 1e-9 * channel.sample_rate_hz) as usize;
+        let hop = column.clamp((length / MOST_OVERLAP).max(1), length / 2);
+        // A frame begins in every column.
+        let column_ns = column_ns.max(stamp_ns(0, hop as u64, channel.sample_rate_hz) + 1);
+        Self::new(channel, band_hz, (part.low_hz, part.high_hz), length, hop, column_ns, columns + 2)
+    }
+
+    fn new(
+        channel: &Channel,
+        band_hz: [f64; 2],
+        shown_hz: (f64, f64),
+        length: usize,
+        hop: usize,
+        column_ns: i64,
+        capacity: usize,
+    ) -> Result<Self, ChannelError> {
+        let calibration = channel.calibration()?;
         let bin_hz = channel.sample_rate_hz / length as f64;
-        let top_hz = TOP_HZ.min(0.5 * channel.sample_rate_hz);
-        let rows = MOST_ROWS.min((top_hz / bin_hz) as usize);
         let frequencies = (0..=length / 2).map(|bin| bin as f64 * bin_hz);
-        let row_of_bin = frequencies.clone().map(|hz| ((hz / top_hz * rows as f64) as usize).min(rows)).collect();
         let weight = |hz: f64| {
             let in_band = (band_hz[0]..=band_hz[1]).contains(&hz);
             if in_band { power_weight(calibration.quantity, hz) / NOISE_BANDWIDTH } else { 0.0 }
@@ -89,8 +161,8 @@ impl Spectrogram {
             factor: calibration.factor,
             spectra: Spectra::new(length),
             band_hz,
-            rows,
-            row_of_bin,
+            rows: Rows::new(shown_hz.0, shown_hz.1, bin_hz, length / 2 + 1),
+            hop,
             weights: frequencies.map(weight).collect(),
             pending: vec![],
             pending_ns: 0,
@@ -114,14 +186,19 @@ impl Spectrogram {
         self.band_hz
     }
 
-    /// Number of rows, the first of which begins at 0 Hz.
+    /// Number of rows.
     pub fn rows(&self) -> usize {
-        self.rows
+        self.rows.count
+    }
+
+    /// Lower frequency of the first row; half a bin below 0 Hz if that is shown.
+    pub fn bottom_hz(&self) -> f64 {
+        self.rows.low_hz(0)
     }
 
     /// Upper frequency of the last row.
     pub fn top_hz(&self) -> f64 {
-        TOP_HZ.min(0.5 * self.channel.sample_rate_hz)
+        self.rows.low_hz(self.rows.count)
     }
 
     /// Level of a cell of 0, dB, not weighted.
@@ -155,7 +232,7 @@ impl Spectrogram {
         let mut first = 0;
         while first + length <= self.pending.len() {
             self.frame(first, stamp_ns(start_ns, (first + length / 2) as u64, rate_hz));
-            first += length / 2;
+            first += self.hop;
         }
         self.pending.drain(..first);
         self.pending_ns = stamp_ns(start_ns, first as u64, rate_hz);
@@ -163,22 +240,16 @@ impl Spectrogram {
 
     /// Adds the frame that begins with the pending sample `first`; `middle_ns` is the time of its middle.
     fn frame(&mut self, first: usize, middle_ns: i64) {
-        let factor = self.factor;
+        let (factor, lowest_db) = (self.factor, self.lowest_db());
         let samples = &self.pending[first..first + self.spectra.length()];
         let power = self.spectra.power(samples.iter().map(|&sample| factor * f64::from(sample)));
         let reference = self.quantity.reference().powi(2);
-        let mut highest = vec![0.0_f64; self.rows];
-        let mut in_band = 0.0;
-        for ((&power, &row), weight) in power.iter().zip(&self.row_of_bin).zip(&self.weights) {
-            in_band += weight * power;
-            if let Some(cell) = highest.get_mut(row) {
-                *cell = cell.max(power);
-            }
-        }
-        let lowest_db = self.lowest_db();
+        let in_band: f64 = power.iter().zip(&self.weights).map(|(power, weight)| weight * power).sum();
+        let rows = power[self.rows.first_bin..].chunks(self.rows.bins_per_row).take(self.rows.count);
+        let highest = rows.map(|bins| bins.iter().copied().fold(0.0, f64::max));
         let cell = |power: f64| ((10.0 * (power / reference).log10() - lowest_db) / STEP_DB).round() as u8;
         let level_db = (10.0 * (in_band / reference).log10()) as f32;
-        let cells = highest.into_iter().map(cell).collect();
+        let cells = highest.map(cell).collect();
         self.add(middle_ns, Column { index: 0, cells, level_db });
     }
 
@@ -258,14 +329,16 @@ mod tests {
         for (k, block) in tone(10.0, 2500.0, 4.0, 6.0).chunks(777).enumerate() {
             found.push(100 * S + stamp_ns(0, 777 * k as u64, 51_200.0), block);
         }
-        assert_eq!((found.rows(), found.top_hz(), found.column_ns()), (400, 20_000.0, COLUMN_NS));
-        let row = (2500.0 / 50.0) as usize;
+        // Bins of 25 Hz, two in a row, up to that of 20 kHz.
+        assert_eq!((found.rows(), found.column_ns()), (401, COLUMN_NS));
+        assert_eq!((found.bottom_hz(), found.top_hz()), (-12.5, 20_037.5));
+        let row = (2512.5 / 50.0) as usize;
         for column in found.columns() {
             let from_s = (column.index * COLUMN_NS - 100 * S) as f64 * 1e-9;
             let level_db = found.lowest_db() + STEP_DB * f64::from(column.cells[row]);
             if (4.05..5.9).contains(&from_s) {
                 assert!((level_db - 90.97).abs() <= 0.5 * STEP_DB + 0.01, "{level_db} dB at {from_s} s");
-                let loudest = (0..400).max_by_key(|&row| column.cells[row]).unwrap();
+                let loudest = (0..401).max_by_key(|&row| column.cells[row]).unwrap();
                 assert!(loudest.abs_diff(row) <= 1, "row {loudest}");
                 assert!((f64::from(column.level_db) - 90.97 - 1.3).abs() < 0.1, "{}", column.level_db);
             }
@@ -273,6 +346,27 @@ mod tests {
                 assert_eq!(column.cells[row], 0, "at {from_s} s");
             }
         }
+    }
+
+    /// In detail, the onset of a tone is within a frame and a column of its time, and its frequency in its row, at the level
+    /// of the whole. The frame is the power of two nearest to `√(2 s / 2 kHz)` = 32 ms: 2048 samples, bins of 25 Hz.
+    #[test]
+    fn a_part_has_finer_columns_and_rows() {
+        let part = Part { from_ns: 3 * S, to_ns: 5 * S, low_hz: 1510.0, high_hz: 3510.0 };
+        let mut found = Spectrogram::part(&channel(), [1250.0, 16_000.0], part, 200).unwrap();
+        found.push(3 * S, &tone(10.0, 2500.0, 4.0, 6.0)[3 * 51_200..5 * 51_200]);
+        assert_eq!((found.rows(), found.bottom_hz(), found.top_hz()), (81, 1487.5, 3512.5));
+        // 2 s in 200 columns, and not shorter than the 512 samples between frames, 10 ms.
+        assert_eq!(found.column_ns(), 10_000_001);
+        assert_eq!(found.span(), found.columns().len() as i64, "no column is empty");
+        let row = ((2500.0 - found.bottom_hz()) / 25.0) as usize;
+        let level_db = |column: &Column| found.lowest_db() + STEP_DB * f64::from(column.cells[row]);
+        let loud: Vec<&Column> = found.columns().iter().filter(|column| level_db(column) > 84.97).collect();
+        assert!((loud[0].index - 400).abs() <= 2, "half the amplitude, 6 dB less, at the onset: {}", loud[0].index);
+        let last = loud[loud.len() - 1];
+        assert!((level_db(last) - 90.97).abs() <= 0.5 * STEP_DB + 0.01, "{} dB", level_db(last));
+        let loudest = (0..81).max_by_key(|&row| last.cells[row]).unwrap();
+        assert_eq!(loudest, row);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 // A long recording with sound in the page, moved through: node scrub.mjs URL WHAT [pictures], WHAT a JSON object: `per_s`, the
 // predictions in a second, and `channels` with `name`, and of a tone `hz` and `time_s` since the epoch. Prints how fast it was.
 import { check, launch, open, picture, until } from "./browser.mjs";
-import { column, predicted, settled } from "./spectrogram.mjs";
+import { column, predicted, refined, settled } from "./spectrogram.mjs";
 
 const [url, what, pictures] = process.argv.slice(2);
 const { per_s: rate, channels } = JSON.parse(what);
@@ -75,15 +75,31 @@ for (const { name, hz, time_s: seconds } of channels) {
 }
 await picture(page, pictures, "scrub-1280");
 
-// The spectrogram, zoomed and dragged: each step is drawn.
+// In detail: narrower columns, from the samples in the recording.
+const at = await page.evaluate(([seconds, hz]) => document.getElementById("spectrogram").position(seconds, hz), [channels[3].time_s - 15, channels[3].hz]);
 const box = await canvas.boundingBox();
+const view = () => page.evaluate(() => ({ ...document.getElementById("spectrogram").view() }));
+await page.mouse.move(box.x + at[0], box.y + at[1]);
+for (let k = 0; k < 25; k++) await page.mouse.wheel(0, -100);
+await until("it is zoomed", async () => { const { from, to } = await view(); return to - from < 0.004 * length; });
+const asked = Date.now();
+await refined(page);
+const detail = Date.now() - asked;
+// The tone begins within a few columns of 1/2400 of twice the time shown, and frames of √(4.6 s / 4 kHz) = 34 ms.
+const onset = channels[3].time_s - 15;
+const [before, after] = [await column(page, onset - 0.1, channels[3].hz), await column(page, onset + 0.1, channels[3].hz)];
+check(after.light > before.light + 80, `lightness ${before.light} before the onset, ${after.light} after it`);
+await picture(page, pictures, "scrub-detail-1280");
+await page.locator("#sound-all").click();
+await settled(page);
+
+// The spectrogram, zoomed and dragged: each step is drawn.
 const [middleX, y] = [box.x + box.width / 2, box.y + box.height / 2];
 await page.mouse.move(middleX, y);
-const view = () => page.evaluate(() => ({ ...document.getElementById("spectrogram").view() }));
 for (let k = 0; k < 8; k++) await page.mouse.wheel(0, -100);
 await until("it is zoomed", async () => { const { from, to } = await view(); return to - from < 0.17 * length; });
 await settled(page);
-const before = await view();
+const start = await view();
 await page.mouse.down();
 // After the page's own listener, which the press has added.
 await page.evaluate(() => {
@@ -99,8 +115,8 @@ await page.evaluate(() => {
 for (let k = 1; k <= 40; k++) await page.mouse.move(middleX - 10 * k, y);
 await page.mouse.up();
 await settled(page);
-const after = await view();
-const moved = (after.from - before.from) / (before.to - before.from);
+const end = await view();
+const moved = (end.from - start.from) / (start.to - start.from);
 check(Math.abs(moved - 400 / (box.width - 52)) < 0.01, `400 px of ${box.width} moved it by ${moved} of its length`);
 const panned = await page.evaluate(() => window.waits);
 // The moment is marked, and the spectrogram goes on to a moment out of sight.
@@ -118,4 +134,4 @@ await picture(page, pictures, "scrub-zoomed-1280");
 await browser.close();
 check(faults.length === 0, faults.join("\n"));
 const summary = (waits) => { const sorted = [...waits].sort((a, b) => a - b); return { median: sorted[sorted.length >> 1], most: sorted[sorted.length - 1] }; };
-console.log(JSON.stringify({ opened_ms: opened, step_ms: summary(steps), drag, choose_ms: summary(choices), pan_ms: summary(panned) }));
+console.log(JSON.stringify({ opened_ms: opened, step_ms: summary(steps), drag, choose_ms: summary(choices), detail_ms: detail, pan_ms: summary(panned) }));

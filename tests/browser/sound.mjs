@@ -1,7 +1,7 @@
 // The sound of a recording in the page: node sound.mjs URL PLANTED [pictures], PLANTED a JSON list of frequencies in Hz and times
 // in s since the epoch. Prints the scores shown.
 import { check, launch, open, picture, until, violations } from "./browser.mjs";
-import { column, predicted, settled } from "./spectrogram.mjs";
+import { column, predicted, refined, settled } from "./spectrogram.mjs";
 
 const [url, list, pictures] = process.argv.slice(2);
 const planted = JSON.parse(list);
@@ -38,14 +38,18 @@ await until("it is zoomed", async () => {
   const { from, to, low, high } = await view(page);
   return to - from < 0.33 * (whole.to - whole.from) && high - low < 0.07 * (whole.high - whole.low);
 });
-await settled(page);
+const detail = await refined(page);
 const zoomed = await view(page);
+check(detail.from_s <= zoomed.from && detail.to_s >= zoomed.to && detail.bottom_hz <= zoomed.low && detail.top_hz >= zoomed.high, `${JSON.stringify(detail)} for ${JSON.stringify(zoomed)}`);
 const [zoomedX, zoomedY] = await page.evaluate(([seconds, hz]) => document.getElementById("spectrogram").position(seconds, hz), [seconds, hz]);
 // Browsers round the place of a pointer to whole pixels, which the zoom magnifies.
 const [timesX, timesY] = [(whole.to - whole.from) / (zoomed.to - zoomed.from), (whole.high - whole.low) / (zoomed.high - zoomed.low)];
 check(Math.abs(zoomedX - x) <= timesX && Math.abs(zoomedY - y) <= timesY, `zooming moved the squeal from ${x}, ${y} to ${zoomedX}, ${zoomedY}`);
+// In detail, the lightest pixel is in the row of the tone or, where a prediction covers that, beside it.
 const { light, median, lightest } = await column(page, seconds, hz);
+const row = (detail.row_hz / (zoomed.high - zoomed.low)) * (box.height - 22);
 check(light > median + 40, `lightness ${light} at the planted ${hz} Hz, ${median} elsewhere`);
+check(lightest <= row + 1, `the tone is ${lightest} px off ${hz} Hz, rows are ${row} px high`);
 await overlays(seconds, hz);
 await picture(page, pictures, "sound-zoomed-1280");
 

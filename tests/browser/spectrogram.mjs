@@ -1,6 +1,13 @@
 // The pixels of a spectrogram.
 
-/** Waits until the view is drawn, of a channel if one is named, and the server has answered. */
+/** Waits until what the server has in detail of the view is drawn; gives what it covers. */
+export async function refined(page) {
+  await page.waitForFunction(() => document.getElementById("spectrogram").refined());
+  await settled(page);
+  return page.evaluate(() => document.getElementById("spectrogram").refined());
+}
+
+/** Waits until the view is drawn, of a channel if one is named. */
 export const settled = (page, channel) => page.waitForFunction((channel) => {
   const canvas = document.getElementById("spectrogram");
   const [view, painted] = [canvas.view?.(), canvas.painted?.()];

@@ -84,6 +84,32 @@ fn recorded_messages_are_read_back() {
     assert_eq!(recover(&directory).unwrap().recoveries.len(), 1);
 }
 
+/// Messages of some log times are read without the chunks elsewhere; of a file without a summary, everything is.
+#[test]
+fn messages_around_log_times_are_found_without_reading_everything() {
+    let temp = TempDir::new().unwrap();
+    // About 12 chunks of 1 MB.
+    let (directory, _) = record(config(temp.path()), 10_000);
+    let all = read(&directory);
+    let (from, to) = (T0 + 9_000_000_000, T0 + 11_000_000_000);
+    let inside = |entries: &[Entry]| -> Vec<(u64, Vec<u8>)> {
+        let inside = entries.iter().filter(|entry| (from..=to).contains(&entry.log_time_ns));
+        inside.map(|entry| (entry.log_time_ns, entry.cdr.to_vec())).collect()
+    };
+    assert!(inside(&all).len() > 1000);
+    let around = |path: &Path| Recording::open(path).unwrap().messages_around(from..=to).collect::<Vec<Entry>>();
+    let some = around(&directory);
+    assert_eq!(inside(&some), inside(&all));
+    assert!(some.len() < all.len() / 2, "{} of {} messages were read", some.len(), all.len());
+    assert!(some.iter().all(|entry| matches!(entry.message, Recorded::Known(_))));
+
+    let bytes = fs::read(only_file(&directory)).unwrap();
+    let cut = temp.path().join("cut.mcap");
+    fs::write(&cut, &bytes[..bytes.len() - 100]).unwrap();
+    let some = around(&cut);
+    assert_eq!((inside(&some), some.len()), (inside(&all), all.len()));
+}
+
 #[test]
 fn a_recording_is_split_by_size_and_by_duration() {
     let temp = TempDir::new().unwrap();

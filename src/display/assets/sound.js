@@ -6,6 +6,11 @@ import { NONE, colour, fixed, known, time } from "./format.js";
 const at = (id) => document.getElementById(id);
 /** Interval between pictures of a running node, ms. */
 const EVERY = 2000;
+/** Finer columns and rows are requested once the view rests, ms; of more than the view, so that it can be moved: by this share
+ * of its length and height on every side; and again if it is this many times shorter. */
+const RESTS = 150;
+const BESIDE = 0.5;
+const FINER = 2;
 /** A prediction is drawn up to the next one if that follows within this time, s. */
 const HOLDS_S = 2;
 /** Room for the labels of the axes, px. */
@@ -19,6 +24,8 @@ export class Sound {
     this.go = go;
     this.picture = null;
     this.covers = null;
+    this.part = null;
+    this.refining = false;
     this.squeals = [];
     this.view = null;
     this.asked = -Infinity;
@@ -41,6 +48,7 @@ export class Sound {
     this.canvas.position = (seconds, hz) => this.position(seconds, hz);
     this.canvas.view = () => this.picture && this.view;
     this.canvas.painted = () => this.painted;
+    this.canvas.refined = () => !this.refining && !this.#unrefined() && (this.part?.covers ?? true);
     new ResizeObserver(() => this.draw()).observe(this.canvas.parentElement);
   }
 
@@ -76,13 +84,12 @@ export class Sound {
     const name = at("sound-channel").value;
     if (!name) return;
     const order = ++this.loads;
-    const answer = await fetch(`spectrogram.png?channel=${encodeURIComponent(name)}`);
-    if (!answer.ok) return;
-    const covers = JSON.parse(answer.headers.get("x-covers"));
-    const picture = await createImageBitmap(await answer.blob());
+    const found = await spectrogram({ channel: name });
     // If two requests overlap, the later one counts.
-    if (order !== this.loads) return;
+    if (!found || order !== this.loads) return;
+    const { picture, covers } = found;
     this.picture = picture;
+    this.part = null;
     this.shown = name;
     const follows = !this.view || !this.covers || this.view.to >= this.covers.to_s;
     const whole = !this.view || (this.covers && this.view.from <= this.covers.from_s && follows);
@@ -94,8 +101,8 @@ export class Sound {
   }
 
   #whole() {
-    const { from_s: from, to_s: to, top_hz: high } = this.covers;
-    return { from, to, low: 0, high };
+    const { from_s: from, to_s: to, bottom_hz: low, top_hz: high } = this.covers;
+    return { from, to, low: Math.max(0, low), high };
   }
 
   #all() {
@@ -133,9 +140,9 @@ export class Sound {
       const start = Math.min(Math.max(a, first), last - length);
       return [start, start + length];
     };
-    const { from_s: first, to_s: last, top_hz: top } = this.covers;
+    const { from: first, to: last, low: bottom, high: top } = this.#whole();
     [this.view.from, this.view.to] = inside(this.view.from, this.view.to, first, last);
-    [this.view.low, this.view.high] = inside(this.view.low, this.view.high, 0, top);
+    [this.view.low, this.view.high] = inside(this.view.low, this.view.high, bottom, top);
   }
 
   #move(seconds, hz) {
@@ -209,7 +216,8 @@ export class Sound {
     pen.beginPath();
     pen.rect(LEFT * ratio, 0, (width - LEFT) * ratio, (height - BELOW) * ratio);
     pen.clip();
-    this.#image(pen, ratio);
+    this.#image(pen, ratio, this);
+    if (this.part) this.#image(pen, ratio, this.part);
     this.#overlay(pen, ratio);
     pen.restore();
     pen.scale(ratio, ratio);
@@ -218,15 +226,57 @@ export class Sound {
     const shown = this.view.to - this.view.from;
     canvas.setAttribute("aria-label", `Spectrogram of ${this.shown}, ${fixed(shown, 1)} s, ${fixed(this.view.low, 0)} to ${fixed(this.view.high, 0)} Hz`);
     this.painted = { channel: this.shown, ...this.view };
+    clearTimeout(this.later);
+    this.later = setTimeout(() => this.#refine(), RESTS);
   };
 
-  /** Draws the part of the picture in sight: as a whole, magnified, it would be too large to be placed to a pixel. */
-  #image(pen, ratio) {
-    const { picture, covers, view } = this;
+  /** Time and frequencies around the view to be requested in finer columns and rows; none if they are there, or cannot be had. */
+  #unrefined() {
+    if (!this.view) return undefined;
+    const whole = this.#whole();
+    const { from, to, low, high } = this.view;
+    const [length, height] = [to - from, high - low];
+    if (length >= whole.to - whole.from && height >= whole.high - whole.low) return undefined;
+    const part = {
+      channel: this.shown,
+      from_s: Math.max(whole.from, from - BESIDE * length), to_s: Math.min(whole.to, to + BESIDE * length),
+      low_hz: Math.max(whole.low, low - BESIDE * height), high_hz: Math.min(whole.high, high + BESIDE * height),
+    };
+    if (part.to_s - part.from_s > this.covers.longest_part_s) return undefined;
+    const there = this.part?.asked;
+    const covered = there && there.from_s <= from && there.to_s >= to && there.low_hz <= low && there.high_hz >= high;
+    const finest = 1 + 2 * BESIDE;
+    const fine = there && there.to_s - there.from_s <= FINER * finest * length && there.high_hz - there.low_hz <= FINER * finest * height;
+    return covered && fine ? undefined : part;
+  }
+
+  /** Requests one part at a time; if the view has moved out of it meanwhile, the next. */
+  async #refine() {
+    if (this.refining) return;
+    this.refining = true;
+    try {
+      for (let asked = this.#unrefined(); asked; asked = this.#unrefined()) {
+        const found = await spectrogram(asked);
+        if (asked.channel !== this.shown) continue;
+        // Without samples the whole is all there is.
+        this.part = { asked, ...found };
+        this.draw();
+      }
+    } catch {
+      // The connection is lost: the next view asks again.
+    } finally {
+      this.refining = false;
+    }
+  }
+
+  /** Draws the part of a picture in sight: as a whole, magnified, it would be too large to be placed to a pixel. */
+  #image(pen, ratio, { picture, covers }) {
+    if (!picture) return;
+    const { view } = this;
     const across = (seconds) => ((seconds - covers.from_s) / (covers.to_s - covers.from_s)) * picture.width;
-    const down = (hz) => (1 - hz / covers.top_hz) * picture.height;
+    const down = (hz) => ((covers.top_hz - hz) / (covers.top_hz - covers.bottom_hz)) * picture.height;
     const [from, to] = [Math.max(view.from, covers.from_s), Math.min(view.to, covers.to_s)];
-    const [low, high] = [Math.max(view.low, 0), Math.min(view.high, covers.top_hz)];
+    const [low, high] = [Math.max(view.low, covers.bottom_hz), Math.min(view.high, covers.top_hz)];
     if (from >= to || low >= high) return;
     const [left, upper] = this.position(from, high).map((px) => px * ratio);
     const [right, lower] = this.position(to, low).map((px) => px * ratio);
@@ -293,6 +343,14 @@ export class Sound {
       if (x > LEFT + 24 && x < width - 24) pen.fillText(label, x, height - BELOW / 2);
     }
   }
+}
+
+/** The spectrogram of a channel, or of a part of it, and what it covers; undefined if there is none. */
+async function spectrogram(asked) {
+  const answer = await fetch(`spectrogram.png?${new URLSearchParams(asked)}`);
+  if (!answer.ok) return undefined;
+  const covers = JSON.parse(answer.headers.get("x-covers"));
+  return { picture: await createImageBitmap(await answer.blob()), covers };
 }
 
 /** Index of the first bin whose number is at least `number`. */
