@@ -2,8 +2,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::Outcome;
 use super::sound_files::SoundFileArgs;
+use super::{Outcome, finite, positive};
 use crate::import::tribometer_log::{Field, LogOptions, TribometerLog};
 use crate::import::{ReadLog, import_with_sound, read_log};
 
@@ -28,9 +28,19 @@ pub struct Options {
 #[derive(Clone, Debug, Args)]
 pub struct LogArgs {
     /// Take a quantity from a column by its name: time_s, normal_load_n, disc_speed_rad_s, friction_coefficient or
-    /// friction_force_n
+    /// friction_force_n. `-NAME` reverses the sign, as of a load that is negative where it presses
     #[arg(long = "column", value_name = "QUANTITY=NAME", value_parser = column)]
     columns: Vec<(Field, String)>,
+    /// A quantity that is not in the log, of the same value in every line: normal_load_n, disc_speed_rad_s or
+    /// friction_coefficient
+    #[arg(long = "constant", value_name = "QUANTITY=VALUE", value_parser = constant)]
+    constants: Vec<(Field, f64)>,
+    /// Distance from the disc's axis at which a sliding speed in m/s was measured, m
+    #[arg(long, value_name = "M", value_parser = positive)]
+    radius_m: Option<f64>,
+    /// Join the steps of a test whose times begin again with each step: one interval after the line before
+    #[arg(long)]
+    times_restart: bool,
     /// The decimal sign, instead of detecting it
     #[arg(long, value_name = ", or .", value_parser = decimal)]
     decimal: Option<char>,
@@ -39,12 +49,19 @@ pub struct LogArgs {
     skip_bad_lines: bool,
 }
 
+fn field(quantity: &str) -> Result<Field, String> {
+    let known: Vec<&str> = Field::ALL.iter().map(|field| field.name()).collect();
+    Field::from_name(quantity).ok_or_else(|| format!("no quantity `{quantity}`; there are {}", known.join(", ")))
+}
+
 fn column(text: &str) -> Result<(Field, String), String> {
     let (quantity, name) = text.split_once('=').ok_or("expected QUANTITY=NAME")?;
-    let known: Vec<&str> = Field::ALL.iter().map(|field| field.name()).collect();
-    let field = Field::from_name(quantity)
-        .ok_or_else(|| format!("no quantity `{quantity}`; there are {}", known.join(", ")))?;
-    Ok((field, name.to_owned()))
+    Ok((field(quantity)?, name.to_owned()))
+}
+
+fn constant(text: &str) -> Result<(Field, f64), String> {
+    let (quantity, value) = text.split_once('=').ok_or("expected QUANTITY=VALUE")?;
+    Ok((field(quantity)?, finite(value)?))
 }
 
 fn decimal(text: &str) -> Result<char, String> {
@@ -60,6 +77,9 @@ impl LogArgs {
     pub fn options(&self) -> LogOptions {
         LogOptions {
             columns: self.columns.clone(),
+            constants: self.constants.clone(),
+            radius_m: self.radius_m,
+            times_restart: self.times_restart,
             decimal: self.decimal,
             skip_bad_lines: self.skip_bad_lines,
             ..Default::default()
@@ -92,7 +112,11 @@ pub fn describe(log: &TribometerLog) -> Outcome {
             "" | "-" | "1" => String::new(),
             unit => format!(" in {unit}"),
         };
-        note!("{} from column {:?}{unit}", column.field, column.header);
+        let sign = if column.reversed { ", with the opposite sign" } else { "" };
+        note!("{} from column {:?}{unit}{sign}", column.field, column.header);
+    }
+    for (field, value) in &log.constants {
+        note!("{field} = {value} in every line");
     }
     if !log.left_out.is_empty() {
         let names: Vec<String> = log.left_out.iter().map(|name| format!("{name:?}")).collect();

@@ -27,7 +27,8 @@ use sound_blocks::{Beside, SoundBlocks, join};
 use tribometer_log::{LogError, LogOptions, Sample, TribometerLog};
 
 /// Name of the metadata record that describes the origin of the recording. Its keys: `source`, `source_sha256`,
-/// `squealcast_version`, `skipped_lines`, and for each quantity the column it was read from.
+/// `squealcast_version`, `skipped_lines`, and for each quantity the column it was read from, after a `-` if with the
+/// opposite sign, or its constant.
 pub const METADATA_NAME: &str = "squealcast_import";
 
 /// Options of an import.
@@ -142,7 +143,11 @@ fn write(file: &mut RecordingFile, read: &ReadLog, sound: &mut SoundBlocks) -> R
         ("skipped_lines".to_owned(), log.skipped.to_string()),
     ]);
     for column in &log.columns {
-        metadata.insert(column.field.name().to_owned(), column.header.clone());
+        let sign = if column.reversed { "-" } else { "" };
+        metadata.insert(column.field.name().to_owned(), format!("{sign}{}", column.header));
+    }
+    for (field, value) in &log.constants {
+        metadata.insert(field.name().to_owned(), format!("constant {value}"));
     }
     file.write_metadata(&Metadata { name: METADATA_NAME.to_owned(), metadata })?;
     let channel = file.own_channel(Topic::OperatingPoint)?;

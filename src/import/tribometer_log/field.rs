@@ -63,6 +63,8 @@ impl Field {
                 "axial_load",
                 "anpresskraft",
                 "axialkraft",
+                "nominal_load",
+                "daq_fz",
             ],
             Self::DiscSpeedRadS => &[
                 "disc_speed",
@@ -76,6 +78,11 @@ impl Field {
                 "ω",
                 "drehzahl",
                 "rpm",
+                "sliding_speed",
+                "linear_speed",
+                "max_linear_speed",
+                "gleitgeschwindigkeit",
+                "rotary_velocity",
             ],
             Self::FrictionCoefficient => &[
                 "friction_coefficient",
@@ -87,18 +94,41 @@ impl Field {
                 "reibwert",
                 "reibungszahl",
                 "reibungskoeffizient",
+                "daq_cof",
             ],
-            Self::FrictionForceN => {
-                &["friction_force", "tangential_force", "ft", "f_t", "ff", "f_f", "reibkraft", "reibungskraft"]
-            }
+            Self::FrictionForceN => &[
+                "friction_force",
+                "tangential_force",
+                "ft",
+                "f_t",
+                "ff",
+                "f_f",
+                "reibkraft",
+                "reibungskraft",
+                "daq_fx",
+            ],
         }
     }
 
     /// Accepted units with their value in the stored unit; of time in ns.
     pub(super) fn units(self) -> &'static [(&'static str, f64)] {
-        const FORCES: &[(&str, f64)] = &[("N", 1.0), ("daN", 10.0), ("kN", 1e3)];
+        // Forces in grams and kilograms are those of standard gravity, 9.80665 m/s².
+        const FORCES: &[(&str, f64)] = &[
+            ("N", 1.0),
+            ("daN", 10.0),
+            ("kN", 1e3),
+            ("mN", 1e-3),
+            ("g", 9.80665e-3),
+            ("gf", 9.80665e-3),
+            ("kg", 9.80665),
+            ("kgf", 9.80665),
+            ("kp", 9.80665),
+            ("lbf", 4.4482216152605),
+        ];
         match self {
-            Self::Time => &[("s", 1e9), ("ms", 1e6), ("us", 1e3), ("ns", 1.0), ("min", 60e9), ("h", 3600e9)],
+            Self::Time => {
+                &[("s", 1e9), ("sec", 1e9), ("ms", 1e6), ("us", 1e3), ("ns", 1.0), ("min", 60e9), ("h", 3600e9)]
+            }
             Self::NormalLoadN | Self::FrictionForceN => FORCES,
             Self::DiscSpeedRadS => &[
                 ("rad/s", 1.0),
@@ -113,15 +143,36 @@ impl Field {
                 ("rev/s", TAU),
                 ("deg/s", TAU / 360.0),
             ],
-            Self::FrictionCoefficient => &[("-", 1.0), ("1", 1.0), ("", 1.0)],
+            // The force that Rtec tribometers divide by the load is named where others have a unit.
+            Self::FrictionCoefficient => &[("-", 1.0), ("1", 1.0), ("", 1.0), ("Fx", 1.0)],
         }
     }
 
-    pub(super) fn unit(self, text: &str) -> Option<(&'static str, f64)> {
-        let text = text.trim().replace(['µ', 'μ'], "u");
-        let exact = self.units().iter().find(|(unit, _)| *unit == text);
-        exact.or_else(|| self.units().iter().find(|(unit, _)| unit.eq_ignore_ascii_case(&text))).copied()
+    /// Accepted units of the sliding speed with their value in m/s, for disc speeds.
+    pub(super) fn sliding_units(self) -> &'static [(&'static str, f64)] {
+        match self {
+            Self::DiscSpeedRadS => &[("m/s", 1.0), ("mm/s", 1e-3), ("mm/sec", 1e-3)],
+            Self::Time | Self::NormalLoadN | Self::FrictionCoefficient | Self::FrictionForceN => &[],
+        }
     }
+
+    /// The unit that a text names, with its value in the stored unit.
+    pub(super) fn unit(self, text: &str) -> Option<(&'static str, f64)> {
+        named(self.units(), text)
+    }
+
+    /// The unit of the sliding speed that a text names, with its value in m/s.
+    pub(super) fn sliding_unit(self, text: &str) -> Option<(&'static str, f64)> {
+        named(self.sliding_units(), text)
+    }
+}
+
+/// The unit that a text names: written as in the list, or else with other capitals, unless these mean another prefix.
+fn named(units: &'static [(&'static str, f64)], text: &str) -> Option<(&'static str, f64)> {
+    let text = text.trim().replace(['µ', 'μ'], "u");
+    let exact = units.iter().find(|(unit, _)| *unit == text);
+    let alike = || units.iter().find(|(unit, _)| unit.eq_ignore_ascii_case(&text) && text != "MN");
+    exact.or_else(alike).copied()
 }
 
 impl fmt::Display for Field {
