@@ -10,6 +10,7 @@
 //! [`PressureLaw`] is `p`, [`Statics`] holds the rest, [`Statics::state`] solves for the closures `δ`, the contact forces
 //! `N`, the rigid motions `ρ` and, where the contact force is what a rig measures, the force `F` on the pad's back.
 
+mod factors;
 mod law;
 mod path;
 mod response;

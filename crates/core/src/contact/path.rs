@@ -4,9 +4,9 @@
 //! the approach of a pair in series with a spring of typical flexibility `f_k`. The force is nearly linear in `u_k` for an
 //! exponential law as for a law with a sharp onset, so long steps neither overflow nor open every pair.
 
-use faer::Mat;
-use faer::linalg::solvers::{PartialPivLu, Solve};
+use faer::{Mat, MatMut};
 
+use super::factors::Factors;
 use super::law::LawValue;
 use super::statics::{MeasuredLoad, PathEnd, StateSlope, Statics, StaticsError, SteadyState, times_columns};
 
@@ -18,9 +18,17 @@ const ROUNDING: f64 = 1e-15;
 const POLISH: f64 = 1e-9;
 /// Below this residual the Jacobian is not computed again.
 const SETTLED: f64 = 1e-12;
-/// Largest number of steps with the Jacobian of an anchor, and the factor by which each of them must reduce the residual.
+/// Steps with the Jacobian of an anchor: the residual below which they end, the largest number of them, and the factor by
+/// which each must reduce the residual.
+const NEAR: f64 = 1e-3;
 const MOST_CHORDS: usize = 12;
 const CONTRACTION: f64 = 0.3;
+/// A Jacobian whose step reduces the residual by this factor is kept for the next one, if it may be.
+const FAST: f64 = 0.05;
+/// Derivatives are refined until the next step would change them by less than this, relative, and in at most so many steps.
+/// Each must change them less than the one before, by the factor of a step with the Jacobian of an anchor.
+const REFINED: f64 = 1e-15;
+const MOST_REFINEMENTS: usize = 8;
 /// Change of the friction coefficient that counts as much as a change of the load by a factor of e.
 const FRICTION_SCALE: f64 = 0.1;
 /// Largest number of Newton steps, and of halvings of one step.
@@ -88,9 +96,9 @@ struct Evaluated {
 }
 
 /// Factorised Jacobian over closed pairs and other unknowns.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 struct Jacobian {
-    lu: PartialPivLu<f64>,
+    factors: Factors,
     /// Pairs with a tangent stiffness, and the tangent stiffness of every pair.
     closed: Vec<usize>,
     tangent: Vec<f64>,
@@ -124,9 +132,24 @@ impl Scales {
 
 impl<'a> Equations<'a> {
     fn new(statics: &'a Statics, load: f64, x: f64, support: f64, scales: &'a Scales) -> Self {
+        Self::within(Mat::new(), statics, load, x, support, scales)
+    }
+
+    /// The equations, with the matrix of flexibilities in the array `flexibility`.
+    fn within(
+        mut flexibility: Mat<f64>,
+        statics: &'a Statics,
+        load: f64,
+        x: f64,
+        support: f64,
+        scales: &'a Scales,
+    ) -> Self {
         let parts = &statics.parts;
         let (normal, sliding) = (&parts.response.normal_flexibility, &parts.response.sliding_flexibility);
-        let flexibility = faer::zip!(normal, sliding).map(|faer::unzip!(nn, nt)| nn + x * nt);
+        if flexibility.shape() != normal.shape() {
+            flexibility = Mat::zeros(normal.nrows(), normal.ncols());
+        }
+        faer::zip!(&mut flexibility, normal, sliding).for_each(|faer::unzip!(out, nn, nt)| *out = nn + x * nt);
         let pushed = &parts.response.rigid.normal + faer::Scale(x) * &parts.response.rigid.sliding;
         Self { statics, load, x, flexibility, pushed, support, scales }
     }
@@ -228,16 +251,27 @@ impl<'a> Equations<'a> {
     /// w (B Φ_r)ᵀ k_c   0          w p_r
     /// w 1ᵀ k_c         0          0
     /// ```
-    fn jacobian(&self, at: &Evaluated) -> Jacobian {
+    fn jacobian(&self, at: &Evaluated, mut arrays: Jacobian) -> Jacobian {
+        let size = at.closed.len() + at.point.others.len();
+        arrays.factors.factorise(size, |matrix| self.fill(at, matrix));
+        arrays.sign = arrays.factors.sign();
+        arrays.closed.clone_from(&at.closed);
+        arrays.tangent.clear();
+        arrays.tangent.extend(at.law.iter().map(|value| value.tangent));
+        arrays
+    }
+
+    /// Writes the Jacobian.
+    fn fill(&self, at: &Evaluated, mut matrix: MatMut<'_, f64>) {
         let parts = &self.statics.parts;
         let (closed, others, rigid) = (&at.closed, at.point.others.len(), self.rigid());
         let m = closed.len();
         let weight = self.weight();
-        let mut matrix = Mat::<f64>::zeros(m + others, m + others);
+        matrix.as_mut().get_mut(.., m..).fill(0.0);
         for (column, &j) in closed.iter().enumerate() {
             let tangent = at.law[j].tangent;
             let of_pair = self.flexibility.col(j);
-            let out = matrix.col_mut(column);
+            let out = matrix.as_mut().col_mut(column);
             for (row, entry) in out.iter_mut().enumerate() {
                 *entry = match closed.get(row) {
                     Some(&k) => of_pair[k] * tangent,
@@ -249,11 +283,7 @@ impl<'a> Equations<'a> {
         }
         for other in 0..others {
             for (row, &k) in closed.iter().enumerate() {
-                matrix[(row, m + other)] = if other < rigid {
-                    parts.response.rigid.normal[(k, other)]
-                } else {
-                    parts.response.gap_per_load[k]
-                };
+                matrix[(row, m + other)] = self.per_other(k, other);
             }
             if other == rigid {
                 for (j, load) in parts.response.rigid.load.iter().enumerate() {
@@ -261,22 +291,53 @@ impl<'a> Equations<'a> {
                 }
             }
         }
-        let lu = matrix.partial_piv_lu();
-        let sign = determinant_sign(&lu, m + others);
-        let tangent = at.law.iter().map(|value| value.tangent).collect();
-        Jacobian { lu, closed: closed.clone(), tangent, sign }
+    }
+
+    /// The Jacobian at `at`, over all pairs, times several vectors.
+    fn times(&self, at: &Evaluated, vectors: &Mat<f64>) -> Mat<f64> {
+        let parts = &self.statics.parts;
+        let (c, rigid, weight) = (self.statics.pairs(), self.rigid(), self.weight());
+        let mut out = Mat::zeros(vectors.nrows(), vectors.ncols());
+        let (mut forces, mut moved) = (vec![0.0; c], vec![0.0; c]);
+        for column in 0..vectors.ncols() {
+            for &k in &at.closed {
+                forces[k] = at.law[k].tangent * vectors[(k, column)];
+            }
+            times_columns(self.flexibility.as_ref(), &forces, &at.closed, &mut moved);
+            for other in 0..vectors.nrows() - c {
+                let value = vectors[(c + other, column)];
+                for (k, moved) in moved.iter_mut().enumerate() {
+                    *moved += value * self.per_other(k, other);
+                }
+                let along = |k: usize| if other < rigid { self.pushed[(k, other)] } else { 1.0 };
+                let mut balance = at.closed.iter().map(|&k| along(k) * forces[k]).sum::<f64>();
+                if other < rigid && vectors.nrows() > c + rigid {
+                    balance += parts.response.rigid.load[other] * vectors[(c + rigid, column)];
+                }
+                out[(c + other, column)] = weight * balance;
+            }
+            for (k, moved) in moved.iter().enumerate() {
+                out[(k, column)] = vectors[(k, column)] + moved;
+            }
+        }
+        out
+    }
+
+    /// Derivative of the gap of a pair with respect to an unknown beside the closures.
+    fn per_other(&self, pair: usize, other: usize) -> f64 {
+        let response = &self.statics.parts.response;
+        if other < self.rigid() { response.rigid.normal[(pair, other)] } else { response.gap_per_load[pair] }
     }
 
     /// Solves `J d = right` for several right-hand sides, `(c + others)×n`, in place.
     fn solve(&self, jacobian: &Jacobian, right: &mut Mat<f64>) {
-        let parts = &self.statics.parts;
-        let (c, m, rigid) = (self.statics.pairs(), jacobian.closed.len(), self.rigid());
+        let (c, m) = (self.statics.pairs(), jacobian.closed.len());
         let others = right.nrows() - c;
         let mut reduced = Mat::from_fn(m + others, right.ncols(), |row, column| match jacobian.closed.get(row) {
             Some(&k) => right[(k, column)],
             None => right[(c + row - m, column)],
         });
-        jacobian.lu.solve_in_place(reduced.as_mut());
+        jacobian.factors.solve(reduced.as_mut());
         let open: Vec<usize> = (0..c).filter(|&k| jacobian.tangent[k] == 0.0).collect();
         let mut moved = vec![0.0; c];
         let mut increments = vec![0.0; c];
@@ -291,12 +352,7 @@ impl<'a> Equations<'a> {
                 // The closure of an open pair follows from the other unknowns.
                 let mut value = right[(k, column)] - moved[k];
                 for other in 0..others {
-                    let per = if other < rigid {
-                        parts.response.rigid.normal[(k, other)]
-                    } else {
-                        parts.response.gap_per_load[k]
-                    };
-                    value -= per * reduced[(m + other, column)];
+                    value -= self.per_other(k, other) * reduced[(m + other, column)];
                 }
                 right[(k, column)] = value;
             }
@@ -341,8 +397,19 @@ impl<'a> Equations<'a> {
     /// Newton steps from `start`; the state with its Jacobian, or the residual where they ended. `full` takes every step at
     /// full length: where pairs open and close, the residual may have to grow before it vanishes.
     fn newton(&self, start: Point, full: bool) -> Result<(Evaluated, Jacobian), f64> {
-        let mut at = self.evaluate(start);
-        let mut jacobian = self.jacobian(&at);
+        self.newton_from(self.evaluate(start), full, None)
+    }
+
+    /// The same from where the equations are evaluated already. With `arrays`, which take the Jacobian, it is kept from step
+    /// to step while these are fast.
+    fn newton_from(
+        &self,
+        mut at: Evaluated,
+        full: bool,
+        arrays: Option<Jacobian>,
+    ) -> Result<(Evaluated, Jacobian), f64> {
+        let keeps = arrays.is_some();
+        let mut jacobian = self.jacobian(&at, arrays.unwrap_or_default());
         for _ in 0..MOST_STEPS {
             if at.accuracy <= ROUNDING {
                 return Ok((at, jacobian));
@@ -370,10 +437,11 @@ impl<'a> Equations<'a> {
             match better {
                 Some(tried) => {
                     // A step that only removes rounding errors leaves the Jacobian as it is.
-                    let settled = at.accuracy < SETTLED && tried.closed == jacobian.closed;
+                    let fast = keeps && tried.accuracy < FAST * at.accuracy;
+                    let settled = (fast || at.accuracy < SETTLED) && tried.closed == jacobian.closed;
                     at = tried;
                     if !settled {
-                        jacobian = self.jacobian(&at);
+                        jacobian = self.jacobian(&at, jacobian);
                     }
                 }
                 None if at.accuracy <= LIMIT => return Ok((at, jacobian)),
@@ -446,10 +514,39 @@ impl<'a> Equations<'a> {
         })
     }
 
+    /// The derivatives of all unknowns with respect to the load, `s μ` and `ln κ`. If the Jacobian is that of another point,
+    /// they are refined; `None` if that does not converge.
+    fn slopes(&self, at: &Evaluated, jacobian: &Jacobian) -> Option<Mat<f64>> {
+        let right = self.parameters(at);
+        let mut slopes = right.clone();
+        self.solve(jacobian, &mut slopes);
+        let same = at.law.iter().zip(&jacobian.tangent).all(|(value, tangent)| value.tangent == *tangent);
+        let mut last = 1.0;
+        for _ in 0..if same { 0 } else { MOST_REFINEMENTS } {
+            let mut rest = &right - self.times(at, &slopes);
+            self.solve(jacobian, &mut rest);
+            slopes += &rest;
+            let change = (0..3).map(|k| rest.col(k).norm_max() / slopes.col(k).norm_max()).fold(0.0, f64::max);
+            if change * change < REFINED * last {
+                break;
+            }
+            if change.is_nan() || change > CONTRACTION * last {
+                // Rounding errors remain.
+                return (change < 1e3 * REFINED).then_some(slopes);
+            }
+            last = change;
+        }
+        Some(slopes)
+    }
+
     fn state(&self, at: &Evaluated, jacobian: &Jacobian) -> SteadyState {
-        let c = self.statics.pairs();
         let mut slopes = self.parameters(at);
         self.solve(jacobian, &mut slopes);
+        self.state_with(at, &slopes)
+    }
+
+    fn state_with(&self, at: &Evaluated, slopes: &Mat<f64>) -> SteadyState {
+        let c = self.statics.pairs();
         let slope = |parameter: usize| {
             let direct = if parameter == 2 { 1.0 } else { 0.0 };
             let closure: Vec<f64> = (0..c).map(|k| slopes[(k, parameter)]).collect();
@@ -483,31 +580,35 @@ impl<'a> Equations<'a> {
             per_stiffness: slope(2),
         }
     }
-}
 
-/// The sign of the determinant, 0 if a pivot vanishes to working precision.
-fn determinant_sign(lu: &PartialPivLu<f64>, size: usize) -> i8 {
-    let upper = lu.U();
-    let mut negative = false;
-    for k in 0..size {
-        let pivot = upper[(k, k)];
-        if pivot == 0.0 || !pivot.is_finite() {
-            return 0;
+    /// The state, started from `anchor`; `None` if it is not certain to be its continuation.
+    fn from_anchor(&self, anchor: &Anchor, work: &mut Work) -> Option<SteadyState> {
+        let along = [self.load - anchor.state.load_n, self.x - anchor.state.friction];
+        let mut at = self.evaluate(self.predicted(&anchor.state, along));
+        for _ in 0..MOST_CHORDS {
+            if at.accuracy < NEAR {
+                break;
+            }
+            let direction = self.direction(&at, &anchor.jacobian);
+            let tried = self.evaluate(self.step(&at, &direction, 1.0, true));
+            let contracts = tried.accuracy < CONTRACTION * at.accuracy;
+            if tried.accuracy < at.accuracy {
+                at = tried;
+            }
+            if !contracts {
+                break;
+            }
         }
-        negative ^= pivot < 0.0;
+        let found = self.newton_from(at, false, Some(std::mem::take(&mut work.jacobian))).ok()?;
+        let near = self.is_near(&anchor.state, along, anchor.jacobian.sign, &found);
+        let (at, jacobian) = found;
+        let state = near.then(|| match self.slopes(&at, &jacobian) {
+            Some(slopes) => self.state_with(&at, &slopes),
+            None => self.state(&at, &self.jacobian(&at, Jacobian::default())),
+        });
+        work.jacobian = jacobian;
+        state
     }
-    let (permutation, _) = lu.P().arrays();
-    let mut seen = vec![false; size];
-    for start in 0..size {
-        let (mut k, mut length) = (start, 0);
-        while !seen[k] {
-            seen[k] = true;
-            k = permutation[k];
-            length += 1;
-        }
-        negative ^= length > 0 && length % 2 == 0;
-    }
-    if negative { -1 } else { 1 }
 }
 
 /// The state at `load` and `s_mu`, continued from `s_mu = 0`.
@@ -614,13 +715,12 @@ fn classify(near: &Equations<'_>, state: &SteadyState, toward: f64, sign: i8) ->
     let beyond = 1e3 * SHORTEST * toward;
     let equations = Equations::new(statics, state.load_n, state.friction + beyond, 0.0, scales);
     let at = equations.evaluate(equations.predicted(state, [0.0, beyond]));
-    let jacobian = equations.jacobian(&at);
+    let jacobian = equations.jacobian(&at, Jacobian::default());
     let largest = state.per_friction.force.iter().fold(0.0f64, |most, value| most.max(value.abs()));
     if jacobian.sign == -sign && largest > GROWTH * scales.force {
         return PathEnd::Turns;
     }
-    let upper = jacobian.lu.U();
-    let pivots = (0..upper.nrows()).map(|k| upper[(k, k)].abs());
+    let pivots = jacobian.factors.pivots().map(f64::abs);
     let (least, most) =
         pivots.fold((f64::INFINITY, 0.0f64), |(least, most), pivot| (least.min(pivot), most.max(pivot)));
     if least <= 1e-9 * most { PathEnd::Tips } else { PathEnd::Turns }
@@ -653,7 +753,7 @@ pub(super) fn anchors(statics: &Statics, loads_n: &[f64], s_mus: &[f64]) -> Vec<
                 }
                 let equations = Equations::new(statics, load, s_mu, 0.0, &scales);
                 let at = equations.evaluate(equations.predicted(&path.state, [0.0; 2]));
-                let jacobian = equations.jacobian(&at);
+                let jacobian = equations.jacobian(&at, Jacobian::default());
                 anchors.push(Anchor { state: path.state.clone(), jacobian });
             }
         }
@@ -661,8 +761,27 @@ pub(super) fn anchors(statics: &Statics, loads_n: &[f64], s_mus: &[f64]) -> Vec<
     anchors
 }
 
+/// Arrays of the size of the matrices, which serve one state after the other.
+#[derive(Debug)]
+pub(super) struct Work {
+    flexibility: Mat<f64>,
+    jacobian: Jacobian,
+}
+
+impl Default for Work {
+    fn default() -> Self {
+        Self { flexibility: Mat::new(), jacobian: Jacobian::default() }
+    }
+}
+
 /// The state, started from the nearest of `anchors`; `None` if it is not certain to be the one continued from `μ = 0`.
-pub(super) fn from_anchor(statics: &Statics, anchors: &[Anchor], load: f64, s_mu: f64) -> Option<SteadyState> {
+pub(super) fn from_anchor(
+    statics: &Statics,
+    anchors: &[Anchor],
+    load: f64,
+    s_mu: f64,
+    work: &mut Work,
+) -> Option<SteadyState> {
     let away = |anchor: &Anchor| {
         let [by_load, by_friction] =
             [(load / anchor.state.load_n).ln(), (s_mu - anchor.state.friction) / FRICTION_SCALE];
@@ -670,21 +789,9 @@ pub(super) fn from_anchor(statics: &Statics, anchors: &[Anchor], load: f64, s_mu
     };
     let anchor = anchors.iter().min_by(|one, other| away(one).total_cmp(&away(other)))?;
     let scales = Scales::new(statics, load);
-    let equations = Equations::new(statics, load, s_mu, 0.0, &scales);
-    let along = [load - anchor.state.load_n, s_mu - anchor.state.friction];
-    let mut at = equations.evaluate(equations.predicted(&anchor.state, along));
-    for _ in 0..MOST_CHORDS {
-        let direction = equations.direction(&at, &anchor.jacobian);
-        let tried = equations.evaluate(equations.step(&at, &direction, 1.0, true));
-        let contracts = tried.accuracy < CONTRACTION * at.accuracy;
-        if tried.accuracy < at.accuracy {
-            at = tried;
-        }
-        if !contracts || at.accuracy < SETTLED {
-            break;
-        }
-    }
-    let found = equations.newton(at.point, false).ok()?;
-    let near = equations.is_near(&anchor.state, along, anchor.jacobian.sign, &found);
-    near.then(|| equations.state(&found.0, &found.1))
+    let flexibility = std::mem::replace(&mut work.flexibility, Mat::new());
+    let equations = Equations::within(flexibility, statics, load, s_mu, 0.0, &scales);
+    let state = equations.from_anchor(anchor, work);
+    work.flexibility = equations.flexibility;
+    state
 }

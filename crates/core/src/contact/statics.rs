@@ -1,6 +1,6 @@
 //! Statics of steady sliding: closures and forces of contact pairs that can open, by semi-smooth Newton steps.
 
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use faer::{Mat, MatRef};
 
@@ -42,6 +42,27 @@ pub struct Statics {
     anchored_at: [Vec<f64>; 2],
     /// Computed with the first state.
     anchors: OnceLock<Vec<path::Anchor>>,
+    spare: Spare,
+}
+
+/// Work arrays that wait for the next state; a copy has none.
+#[derive(Debug, Default)]
+struct Spare(Mutex<Vec<path::Work>>);
+
+impl Clone for Spare {
+    fn clone(&self) -> Self {
+        Self::default()
+    }
+}
+
+impl Spare {
+    /// What `solve` returns with work arrays of its own.
+    fn with<T>(&self, solve: impl FnOnce(&mut path::Work) -> T) -> T {
+        let mut work = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+        let found = solve(&mut work);
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(work);
+        found
+    }
 }
 
 /// Why the states that continue frictionless contact end at some friction coefficient.
@@ -237,7 +258,7 @@ impl Statics {
             return Err(StaticsError::Condition { what: "number of contact pairs", value: 0.0, limit: "at least 1" });
         }
         let total_area = parts.area.iter().sum();
-        Ok(Self { parts, total_area, anchored_at: [vec![], vec![]], anchors: OnceLock::new() })
+        Ok(Self { parts, total_area, anchored_at: [vec![], vec![]], anchors: OnceLock::new(), spare: Spare::default() })
     }
 
     /// Adds anchors: the states at all combinations of `loads_n` (N, positive) and `s_mus`. Solutions start at the nearest
@@ -290,7 +311,8 @@ impl Statics {
         if needs_load && load_n <= 0.0 {
             return Err(StaticsError::Condition { what: "load", value: load_n, limit: "more than 0" });
         }
-        let near = (load_n > 0.0).then(|| path::from_anchor(self, self.known_anchors(), load_n, s_mu)).flatten();
+        let anchors = if load_n > 0.0 { self.known_anchors() } else { &[] };
+        let near = self.spare.with(|work| path::from_anchor(self, anchors, load_n, s_mu, work));
         let found = near.map_or_else(|| path::follow(self, load_n, s_mu), Ok)?;
         if let PressureLaw::Table(table) = &self.parts.law {
             let limit_m = table.last_closure_m();

@@ -10,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 35] = [
+pub const BUILDER: [&str; 36] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -36,6 +36,7 @@ pub const BUILDER: [&str; 35] = [
     include_str!("../steady_contact.rs"),
     include_str!("../stribeck.rs"),
     include_str!("../traces.rs"),
+    include_str!("../../contact/factors.rs"),
     include_str!("../../contact/law.rs"),
     include_str!("../../contact/mod.rs"),
     include_str!("../../contact/path.rs"),
