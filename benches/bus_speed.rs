@@ -56,12 +56,12 @@ impl NodeOnShm {
         // Without inputs between its blocks there is no silence.
         let settings = Settings { silence_timeout_s: 1e6, ..Settings::for_rig(&rig) };
         let watch = Watch::default();
-        let (node, inlet) = Node::new(rig, settings, watch.clone());
+        let (node, inlet) = Node::new(rig.clone(), settings, watch.clone());
         let sink: Arc<dyn Sink> = Arc::new(inlet.clone());
         let shm = ShmConnection::of_node(options, &sink).expect("shared memory");
         let outputs = Outputs { buses: vec![Box::new(shm)], ..Default::default() };
         if let Some(chart) = chart {
-            assert!(inlet.send(Incoming::Chart(Ok(chart))), "room");
+            assert!(inlet.send(Incoming::Chart { rig, chart: Ok(chart) }), "room");
         }
         let thread = thread::spawn(move || node.run(outputs));
         Self { inlet, thread: Some(thread), watch }

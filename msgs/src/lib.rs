@@ -38,6 +38,8 @@ pub mod topic {
     pub const OPERATING_POINT: &str = "/rig/operating_point";
     /// Measured vibration, received by the node; it does not affect predictions.
     pub const VIBRATION: &str = "/rig/vibration";
+    /// Temperature of the contact, received by the node; the rig follows it.
+    pub const TEMPERATURE: &str = "/rig/temperature";
     /// Samples of microphones and accelerometers, received by the node; they do not affect predictions.
     pub const WAVEFORM: &str = "/rig/waveform";
     /// Predictions, published by the node.
@@ -114,6 +116,17 @@ pub struct Vibration {
     pub frequency_hz: f64,
     /// Level of that peak, dB; the reference is that of the instrument.
     pub level_db: f64,
+}
+
+/// `sensor_msgs/Temperature`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Temperature {
+    /// The stamp is the time of measurement.
+    pub header: Header,
+    /// Temperature of the contact, °C.
+    pub temperature: f64,
+    /// Its variance, K²; 0 if unknown. It is recorded and not used.
+    pub variance: f64,
 }
 
 /// `squealcast_msgs/Waveform`.
@@ -406,7 +419,7 @@ pub struct SessionEvent {
     pub kind: u8,
     /// Of a parameter: its name.
     pub name: String,
-    /// Of a parameter: its value.
+    /// Of a parameter: its value. Of a temperature: the temperature, °C.
     pub value: f64,
     /// Of a stability map or window ends: the load they hold for, N.
     pub normal_load_n: f64,
@@ -429,6 +442,8 @@ listed! {
         Chart,
         /// Ends of windows were computed.
         WindowEnds,
+        /// The rig was built for another temperature.
+        Temperature,
     }
 }
 
@@ -441,6 +456,7 @@ impl SessionEventKind {
             Self::StabilityMap => 2,
             Self::Chart => 3,
             Self::WindowEnds => 4,
+            Self::Temperature => 5,
         }
     }
 

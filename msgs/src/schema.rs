@@ -27,6 +27,8 @@ listed! {
         Waveform,
         /// [`topic::HEARD`]
         Heard,
+        /// [`topic::TEMPERATURE`]
+        Temperature,
     }
 }
 
@@ -45,6 +47,8 @@ const DIAGNOSTIC_STATUS: (&str, &str) = (
      KeyValue[] values\n",
 );
 const KEY_VALUE: (&str, &str) = ("diagnostic_msgs/KeyValue", "string key\nstring value\n");
+const TEMPERATURE: &str = "std_msgs/Header header\n# Degrees Celsius.\nfloat64 temperature\n# 0 is interpreted as \
+                           variance unknown.\nfloat64 variance\n";
 const DIAGNOSTIC_ARRAY: &str = "std_msgs/Header header\nDiagnosticStatus[] status\n";
 
 impl Topic {
@@ -60,6 +64,7 @@ impl Topic {
             Self::Vibration => topic::VIBRATION,
             Self::Waveform => topic::WAVEFORM,
             Self::Heard => topic::HEARD,
+            Self::Temperature => topic::TEMPERATURE,
         }
     }
 
@@ -75,6 +80,7 @@ impl Topic {
             Self::Vibration => "squealcast_msgs/msg/Vibration",
             Self::Waveform => "squealcast_msgs/msg/Waveform",
             Self::Heard => "squealcast_msgs/msg/Heard",
+            Self::Temperature => "sensor_msgs/msg/Temperature",
         }
     }
 
@@ -94,7 +100,8 @@ impl Topic {
             | Self::Diagnostics
             | Self::Vibration
             | Self::Waveform
-            | Self::Heard => false,
+            | Self::Heard
+            | Self::Temperature => false,
         }
     }
 
@@ -110,15 +117,19 @@ impl Topic {
             Self::Vibration => include_str!("../msg/Vibration.msg"),
             Self::Waveform => include_str!("../msg/Waveform.msg"),
             Self::Heard => include_str!("../msg/Heard.msg"),
+            Self::Temperature => TEMPERATURE,
         }
     }
 
     /// The messages it refers to, as `package/Type` and text.
     fn dependencies(self) -> &'static [(&'static str, &'static str)] {
         match self {
-            Self::OperatingPoint | Self::SessionEvent | Self::Vibration | Self::Waveform | Self::Heard => {
-                &[HEADER, TIME]
-            }
+            Self::OperatingPoint
+            | Self::SessionEvent
+            | Self::Vibration
+            | Self::Waveform
+            | Self::Heard
+            | Self::Temperature => &[HEADER, TIME],
             Self::Prediction => &[HEADER, TIME, MODE],
             Self::RigInfo => &[],
             Self::Sensitivity => &[HEADER, TIME, MODE_SENSITIVITY, PAIR_SENSITIVITY, DERIVATIVES],

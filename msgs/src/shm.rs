@@ -9,7 +9,7 @@ mod prediction;
 mod sensitivity;
 mod sound;
 
-pub use conditions::{OperatingPointForm, VibrationForm};
+pub use conditions::{OperatingPointForm, TemperatureForm, VibrationForm};
 pub use prediction::{ModeForm, PredictionForm, REASON_BYTES};
 pub use sensitivity::{MAX_PAIRS, ModeSensitivityForm, PairSensitivityForm, SensitivityForm};
 pub use sound::{HeardForm, SENSITIVITY_BYTES, UNIT_BYTES, WaveformHeader};

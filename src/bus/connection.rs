@@ -7,7 +7,8 @@ use super::shm::ShmError;
 use super::{Bus, Counts, Received};
 use crate::msgs::schema::Topic;
 use crate::msgs::{
-    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, Waveform,
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Temperature, Vibration,
+    Waveform,
 };
 
 /// A message to be published.
@@ -22,6 +23,7 @@ pub enum Outgoing<'a> {
     Vibration(&'a Vibration),
     Waveform(&'a Waveform),
     Heard(&'a Heard),
+    Temperature(&'a Temperature),
 }
 
 /// Why a bus refused to publish a message.
@@ -73,7 +75,7 @@ pub trait Connection: Send {
 
 /// Takes what a node receives over its buses. Buses call it on their own threads; it must not block.
 pub trait Sink: Send + Sync {
-    /// Whether operating points, vibrations and samples are wanted. If not, a bus need not receive them.
+    /// Whether operating points, vibrations, temperatures and samples are wanted. If not, a bus need not receive them.
     fn takes_inputs(&self) -> bool;
 
     /// Takes an operating point. With `may_predict` the calling thread may be used for the time of a prediction.
@@ -81,6 +83,9 @@ pub trait Sink: Send + Sync {
 
     /// Takes a measured vibration.
     fn vibration(&self, received: Received<Vibration>);
+
+    /// Takes a temperature of the contact.
+    fn temperature(&self, received: Received<Temperature>);
 
     /// Takes a block of samples of a microphone or accelerometer.
     fn waveform(&self, received: Received<Waveform>);

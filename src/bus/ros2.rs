@@ -34,7 +34,8 @@ use super::received::{Counters, Counts, Received};
 use super::ros_args::{RosArgs, USE_SIM_TIME};
 use crate::msgs::schema::Topic;
 use crate::msgs::{
-    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, Waveform, topic,
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Temperature, Vibration,
+    Waveform, topic,
 };
 
 /// Name of the node before remapping.
@@ -153,10 +154,15 @@ impl Parameters {
     }
 }
 
-/// Receives the blocks of samples of microphones and accelerometers.
-type WaveformSink = Box<dyn FnMut(Received<Waveform>) + Send>;
+/// Receives what a node takes beside operating points and the measured vibration.
+struct Beside {
+    temperature: Box<dyn FnMut(Received<Temperature>) + Send>,
+    /// Blocks of samples of microphones and accelerometers.
+    waveform: Box<dyn FnMut(Received<Waveform>) + Send>,
+}
 
-/// The node's side: receives operating points, the measured vibration and samples, and publishes all other topics.
+/// The node's side: receives operating points, the measured vibration, temperatures and samples, and publishes all other
+/// topics.
 pub struct Ros2 {
     // Declared first, because publishers must be dropped before the node.
     prediction: Publisher<Prediction>,
@@ -190,14 +196,14 @@ impl Ros2 {
     }
 
     /// As [`Self::start`]. Publishing a prediction fails once a reader has left `max_unanswered` of them
-    /// unacknowledged. With `waveform`, samples are received too.
+    /// unacknowledged. With `beside`, temperatures and samples are received too.
     fn start_with(
         options: &Ros2Options,
         parameters: Parameters,
         max_unanswered: i32,
         sink: impl FnMut(Received<OperatingPoint>) + Send + 'static,
         vibration: impl FnMut(Received<Vibration>) + Send + 'static,
-        waveform: Option<WaveformSink>,
+        beside: Option<Beside>,
     ) -> Result<Self, Ros2Error> {
         let started = Arc::new(AtomicBool::new(false));
         let mut link = Link::join(options, NODE_NAME, parameters.declare(Arc::clone(&started)))?;
@@ -213,18 +219,23 @@ impl Ros2 {
         let vibration = link.aside(topic::VIBRATION, ours("Vibration"), MAX_WAITING, vibration, Arc::default())?;
         let waveform_counters = Arc::<Counters>::default();
         let counters = waveform_counters.clone();
-        let waveform = waveform
-            .map(|sink| link.aside(topic::WAVEFORM, ours("Waveform"), MAX_BLOCKS_WAITING, sink, counters))
+        let beside = beside
+            .map(|Beside { temperature, waveform }| {
+                let kind = MessageTypeName::new("sensor_msgs", "Temperature");
+                let temperature = link.aside(topic::TEMPERATURE, kind, MAX_WAITING, temperature, Arc::default())?;
+                let waveform = link.aside(topic::WAVEFORM, ours("Waveform"), MAX_BLOCKS_WAITING, waveform, counters)?;
+                Ok::<_, Ros2Error>((temperature, waveform))
+            })
             .transpose()?;
         let beats = Arc::new(AtomicU64::new(0));
         let beating = beats.clone();
         let aside = Box::pin(async move {
-            let waveform = async {
-                if let Some(waveform) = waveform {
-                    waveform.await;
+            let beside = async {
+                if let Some((temperature, waveform)) = beside {
+                    tokio::join!(temperature, waveform);
                 }
             };
-            tokio::join!(vibration, waveform, beat(&beating));
+            tokio::join!(vibration, beside, beat(&beating));
         });
         link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink, Some(aside))?;
         started.store(true, Ordering::Release);
@@ -331,7 +342,7 @@ impl Ros2 {
             Topic::Diagnostics => self.diagnostics.get_subscription_count(node),
             Topic::Heard => self.heard.get_subscription_count(node),
             // Published by the rig.
-            Topic::OperatingPoint | Topic::Vibration | Topic::Waveform => 0,
+            Topic::OperatingPoint | Topic::Vibration | Topic::Waveform | Topic::Temperature => 0,
         }
     }
 
@@ -365,10 +376,11 @@ impl Ros2 {
     pub fn stop(self) {}
 }
 
-/// The rig's side: publishes operating points, measured vibration and samples, receives predictions.
+/// The rig's side: publishes operating points, measured vibration, temperatures and samples, receives predictions.
 pub struct Ros2Source {
     operating_point: Publisher<OperatingPoint>,
     vibration: Publisher<Vibration>,
+    temperature: Publisher<Temperature>,
     waveform: Publisher<Waveform>,
     link: Link<Prediction>,
 }
@@ -387,9 +399,11 @@ impl Ros2Source {
         let operating_point =
             link.publisher(topic::OPERATING_POINT, ours("OperatingPoint"), Durability::Volatile, MAX_UNANSWERED)?;
         let vibration = link.publisher(topic::VIBRATION, ours("Vibration"), Durability::Volatile, MAX_UNANSWERED)?;
+        let kind = MessageTypeName::new("sensor_msgs", "Temperature");
+        let temperature = link.publisher(topic::TEMPERATURE, kind, Durability::Volatile, MAX_UNANSWERED)?;
         let waveform = link.publisher(topic::WAVEFORM, ours("Waveform"), Durability::Volatile, MAX_BLOCKS_WAITING)?;
         link.listen(topic::PREDICTION, ours("Prediction"), |prediction| prediction.input_seq, sink, None)?;
-        Ok(Self { operating_point, vibration, waveform, link })
+        Ok(Self { operating_point, vibration, temperature, waveform, link })
     }
 
     /// Publishes an operating point without blocking.
@@ -406,6 +420,19 @@ impl Ros2Source {
     /// [`Ros2Error::Publish`].
     pub fn publish_vibration(&self, vibration: &Vibration) -> Result<(), Ros2Error> {
         publish(&self.vibration, topic::VIBRATION, vibration)
+    }
+
+    /// Publishes a temperature of the contact without blocking.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn publish_temperature(&self, temperature: &Temperature) -> Result<(), Ros2Error> {
+        publish(&self.temperature, topic::TEMPERATURE, temperature)
+    }
+
+    /// Number of readers of the temperature, including killed ones whose lease has not expired. A node counts twice.
+    pub fn temperature_readers(&self) -> usize {
+        self.temperature.get_subscription_count(self.link.node())
     }
 
     /// Publishes a block of samples without blocking.

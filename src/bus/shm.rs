@@ -29,7 +29,7 @@ use super::Bus;
 use super::received::{Counters, Counts, Gaps, Received};
 use super::shm_place;
 use crate::msgs::shm::{
-    Form, FormError, HeardForm, OperatingPointForm, PredictionForm, SensitivityForm, VibrationForm,
+    Form, FormError, HeardForm, OperatingPointForm, PredictionForm, SensitivityForm, TemperatureForm, VibrationForm,
 };
 
 /// The ports may be used from any thread; peers with single-threaded ports can connect to them.
@@ -49,6 +49,10 @@ pub type ShmSource = ShmWriter<OperatingPointForm>;
 pub type ShmVibrationInput = ShmReader<VibrationForm>;
 /// Publishes the measured vibration.
 pub type ShmVibrationSource = ShmWriter<VibrationForm>;
+/// Receives the temperature of the contact.
+pub type ShmTemperatureInput = ShmReader<TemperatureForm>;
+/// Publishes the temperature of the contact.
+pub type ShmTemperatureSource = ShmWriter<TemperatureForm>;
 /// Publishes squeals found in sound.
 pub type ShmHeard = ShmWriter<HeardForm>;
 /// Receives squeals found in sound.

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use super::Bus;
 use super::connection::{BusError, Connection, Outgoing, Report, Sink};
 use super::shm::{
-    ShmError, ShmHeard, ShmInput, ShmOptions, ShmOutput, ShmSensitivity, ShmSource, ShmVibrationInput,
-    ShmVibrationSource, ShmWriter,
+    ShmError, ShmHeard, ShmInput, ShmOptions, ShmOutput, ShmSensitivity, ShmSource, ShmTemperatureInput,
+    ShmTemperatureSource, ShmVibrationInput, ShmVibrationSource, ShmWriter,
 };
 use super::shm_waveform::{ShmWaveformInput, ShmWaveformSource};
 use crate::msgs::schema::Topic;
@@ -19,10 +19,12 @@ pub struct ShmConnection {
     sensitivities: Option<ShmSensitivity>,
     operating_points: Option<ShmSource>,
     vibrations: Option<ShmVibrationSource>,
+    temperatures: Option<ShmTemperatureSource>,
     waveforms: Option<ShmWaveformSource>,
     heard: Option<ShmHeard>,
     inputs: Option<ShmInput>,
     vibration_inputs: Option<ShmVibrationInput>,
+    temperature_inputs: Option<ShmTemperatureInput>,
     waveform_inputs: Option<ShmWaveformInput>,
 }
 
@@ -39,12 +41,14 @@ impl ShmConnection {
             ..Self::default()
         };
         if sink.takes_inputs() {
-            let (inputs, vibrations, waveforms) = (sink.clone(), sink.clone(), sink.clone());
+            let [inputs, vibrations, temperatures, waveforms] = std::array::from_fn(|_| sink.clone());
             ports.inputs = Some(ShmInput::spawn_with_backlog(options, move |received, more_waits| {
                 inputs.operating_point(received, !more_waits);
             })?);
             ports.vibration_inputs =
                 Some(ShmVibrationInput::spawn(options, move |received| vibrations.vibration(received))?);
+            ports.temperature_inputs =
+                Some(ShmTemperatureInput::spawn(options, move |received| temperatures.temperature(received))?);
             ports.waveform_inputs =
                 Some(ShmWaveformInput::spawn(options, move |received| waveforms.waveform(received))?);
         }
@@ -73,6 +77,7 @@ impl ShmConnection {
             sensitivities: Some(ShmSensitivity::new(options)?),
             operating_points: Some(ShmSource::new(options)?),
             vibrations: Some(ShmVibrationSource::new(options)?),
+            temperatures: Some(ShmTemperatureSource::new(options)?),
             waveforms: Some(ShmWaveformSource::new(options)?),
             heard: Some(ShmHeard::new(options)?),
             ..Self::default()
@@ -91,6 +96,7 @@ impl Connection for ShmConnection {
             Outgoing::Prediction(message) => publish(self.predictions.as_ref(), message),
             Outgoing::Sensitivity(message) => publish(self.sensitivities.as_ref(), message),
             Outgoing::Vibration(message) => publish(self.vibrations.as_ref(), message),
+            Outgoing::Temperature(message) => publish(self.temperatures.as_ref(), message),
             Outgoing::Heard(message) => publish(self.heard.as_ref(), message),
             Outgoing::Waveform(message) => {
                 if let Some(waveforms) = &self.waveforms {
@@ -109,6 +115,7 @@ impl Connection for ShmConnection {
             Topic::Prediction => readers(self.predictions.as_ref()),
             Topic::Sensitivity => readers(self.sensitivities.as_ref()),
             Topic::Vibration => readers(self.vibrations.as_ref()),
+            Topic::Temperature => readers(self.temperatures.as_ref()),
             Topic::Heard => readers(self.heard.as_ref()),
             Topic::Waveform => self.waveforms.as_ref().map_or(0, ShmWaveformSource::readers),
             Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics => 0,

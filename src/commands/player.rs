@@ -74,5 +74,6 @@ fn outgoing(payload: &Payload) -> Outgoing<'_> {
         Payload::Vibration(message) => Outgoing::Vibration(message),
         Payload::Waveform(message) => Outgoing::Waveform(message),
         Payload::Heard(message) => Outgoing::Heard(message),
+        Payload::Temperature(message) => Outgoing::Temperature(message),
     }
 }

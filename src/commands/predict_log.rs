@@ -79,6 +79,7 @@ impl Options {
             let quantity = match entry.message {
                 Recorded::Known(Payload::OperatingPoint(input)) => Quantity::Conditions(input),
                 Recorded::Known(Payload::Vibration(vibration)) => Quantity::Vibration(vibration),
+                Recorded::Known(Payload::Temperature(measured)) => Quantity::Temperature(measured),
                 Recorded::Known(Payload::Waveform(block)) => Quantity::Samples(block),
                 // Of the rig's messages only these are predicted or recorded again; the node's own are made anew.
                 Recorded::Known(

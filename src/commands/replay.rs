@@ -225,7 +225,8 @@ impl Options {
                             SessionEventKind::Parameter
                             | SessionEventKind::StabilityMap
                             | SessionEventKind::Chart
-                            | SessionEventKind::WindowEnds,
+                            | SessionEventKind::WindowEnds
+                            | SessionEventKind::Temperature,
                         )
                         | None => {}
                     },
@@ -234,7 +235,8 @@ impl Options {
                     | Payload::Diagnostics(_)
                     | Payload::Vibration(_)
                     | Payload::Waveform(_)
-                    | Payload::Heard(_) => {}
+                    | Payload::Heard(_)
+                    | Payload::Temperature(_) => {}
                 }
             }
             let nothing = played.load(Ordering::Relaxed) == 0;

@@ -4,7 +4,7 @@
 //! hundredth of the fastest. Interruptions below half a second are included, and shorter applications are none.
 
 use super::heard::SquealInSound;
-use super::history::{Bin, History};
+use super::history::{Bin, History, both};
 
 /// Least share of the highest load, and of the fastest speed.
 const LEAST_LOAD: f32 = 0.1;
@@ -21,6 +21,8 @@ pub struct Application {
     /// Smallest and largest load and speed.
     pub load_n: (f32, f32),
     pub speed_rad_s: (f32, f32),
+    /// Smallest and largest temperature measured in it, °C.
+    pub temperature_c: Option<(f32, f32)>,
     /// Squeals with their onset or a part of them in it, without harmonics; the level and frequency of the loudest.
     pub squeals: usize,
     pub level_db: Option<f64>,
@@ -54,12 +56,14 @@ pub fn applications<'a>(history: &History, squeals: impl Iterator<Item = &'a Squ
                 let joined = |a: (f32, f32), b: (f32, f32)| (a.0.min(b.0), a.1.max(b.1));
                 last.to_s = to_s;
                 (last.load_n, last.speed_rad_s) = (joined(last.load_n, load_n), joined(last.speed_rad_s, speed_rad_s));
+                last.temperature_c = both(last.temperature_c, bin.temperature_c);
             }
             None => found.push(Application {
                 from_s,
                 to_s,
                 load_n,
                 speed_rad_s,
+                temperature_c: bin.temperature_c,
                 squeals: 0,
                 level_db: None,
                 frequency_hz: None,

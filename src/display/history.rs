@@ -31,6 +31,9 @@ pub struct Bin {
     /// The measured vibration.
     #[serde(rename = "v", skip_serializing_if = "Option::is_none")]
     pub vibration: Option<Vibration>,
+    /// Smallest and largest temperature of the contact, °C.
+    #[serde(rename = "t", skip_serializing_if = "Option::is_none")]
+    pub temperature_c: Option<(f32, f32)>,
 }
 
 /// Smallest and largest level of the measured vibration, and the frequency at the largest.
@@ -51,6 +54,14 @@ impl Vibration {
     }
 }
 
+/// The range of two ranges.
+pub fn both(a: Option<(f32, f32)>, b: Option<(f32, f32)>) -> Option<(f32, f32)> {
+    match (a, b) {
+        (Some(a), Some(b)) => Some((a.0.min(b.0), a.1.max(b.1))),
+        (a, b) => a.or(b),
+    }
+}
+
 /// Serialises the entries that are present.
 fn present<S: Serializer>(unstable: &[Option<(f32, f32)>; SAMPLE_MODES], serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_seq(unstable.iter().flatten())
@@ -59,7 +70,7 @@ fn present<S: Serializer>(unstable: &[Option<(f32, f32)>; SAMPLE_MODES], seriali
 impl Bin {
     fn empty(index: i64) -> Self {
         let ranges = [None; QUANTITIES.len()];
-        Self { index, ranges, level: None, unstable: [None; SAMPLE_MODES], vibration: None }
+        Self { index, ranges, level: None, unstable: [None; SAMPLE_MODES], vibration: None, temperature_c: None }
     }
 
     fn merge(&mut self, other: Self) {
@@ -68,11 +79,9 @@ impl Bin {
             self.unstable = other.unstable;
         }
         for (range, other) in self.ranges.iter_mut().zip(other.ranges) {
-            *range = match (*range, other) {
-                (Some(a), Some(b)) => Some((a.0.min(b.0), a.1.max(b.1))),
-                (a, b) => a.or(b),
-            };
+            *range = both(*range, other);
         }
+        self.temperature_c = both(self.temperature_c, other.temperature_c);
         self.level = self.level.max(other.level);
         self.vibration = match (self.vibration, other.vibration) {
             (Some(a), Some(b)) => Some(a.merge(b)),
@@ -176,6 +185,22 @@ impl History {
         };
         let new = Vibration { low_db: level_db, high_db: level_db, frequency_hz };
         bin.vibration = Some(bin.vibration.map_or(new, |before| before.merge(new)));
+    }
+
+    /// Adds a temperature of the contact, °C.
+    pub fn push_temperature(&mut self, time_ns: i64, celsius: f64) {
+        let celsius = celsius as f32;
+        if let Some(bin) = self.bin(time_ns).filter(|_| celsius.is_finite()) {
+            bin.temperature_c = both(bin.temperature_c, Some((celsius, celsius)));
+        }
+    }
+
+    /// The latest temperature before the end of the bin of `time_s`, with the end of its own bin, s; `None` before the first.
+    pub fn temperature_before(&self, time_s: f64) -> Option<(f64, f64)> {
+        let bin_s = seconds(self.bin_ns);
+        let until = self.bins.partition_point(|bin| bin.index as f64 * bin_s <= time_s);
+        let known = self.bins.range(..until).rev().find_map(|bin| Some((bin, bin.temperature_c?)));
+        known.map(|(bin, (low, high))| ((bin.index + 1) as f64 * bin_s, 0.5 * f64::from(low + high)))
     }
 
     /// Adds a sample.

@@ -13,7 +13,7 @@ use super::running_score::RunningScore;
 use super::server::{About, Source};
 use super::shape::shape;
 use super::sound_page::{SoundShown, SpectrogramPicture, picture};
-use super::state::{CountersShown, Shown, State, spread, trend_per_s};
+use super::state::{CountersShown, Shown, State, TemperatureShown, spread, trend_per_s};
 use crate::msgs::Heard;
 use crate::node::{Sample, VibrationSample, Watch};
 use crate::physics::{Solver, StabilityMap};
@@ -41,6 +41,7 @@ pub struct Live {
 struct Followed {
     samples: Vec<Sample>,
     vibrations: Vec<VibrationSample>,
+    temperatures: Vec<(i64, f64)>,
     history: History,
     events: Events,
     heard: Vec<Heard>,
@@ -65,6 +66,7 @@ impl Live {
         let followed = Followed {
             samples: vec![],
             vibrations: vec![],
+            temperatures: vec![],
             history: History::new(BIN_NS, BINS),
             events: Events::default(),
             heard: vec![],
@@ -99,6 +101,10 @@ impl Followed {
         for sample in &self.vibrations {
             self.history.push_vibration(sample);
         }
+        watch.take_temperatures(&mut self.temperatures);
+        for &(time_ns, celsius) in &self.temperatures {
+            self.history.push_temperature(time_ns, celsius);
+        }
         watch.take_heard(&mut self.heard);
         for heard in &self.heard {
             self.squeals_in_sound.push(heard, heard.header.stamp.as_ns());
@@ -110,10 +116,11 @@ impl Followed {
         while self.ticks.front().is_some_and(|tick| now - tick.0 > Duration::from_secs(1)) {
             self.ticks.pop_front();
         }
-        !self.samples.is_empty() || !self.vibrations.is_empty() || !self.heard.is_empty()
+        let nothing = self.samples.is_empty() && self.vibrations.is_empty() && self.temperatures.is_empty();
+        !nothing || !self.heard.is_empty()
     }
 
-    fn state(&mut self, watch: &Watch, with_bins: bool) -> String {
+    fn state(&mut self, rig: &Rig, watch: &Watch, with_bins: bool) -> String {
         let snapshot = watch.snapshot();
         let assessment = snapshot.assessment();
         if let Some(map) = snapshot.map.filter(|map| self.map.as_ref().is_none_or(|known| !Arc::ptr_eq(known, map))) {
@@ -131,6 +138,11 @@ impl Followed {
             spread: spread(&self.history, time_s),
             trend_per_s: trend_per_s(&self.history, time_s),
             warn_margin: snapshot.warn_margin,
+            temperature: snapshot.temperature.map(|seen| TemperatureShown {
+                celsius: seen.celsius,
+                of_rig: snapshot.rig.as_deref().unwrap_or(rig).temperature_c(),
+                stale: seen.is_stale(),
+            }),
             map: self.map_number,
             events: self.event_changes,
             counters: Some(CountersShown::new(snapshot.counters, snapshot.passed_over, snapshot.bus_restarts)),
@@ -155,11 +167,11 @@ impl Source for Live {
         let mut followed = self.followed();
         let changed = followed.follow(&self.watch);
         let due = changed || followed.sent_at.is_none_or(|sent| sent.elapsed() >= SIGN_OF_LIFE);
-        (listened_to && due).then(|| followed.state(&self.watch, true))
+        (listened_to && due).then(|| followed.state(&self.rig, &self.watch, true))
     }
 
     fn state(&self, _at_s: Option<f64>) -> String {
-        self.followed().state(&self.watch, false)
+        self.followed().state(&self.rig, &self.watch, false)
     }
 
     fn history(&self) -> String {
@@ -212,13 +224,15 @@ impl Source for Live {
         let snapshot = self.watch.snapshot();
         let input = snapshot.input.ok_or("no conditions were received yet")?;
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
-        let shape = shape(&self.rig, &mut solver, snapshot.map.as_deref(), &conditions(&input), id)?;
+        let rig = snapshot.rig.as_deref().unwrap_or(&self.rig);
+        let shape = shape(rig, &mut solver, snapshot.map.as_deref(), &conditions(&input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
     }
 
     fn contact(&self, _at_s: Option<f64>) -> Result<String, String> {
-        let input = self.watch.snapshot().input.ok_or("no conditions were received yet")?;
-        let contact = contact(&self.rig, &conditions(&input))?;
+        let snapshot = self.watch.snapshot();
+        let input = snapshot.input.ok_or("no conditions were received yet")?;
+        let contact = contact(snapshot.rig.as_deref().unwrap_or(&self.rig), &conditions(&input))?;
         Ok(serde_json::to_string(&contact).unwrap_or_default())
     }
 }

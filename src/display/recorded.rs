@@ -13,7 +13,7 @@ use super::server::{About, Note, Source};
 use super::shape::shape;
 use super::sound_detail::{SampleIndex, longest_part_s};
 use super::sound_page::{SoundShown, SpectrogramPicture, picture};
-use super::state::{Shown, State, spread, trend_per_s};
+use super::state::{Shown, State, TemperatureShown, spread, trend_per_s};
 use super::time_line::TimeLine;
 use crate::msgs::{DiagnosticArray, OperatingPoint, Prediction, SessionEvent, SessionEventKind, Waveform, level};
 use crate::node::status::{Assessment, Inputs, Status};
@@ -24,7 +24,7 @@ use crate::physics::{Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded as Content, Recording};
 use crate::rig::Rig;
-use crate::session::computed::session_map;
+use crate::session::computed::{session_map, session_rig};
 use crate::session::conditions;
 use crate::simulator;
 use crate::sound;
@@ -99,6 +99,8 @@ pub struct Recorded {
     /// Whether inputs arrived at the latest entry read.
     flow: Inputs,
     maps: Mutex<VecDeque<(u64, Arc<StabilityMap>)>>,
+    /// The latest rigs built for other temperatures, °C.
+    rigs: Mutex<VecDeque<(f64, Arc<Rig>)>>,
     solver: Mutex<Solver>,
 }
 
@@ -131,6 +133,7 @@ impl Recorded {
             status_before: None,
             flow: Inputs::default(),
             maps: Mutex::default(),
+            rigs: Mutex::default(),
         };
         let mut inputs: VecDeque<OperatingPoint> = VecDeque::new();
         let mut line = TimeLine::default();
@@ -167,6 +170,10 @@ impl Recorded {
                     let sample = VibrationSample::new(line.of_stamp(vibration.header.stamp, log_ns), &vibration);
                     recorded.history.push_vibration(&sample);
                     recorded.vibration.push(&sample);
+                }
+                Content::Known(Payload::Temperature(measured)) => {
+                    let time_ns = line.of_stamp(measured.header.stamp, log_ns);
+                    recorded.history.push_temperature(time_ns, measured.temperature);
                 }
                 Content::Known(Payload::Heard(heard)) => {
                     recorded.squeals_in_sound.push(&heard, line.of_stamp(heard.header.stamp, log_ns));
@@ -287,11 +294,43 @@ impl Recorded {
         self.map_events().take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7).count() as u64
     }
 
-    /// The margin below which the node warned at a time; `None` if not recorded.
-    pub fn warn_margin(&self, at_s: f64) -> Option<f64> {
+    /// The value of a setting at a time; `None` if not recorded.
+    pub fn setting(&self, name: &str, at_s: f64) -> Option<f64> {
         let settings = self.events_of(SessionEventKind::Parameter);
         let before = settings.take_while(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7);
-        before.map(|(_, event)| event).filter(|event| event.name == "warn_margin").last().map(|event| event.value)
+        before.map(|(_, event)| event).filter(|event| event.name == name).last().map(|event| event.value)
+    }
+
+    /// The rig that was in force after the first `events` session events; the rig at its reference temperature if it cannot
+    /// be built for the recorded one.
+    fn rig_after(&self, events: usize) -> Arc<Rig> {
+        let before = self.session_events.iter().take(events);
+        let of_rig =
+            |(_, event): &&(i64, SessionEvent)| SessionEventKind::of(event) == Some(SessionEventKind::Temperature);
+        let Some(celsius) = before.rev().find(of_rig).map(|(_, event)| event.value) else { return self.rig.clone() };
+        let mut rigs = self.rigs.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, rig)) = rigs.iter().find(|(known, _)| *known == celsius) {
+            return rig.clone();
+        }
+        let Ok(rig) = session_rig(&self.rig, celsius) else { return self.rig.clone() };
+        if rigs.len() == MAPS {
+            rigs.pop_front();
+        }
+        rigs.push_back((celsius, rig.clone()));
+        rig
+    }
+
+    /// The rig in force at a time.
+    fn rig_at(&self, at_s: f64) -> Arc<Rig> {
+        self.rig_after(self.session_events.partition_point(|(time_ns, _)| seconds(*time_ns) <= at_s + 1e-7))
+    }
+
+    /// The temperature of the contact at a time; `None` before the first.
+    fn temperature(&self, at_s: f64) -> Option<TemperatureShown> {
+        let (known_s, celsius) = self.history.temperature_before(at_s)?;
+        let timeout_s = self.setting("temperature_timeout_s", at_s).unwrap_or(f64::INFINITY);
+        let of_rig = self.rig.temperature.as_ref().and_then(|_| self.rig_at(at_s).temperature_c());
+        Some(TemperatureShown { celsius, of_rig, stale: at_s - known_s > timeout_s })
     }
 
     /// The map with that number, computed again; `None` if there is none or the computation fails.
@@ -302,7 +341,11 @@ impl Recorded {
         if let Some(map) = known(&self.maps.lock().unwrap_or_else(PoisonError::into_inner)) {
             return Some(map);
         }
-        let (_, event) = self.map_events().nth(usize::try_from(number.checked_sub(1)?).ok()?)?;
+        let events = self.session_events.iter().enumerate();
+        let mut maps =
+            events.filter(|(_, (_, event))| SessionEventKind::of(event) == Some(SessionEventKind::StabilityMap));
+        let (index, (_, event)) = maps.nth(usize::try_from(number.checked_sub(1)?).ok()?)?;
+        let rig = self.rig_after(index);
         let point = crate::physics::OperatingPoint {
             normal_load_n: event.normal_load_n,
             disc_speed_rad_s: event.disc_speed_rad_s,
@@ -313,7 +356,7 @@ impl Recorded {
         if let Some(map) = known(&maps()) {
             return Some(map);
         }
-        let map = Arc::new(session_map(&self.rig, &mut solver, &point).ok()?);
+        let map = Arc::new(session_map(&rig, &mut solver, &point).ok()?);
         let mut maps = maps();
         if maps.len() == MAPS {
             maps.pop_front();
@@ -330,6 +373,7 @@ impl Source for Recorded {
             let note = Note { onset_s, what: "chart ready", normal_load_n: None, disc_speed_rad_s: None };
             match SessionEventKind::of(event)? {
                 SessionEventKind::Chart => Some(note),
+                SessionEventKind::Temperature => Some(Note { what: "rig at another temperature", ..note }),
                 SessionEventKind::StabilityMap => {
                     let (load, speed) = (event.normal_load_n, event.disc_speed_rad_s);
                     let what = "stability map ready";
@@ -361,7 +405,8 @@ impl Source for Recorded {
             prediction: moment.map(|moment| Shown::new(moment.input.as_ref(), &moment.prediction)),
             spread: spread(&self.history, time_s),
             trend_per_s: trend_per_s(&self.history, time_s),
-            warn_margin: self.warn_margin(time_s),
+            warn_margin: self.setting("warn_margin", time_s),
+            temperature: self.temperature(time_s),
             map: self.map_number(time_s),
             events: self.events.count(),
             counters: None,
@@ -410,7 +455,7 @@ impl Source for Recorded {
         let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
         let map = self.stability_map(self.map_number(time_s));
         let mut solver = self.solver.lock().unwrap_or_else(PoisonError::into_inner);
-        let shape = shape(&self.rig, &mut solver, map.as_deref(), &conditions(input), id)?;
+        let shape = shape(&self.rig_at(time_s), &mut solver, map.as_deref(), &conditions(input), id)?;
         Ok(serde_json::to_string(&shape).unwrap_or_default())
     }
 
@@ -418,7 +463,7 @@ impl Source for Recorded {
         let time_s = at_s.or(self.span_s().map(|span| span.0)).unwrap_or(0.0);
         let moment = self.moment(time_s).ok_or("the recording holds no prediction")?;
         let input = moment.input.as_ref().ok_or("the conditions of this prediction were not recorded")?;
-        let contact = contact(&self.rig, &conditions(input))?;
+        let contact = contact(&self.rig_at(time_s), &conditions(input))?;
         Ok(serde_json::to_string(&contact).unwrap_or_default())
     }
 }

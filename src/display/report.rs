@@ -375,6 +375,7 @@ fn session_events(recorded: &Recorded, from_s: f64) -> String {
                 ("stability map ready", format!("{:.1} N, {:.3} rad/s", event.normal_load_n, event.disc_speed_rad_s))
             }
             SessionEventKind::Chart => ("chart ready", "later predictions are evaluated from it".to_owned()),
+            SessionEventKind::Temperature => ("rig at another temperature", format!("{} °C", event.value)),
             SessionEventKind::Silence => ("silence", "no input came for too long".to_owned()),
             SessionEventKind::Parameter if after_s > STARTING_S => {
                 ("setting", format!("{} = {}", event.name, event.value))

@@ -256,12 +256,16 @@ fn brake_applications(recorded: &Recorded, from_s: f64) -> Result<String, PlotEr
             }
         };
         let panel = |x_label, points| Scatter { x_label, y_label: "level, dB", points, line: false };
-        let panels = [
+        let mut panels = vec![
             panel("frequency, Hz", over(&|squeal| Some(squeal.frequency_hz))),
             panel("disc speed, rad/s", over(&middle(1))),
             panel("normal load, N", over(&middle(0))),
             panel("friction coefficient", over(&middle(2))),
         ];
+        let temperature = over(&|squeal| Some(recorded.history.temperature_before(squeal.onset_s)?.1));
+        if !temperature.is_empty() {
+            panels.push(panel("temperature, °C", temperature));
+        }
         let caption =
             format!("Levels of {} squeals, over their frequency and the conditions at their onset.", loud().count());
         html += &figure(&scatter(&panels)?, &caption);
@@ -281,22 +285,25 @@ fn occurrence(found: &[Application], threshold_db: f64) -> String {
 }
 
 fn application_table(found: &[Application], from_s: f64) -> String {
-    let mut html = "<table><thead><tr><th>no.</th><th>from, s</th><th>duration, s</th><th>load, N</th>\
-                    <th>speed, rad/s</th><th>squeals</th><th>level, dB</th><th>frequency, Hz</th></tr></thead><tbody>\n"
-        .to_owned();
+    let with_temperature = found.iter().any(|application| application.temperature_c.is_some());
+    let heading = if with_temperature { "<th>temperature, °C</th>" } else { "" };
+    let mut html = format!(
+        "<table><thead><tr><th>no.</th><th>from, s</th><th>duration, s</th><th>load, N</th><th>speed, rad/s</th>{heading}\
+         <th>squeals</th><th>level, dB</th><th>frequency, Hz</th></tr></thead><tbody>\n"
+    );
     let tenths = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.1}"));
     let range = |(low, high): (f32, f32)| format!("{low:.1} to {high:.1}");
     for (application, number) in found.iter().zip(1..).take(APPLICATIONS_LISTED) {
-        let cells = [
+        let temperature = application.temperature_c.map_or("–".to_owned(), range);
+        let mut cells = vec![
             number.to_string(),
             format!("{:.2}", application.from_s - from_s),
             format!("{:.2}", application.to_s - application.from_s),
             range(application.load_n),
             range(application.speed_rad_s),
-            application.squeals.to_string(),
-            tenths(application.level_db),
-            tenths(application.frequency_hz),
         ];
+        cells.extend(with_temperature.then_some(temperature));
+        cells.extend([application.squeals.to_string(), tenths(application.level_db), tenths(application.frequency_hz)]);
         let cells: String = cells.iter().map(|cell| format!("<td>{cell}</td>")).collect();
         let _ = writeln!(html, "<tr>{cells}</tr>");
     }

@@ -31,6 +31,8 @@ pub struct State<'a> {
     pub trend_per_s: Option<f64>,
     /// Margin below which the node warns; `null` if unknown.
     pub warn_margin: Option<f64>,
+    /// `null` if none was received.
+    pub temperature: Option<TemperatureShown>,
     /// Number of the stability map in force; 0 before the first.
     pub map: u64,
     /// Changes whenever an event begins or ends.
@@ -39,6 +41,17 @@ pub struct State<'a> {
     /// Bins that changed since the last state sent; the first of them was part of that state.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub bins: Vec<&'a Bin>,
+}
+
+/// The temperature of the contact.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct TemperatureShown {
+    /// The latest temperature received, °C.
+    pub celsius: f64,
+    /// The temperature that the rig has in predictions, °C; `null` if it does not follow the temperature.
+    pub of_rig: Option<f64>,
+    /// Whether the latest one is too old.
+    pub stale: bool,
 }
 
 /// A prediction with its operating point.

@@ -92,6 +92,10 @@ impl Sink for Inlet {
         self.queue_or_lose(Incoming::Vibration(received));
     }
 
+    fn temperature(&self, received: Received<msgs::Temperature>) {
+        self.queue_or_lose(Incoming::Temperature(received));
+    }
+
     fn waveform(&self, received: Received<msgs::Waveform>) {
         self.detection.waveform(received);
     }

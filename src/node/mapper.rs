@@ -1,4 +1,5 @@
-//! Computes stability maps, window ends and sensitivities on a background thread, and builds the chart on another.
+//! Computes stability maps, window ends, sensitivities and rigs at other temperatures on a background thread, and builds the
+//! chart on another.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -13,8 +14,8 @@ use crate::files::chart_file::ChartFile;
 use crate::physics::chart::build::{ChartOptions, resume};
 use crate::physics::{Chart, Ends, OperatingPoint, Solver, StabilityMap};
 use crate::rig::Rig;
-use crate::session::chart_options;
-use crate::session::computed::{Request, compute, session_chart};
+use crate::session::computed::{Request, compute, session_chart, session_rig};
+use crate::session::{Event, chart_options};
 
 /// Interval between saves of an unfinished chart.
 const SAVE_EVERY: Duration = Duration::from_secs(20);
@@ -56,9 +57,9 @@ pub fn yield_to_predictions() {
     let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), 19);
 }
 
-/// Builds the chart on a thread of the lowest priority, so that predictions come first. The build stops early when the
-/// node has ended. With `kept` the chart is stored there and reused by later runs.
-pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming>, stopped: Arc<AtomicBool>) {
+/// Builds the chart on a thread of the lowest priority, so that predictions come first. The build stops early once it is
+/// `stopped`. With `kept` the chart is stored there and reused by later runs.
+fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming>, stopped: Arc<AtomicBool>) {
     std::thread::spawn(move || {
         yield_to_predictions();
         let go_on = || !stopped.load(Ordering::Relaxed);
@@ -68,7 +69,7 @@ pub fn spawn_chart(rig: Arc<Rig>, kept: Option<ChartFile>, done: Sender<Incoming
         }));
         let chart = built.unwrap_or_else(|_| Err("internal error while the rig was charted".to_owned()));
         if go_on() {
-            let _ = done.send(Incoming::Chart(chart.map(Arc::new)));
+            let _ = done.send(Incoming::Chart { rig: rig.clone(), chart: chart.map(Arc::new) });
         }
     });
 }
@@ -89,45 +90,71 @@ enum Work {
         map: Option<Arc<StabilityMap>>,
         ends: Option<Ends>,
     },
+    /// The rig at another temperature, with the map at the load and speed of `point`.
+    Rig {
+        celsius: f64,
+        point: OperatingPoint,
+    },
 }
 
-/// Runs one task at a time: maps before ends before sensitivities, and of each kind the newest request.
+/// Runs one task at a time: rigs before maps before ends before sensitivities, and of each kind the newest request.
 pub struct Mapper {
-    work: Sender<Work>,
+    rig: Arc<Rig>,
+    work: Sender<(Arc<Rig>, Work)>,
+    done: Sender<Incoming>,
     pending: bool,
     next_map: Option<OperatingPoint>,
     next_ends: Option<(Arc<StabilityMap>, OperatingPoint)>,
     given_up: Option<OperatingPoint>,
+    /// Stops the build of the chart; `None` if the rig is not charted.
+    chart_stopped: Option<Arc<AtomicBool>>,
 }
 
 impl Mapper {
     /// Starts the thread; it ends when the mapper is dropped.
     pub fn spawn(rig: Arc<Rig>, done: Sender<Incoming>) -> Self {
-        let (work, requests) = bounded::<Work>(1);
+        let (work, requests) = bounded::<(Arc<Rig>, Work)>(1);
+        let answers = done.clone();
+        let mut solver = Solver::new(rig.model.dimension());
         std::thread::spawn(move || {
             // If the system does not allow it, the priority stays as it is.
             let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
-            let mut solver = Solver::new(rig.model.dimension());
-            for work in requests {
-                let answer = match work {
-                    Work::Request { request, map } => {
-                        let result =
-                            guarded(&rig, &mut solver, |solver| compute(&rig, solver, map.as_deref(), &request));
-                        Incoming::Computed { request, map, result }
-                    }
-                    Work::Sensitivity { question, map, ends } => {
-                        let answer = |solver: &mut Solver| {
-                            sensitivity::answer(&rig, solver, &question, map.as_deref(), ends.as_ref())
-                        };
-                        Incoming::Sensitivity(Box::new(guarded(&rig, &mut solver, answer)))
-                    }
-                };
-                if done.send(answer).is_err() {
+            for (rig, work) in requests {
+                if answers.send(answer(&rig, &mut solver, work)).is_err() {
                     return;
                 }
             }
         });
-        Self { work, pending: false, next_map: None, next_ends: None, given_up: None }
+        Self { rig, work, done, pending: false, next_map: None, next_ends: None, given_up: None, chart_stopped: None }
+    }
+
+    /// Builds the chart of the rig, and of every rig that replaces it. Only the first is stored in the file `kept`.
+    pub fn chart(&mut self, kept: Option<ChartFile>) {
+        let stopped = Arc::<AtomicBool>::default();
+        spawn_chart(self.rig.clone(), kept, self.done.clone(), stopped.clone());
+        self.chart_stopped = Some(stopped);
+    }
+
+    /// Stops the build of the chart, if one is being built. Returns whether the rig is charted.
+    pub fn stop_chart(&mut self) -> bool {
+        let stopped = self.chart_stopped.take();
+        stopped.inspect(|stopped| stopped.store(true, Ordering::Relaxed)).is_some()
+    }
+
+    /// Replaces the rig by the same rig at another temperature. Requests for the former are dropped.
+    pub fn take_rig(&mut self, rig: Arc<Rig>) {
+        self.rig = rig;
+        (self.next_map, self.next_ends, self.given_up) = (None, None, None);
+        if self.stop_chart() {
+            self.chart(None);
+        }
+    }
+
+    /// Requests the rig at a temperature, with its map at the load and speed of `point`, unless a task is running.
+    pub fn request_rig(&mut self, celsius: f64, point: OperatingPoint) {
+        if !self.pending {
+            self.start(Work::Rig { celsius, point });
+        }
     }
 
     /// Requests the map at the load and speed of `point`. While a task runs, only the newest request is kept.
@@ -168,13 +195,16 @@ impl Mapper {
     }
 
     fn start(&mut self, work: Work) {
-        self.pending = self.work.try_send(work).is_ok();
+        self.pending = self.work.try_send((self.rig.clone(), work)).is_ok();
     }
 
-    /// Takes note that a task has ended and starts the next request, unless `served` says that the newest map already
-    /// serves it.
-    pub fn done(&mut self, served: impl Fn(&OperatingPoint) -> bool) {
+    /// Takes note that a task has ended.
+    pub fn done(&mut self) {
         self.pending = false;
+    }
+
+    /// Starts the next request, unless `served` says that the newest map already serves it.
+    pub fn start_next(&mut self, served: impl Fn(&OperatingPoint) -> bool) {
         if let Some(point) = self.next_map.take().filter(|point| !served(point)) {
             self.request_map(point);
         }
@@ -191,6 +221,29 @@ impl Mapper {
     /// Whether a task is running.
     pub fn pending(&self) -> bool {
         self.pending
+    }
+}
+
+/// Carries out a task for `rig`.
+fn answer(rig: &Rig, solver: &mut Solver, work: Work) -> Incoming {
+    match work {
+        Work::Request { request, map } => {
+            let result = guarded(rig, solver, |solver| compute(rig, solver, map.as_deref(), &request));
+            Incoming::Computed { request, map, result }
+        }
+        Work::Sensitivity { question, map, ends } => {
+            let answer =
+                |solver: &mut Solver| sensitivity::answer(rig, solver, &question, map.as_deref(), ends.as_ref());
+            Incoming::Sensitivity(Box::new(guarded(rig, solver, answer)))
+        }
+        Work::Rig { celsius, point } => {
+            let result = guarded(rig, solver, |solver| {
+                let rig = session_rig(rig, celsius)?;
+                let map = compute(&rig, solver, None, &Request::Map(point)).ok().flatten();
+                Ok(std::iter::once(Event::RigReady(rig)).chain(map).collect())
+            });
+            Incoming::Rig { celsius, result }
+        }
     }
 }
 

@@ -24,7 +24,7 @@ mod watch;
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
 
 use crossbeam_channel::{Receiver, Select, Sender, TryRecvError, bounded};
@@ -34,14 +34,14 @@ pub use inlet::Inlet;
 pub use mapper::{kept_chart, yield_to_predictions};
 pub use outputs::{NodeName, Outputs};
 pub use sensitivity::end_derivatives;
-pub use watch::{SAMPLE_MODES, Sample, Snapshot, UnstableMode, VibrationSample, Watch};
+pub use watch::{SAMPLE_MODES, Sample, Snapshot, TemperatureSeen, UnstableMode, VibrationSample, Watch};
 
 use crate::bus::{Bus, Received};
 use crate::files::chart_file::ChartFile;
 use crate::msgs::{self, Header, RigInfo, Time};
 use crate::physics::{Chart, OperatingPoint, StabilityMap};
 use crate::recording::message::Payload;
-use crate::rig::{Certificate, Rig};
+use crate::rig::{Certificate, Rig, temperature};
 use crate::session::computed::{Request, parameter_record, record_of};
 use crate::session::{Event, Session, map_serves};
 use crate::session::{conditions, settings::Settings};
@@ -62,10 +62,11 @@ const LATEST: Duration = Duration::from_millis(500);
 /// The time of a prediction is estimated as the minimum over this many, since on a busy machine any of them may have
 /// been interrupted.
 const TIMED: usize = 16;
-/// Number of inputs, and of measured vibrations, whose stamp and sequence number are remembered. A message that arrives
+/// Number of inputs, of measured vibrations, and of temperatures, whose stamp and sequence number are remembered. A message that arrives
 /// over both buses is recognised by them and handled once.
 const REMEMBERED: usize = 8192;
 const VIBRATIONS_REMEMBERED: usize = 1024;
+const TEMPERATURES_REMEMBERED: usize = 64;
 /// Interval between diagnostics.
 const DIAGNOSTICS_EVERY: Duration = Duration::from_secs(1);
 /// Minimum interval between sensitivities.
@@ -78,6 +79,8 @@ pub enum Incoming {
     Input(Received<msgs::OperatingPoint>),
     /// A measured vibration received over a bus. It is recorded and shown, and does not affect predictions.
     Vibration(Received<msgs::Vibration>),
+    /// A temperature of the contact received over a bus. It is recorded and shown, and the rig follows it.
+    Temperature(Received<msgs::Temperature>),
     /// A squeal found in received samples. It is published, recorded and shown, and does not affect predictions.
     Heard(Box<msgs::Heard>),
     /// A changed setting; its value is already validated.
@@ -88,8 +91,10 @@ pub enum Incoming {
     Computed { request: Request, map: Option<Arc<StabilityMap>>, result: Result<Option<Event>, String> },
     /// The requested sensitivities, or why they could not be computed.
     Sensitivity(Box<Result<msgs::Sensitivity, String>>),
-    /// The chart of the rig, or why it could not be built.
-    Chart(Result<Arc<Chart>, String>),
+    /// The chart of `rig`, or why it could not be built.
+    Chart { rig: Arc<Rig>, chart: Result<Arc<Chart>, String> },
+    /// The rig at a temperature, followed by its map if it has one, or why it could not be built.
+    Rig { celsius: f64, result: Result<Vec<Event>, String> },
     /// End of the run.
     Stop,
 }
@@ -113,6 +118,12 @@ struct Worker {
     watch: Watch,
     received_before: Remembered,
     vibration_received_before: Remembered,
+    temperature_received_before: Remembered,
+    /// The latest temperature, °C, and the last one at which the rig could not be built.
+    temperature: Option<f64>,
+    temperature_refused: Option<f64>,
+    /// The latest operating point that was predicted.
+    point: OperatingPoint,
     /// When the latest input was received. `None` before the first: silence is only a FAULT after an input.
     last_received: Option<Instant>,
     /// Whether the current silence has been published.
@@ -126,8 +137,6 @@ struct Worker {
     /// predicted.
     passing_over: bool,
     next_diagnostics: Instant,
-    /// Set when the node ends; stops the thread that builds the chart.
-    stopped: Arc<AtomicBool>,
     next_sensitivity: Instant,
     detection: DetectionInlet,
 }
@@ -146,13 +155,16 @@ impl Node {
         let worker = Worker {
             session: Session::new(rig.clone(), settings),
             mapper: Mapper::spawn(rig.clone(), sender.clone()),
-            stopped: Arc::new(AtomicBool::new(false)),
+            temperature: None,
+            temperature_refused: None,
+            point: rig.reference,
             rig,
             outputs: Outputs::default(),
             statistics: Statistics::new(lost),
             watch,
             received_before: Remembered::new(REMEMBERED),
             vibration_received_before: Remembered::new(VIBRATIONS_REMEMBERED),
+            temperature_received_before: Remembered::new(TEMPERATURES_REMEMBERED),
             last_received: None,
             silent: false,
             backlog: VecDeque::new(),
@@ -168,8 +180,8 @@ impl Node {
 
     /// Builds the chart of the rig in the background, or loads it from the file `kept`. Predictions use the chart as
     /// soon as it is available.
-    pub fn with_chart(self, kept: Option<ChartFile>) -> Self {
-        mapper::spawn_chart(self.worker.rig.clone(), kept, self.sender.clone(), self.worker.stopped.clone());
+    pub fn with_chart(mut self, kept: Option<ChartFile>) -> Self {
+        self.worker.mapper.chart(kept);
         self
     }
 
@@ -200,7 +212,7 @@ impl Node {
                 && let Some(mut worker) = running.take()
             {
                 drop(running);
-                worker.stopped.store(true, Ordering::Relaxed);
+                worker.mapper.stop_chart();
                 let lasted = detection.stop();
                 let found = queue.try_iter().filter_map(|item| match item {
                     Incoming::Heard(heard) => Some(*heard),
@@ -233,11 +245,13 @@ impl Worker {
                     self.input(received);
                 }
                 Some(Incoming::Vibration(received)) => self.vibration(received),
+                Some(Incoming::Temperature(received)) => self.temperature(received),
                 Some(Incoming::Heard(heard)) => self.heard(*heard),
                 Some(Incoming::Parameter { name, value }) => self.parameter(name, value),
                 Some(Incoming::Computed { request, map, result }) => self.computed(&request, map.as_ref(), result),
                 Some(Incoming::Sensitivity(found)) => self.sensitivity(*found),
-                Some(Incoming::Chart(chart)) => self.chart(chart),
+                Some(Incoming::Chart { rig, chart }) => self.chart(&rig, chart),
+                Some(Incoming::Rig { celsius, result }) => self.rig_ready(celsius, result),
             }
             if Instant::now() >= self.next_diagnostics {
                 break;
@@ -282,7 +296,7 @@ impl Worker {
         for (name, value) in settings {
             self.outputs.session_event(parameter_record(now_header(), name, value));
         }
-        self.watch.warn_margin(self.session.settings().warn_margin);
+        self.watch.settings(self.session.settings());
         self.mapper.request_map(self.rig.reference);
     }
 
@@ -320,6 +334,7 @@ impl Worker {
             return;
         }
         let point = conditions(&received.message);
+        self.point = point;
         let worked_before = self.session.counters().worked();
         self.step(Event::Input(received.message.clone()), Some(received));
         let took = Duration::from_nanos(clock::monotonic_ns().saturating_sub(started));
@@ -343,6 +358,57 @@ impl Worker {
         }
     }
 
+    /// Shows and records a temperature. A rig that follows it and has another one is built for it in the background.
+    fn temperature(&mut self, received: Received<msgs::Temperature>) {
+        // A temperature has no sequence number either.
+        let measured = received.message;
+        let celsius = measured.temperature;
+        if !self.temperature_received_before.is_new(received.bus, measured.header.stamp, celsius.to_bits()) {
+            return;
+        }
+        self.outputs.record(received.at, Payload::Temperature(measured));
+        if let Err(refused) = temperature::check(&self.rig.name, "temperature", celsius) {
+            self.statistics.refused = Some(refused.to_string());
+            return;
+        }
+        self.watch.temperature(received.at.wall_ns, celsius);
+        self.statistics.temperature(celsius);
+        self.temperature = Some(celsius);
+        self.follow_temperature();
+    }
+
+    /// Requests the rig at the latest temperature if that is outside the dead-band of the rig's own.
+    fn follow_temperature(&mut self) {
+        let left = self.temperature.filter(|&celsius| self.session.leaves_temperature(celsius));
+        if let Some(celsius) = left.filter(|_| self.temperature_refused != left) {
+            self.mapper.request_rig(celsius, self.point);
+        }
+    }
+
+    /// Hands the rig at another temperature, and its map, to the session.
+    fn rig_ready(&mut self, celsius: f64, result: Result<Vec<Event>, String>) {
+        match result {
+            Ok(events) => {
+                (self.temperature_refused, self.statistics.temperature_failure) = (None, None);
+                for event in events {
+                    self.record_and_step(event, now_header());
+                }
+            }
+            Err(reason) => {
+                self.temperature_refused = Some(celsius);
+                self.statistics.temperature_failure = Some(reason);
+            }
+        }
+        self.task_done(|_| false);
+    }
+
+    /// Takes note that a task of the background thread has ended and starts the next one.
+    fn task_done(&mut self, served: impl Fn(&OperatingPoint) -> bool) {
+        self.mapper.done();
+        self.follow_temperature();
+        self.mapper.start_next(served);
+    }
+
     /// Publishes, shows and records a squeal found in received samples.
     fn heard(&mut self, heard: msgs::Heard) {
         self.watch.heard(&heard);
@@ -351,7 +417,7 @@ impl Worker {
 
     fn parameter(&mut self, name: String, value: f64) {
         self.record_and_step(Event::Parameter { name, value }, now_header());
-        self.watch.warn_margin(self.session.settings().warn_margin);
+        self.watch.settings(self.session.settings());
     }
 
     /// Hands the result of a request to the session. `requested_of` is the map in force when it was made.
@@ -361,14 +427,14 @@ impl Worker {
         requested_of: Option<&Arc<StabilityMap>>,
         result: Result<Option<Event>, String>,
     ) {
-        let (model, tolerance) = (&self.rig.model, self.session.settings().map_tolerance);
+        let (rig, tolerance) = (self.rig.clone(), self.session.settings().map_tolerance);
         match &result {
-            Ok(Some(Event::MapReady(map))) => self.mapper.done(|wish| map_serves(model, map, wish, tolerance)),
+            Ok(Some(Event::MapReady(map))) => self.task_done(|wish| map_serves(&rig.model, map, wish, tolerance)),
             Err(_) if matches!(request, Request::Map(_)) => {
                 self.mapper.give_up_on(*request.point());
-                self.mapper.done(|_| false);
+                self.task_done(|_| false);
             }
-            Ok(_) | Err(_) => self.mapper.done(|_| false),
+            Ok(_) | Err(_) => self.task_done(|_| false),
         }
         // Ends belong to their map: those of a map that is no longer in force are discarded.
         let in_force = match (self.session.map(), requested_of) {
@@ -414,7 +480,7 @@ impl Worker {
     }
 
     fn sensitivity(&mut self, found: Result<msgs::Sensitivity, String>) {
-        self.mapper.done(|_| false);
+        self.task_done(|_| false);
         match found {
             Ok(sensitivity) => {
                 self.statistics.sensitivities += 1;
@@ -424,7 +490,11 @@ impl Worker {
         }
     }
 
-    fn chart(&mut self, chart: Result<Arc<Chart>, String>) {
+    fn chart(&mut self, rig: &Arc<Rig>, chart: Result<Arc<Chart>, String>) {
+        // The chart of a rig that was replaced before its build was stopped is discarded.
+        if !Arc::ptr_eq(rig, &self.rig) {
+            return;
+        }
         match chart {
             Ok(chart) => {
                 self.statistics.charted(&chart);
@@ -456,6 +526,12 @@ impl Worker {
         match &event {
             Event::MapReady(map) => self.watch.map(map),
             Event::EndsReady(ends) => self.watch.ends(ends),
+            Event::RigReady(rig) => {
+                self.rig = rig.clone();
+                self.mapper.take_rig(rig.clone());
+                self.watch.rig(rig);
+                self.statistics.rig_replaced();
+            }
             Event::Input(_) | Event::Parameter { .. } | Event::Silence { .. } | Event::ChartReady(_) => {}
         }
         self.step(event, None);
@@ -496,6 +572,7 @@ impl Worker {
         let pending = self.mapper.pending();
         let sound = self.detection.report();
         let outputs = &mut self.outputs;
+        self.statistics.temperature_timeout_s = self.session.settings().temperature_timeout_s;
         let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, sound, outputs);
         self.watch.counters(counters, self.statistics.passed_over, self.statistics.restarts);
         self.watch.recording_problem(self.outputs.recorder.as_ref().and_then(|recorder| recorder.status().problem()));
@@ -661,7 +738,7 @@ mod tests {
         let watch = Watch::default();
         let (node, inlet) = Node::new(rig.clone(), Settings::for_rig(&rig), watch.clone());
         let chart = Arc::new(session_chart(&rig, 1, &|| true).expect("charted"));
-        assert!(inlet.send(Incoming::Chart(Ok(chart))));
+        assert!(inlet.send(Incoming::Chart { rig, chart: Ok(chart) }));
         let mut samples = vec![];
         watch.take_samples(&mut samples);
         let thread = std::thread::spawn(move || node.run(Outputs::default()));

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::Outputs;
 use super::detection::SoundReport;
@@ -39,6 +39,13 @@ pub struct Statistics {
     chart: Option<(usize, usize)>,
     pub map_failure: Option<String>,
     pub chart_failure: Option<String>,
+    /// Why the rig could not be built for the latest temperature.
+    pub temperature_failure: Option<String>,
+    /// The latest temperature, °C, and when it was received.
+    temperature: Option<(f64, Instant)>,
+    /// Age from which on it is stale, s.
+    pub temperature_timeout_s: f64,
+    rigs: u64,
     pub refused: Option<String>,
     inputs: Inputs,
     level: Option<u8>,
@@ -120,6 +127,30 @@ impl Statistics {
         self.chart = Some((chart.leaf_count(), chart.size_bytes()));
     }
 
+    /// Takes note of a temperature received now.
+    pub fn temperature(&mut self, celsius: f64) {
+        self.temperature = Some((celsius, Instant::now()));
+    }
+
+    /// Takes note that the rig was replaced by the same rig at another temperature; its chart goes with it.
+    pub fn rig_replaced(&mut self) {
+        self.rigs += 1;
+        self.chart = None;
+    }
+
+    /// The values of a rig that follows the temperature, and a warning if the latest temperature is stale.
+    fn temperature_values(&self, rig: &Rig) -> (Vec<KeyValue>, Option<String>) {
+        let Some(of_rig) = rig.temperature_c() else { return (vec![], None) };
+        let mut values = vec![pair("temperature_of_rig_c", of_rig), pair("rigs_by_temperature", self.rigs)];
+        let Some((celsius, received)) = self.temperature else { return (values, None) };
+        let age_s = received.elapsed().as_secs_f64();
+        values.extend([pair("temperature_c", celsius), pair("temperature_age_s", format!("{age_s:.1}"))]);
+        let limit_s = self.temperature_timeout_s;
+        let stale = (age_s > limit_s)
+            .then(|| format!("temperature stale: the last one, {celsius} °C, is {age_s:.0} s old, limit {limit_s} s"));
+        (values, stale)
+    }
+
     /// Takes note of the level of the latest prediction.
     pub fn published(&mut self, level: u8) {
         self.level = Some(level);
@@ -152,6 +183,8 @@ impl Statistics {
             values.push(pair(&format!("{bus}_failures"), counts.failures));
             values.push(pair(&format!("{bus}_incompatible_peers"), counts.incompatible));
         }
+        let (of_temperature, stale) = self.temperature_values(rig);
+        values.extend(of_temperature);
         let sound = sound.map(|sound| self.sound_status(rig, sound, &reports, outputs));
         for (_, report) in &mut reports {
             values.extend(report.values.drain(..).map(|(key, value)| pair(key, value)));
@@ -161,6 +194,9 @@ impl Statistics {
         warnings.extend(self.map_failure.iter().map(|why| format!("no stability map: {why}")));
         warnings.extend(self.chart_failure.iter().map(|why| format!("no chart: {why}")));
         warnings.extend(self.sensitivity_failure.iter().map(|why| format!("no sensitivities: {why}")));
+        let failure = self.temperature_failure.iter();
+        warnings.extend(failure.map(|why| format!("the rig does not follow the temperature: {why}")));
+        warnings.extend(stale);
         warnings.extend(self.refused.take());
         warnings.extend(reports.into_iter().flat_map(|(_, report)| report.warnings));
         let incompatible = lost.buses.iter().map(|(_, counts)| counts.incompatible).sum::<u64>();

@@ -196,6 +196,16 @@ impl Assessment {
     }
 }
 
+impl Assessment {
+    /// The same assessment, of a rig whose temperature is stale.
+    pub fn with_stale_temperature(mut self) -> Self {
+        if self.status.is_known() {
+            self.message += "; the temperature is stale";
+        }
+        self
+    }
+}
+
 /// A sentence about what grows: `unstable` counts modes and static roots.
 fn growing(fastest: Option<UnstableMode>, unstable: u32) -> String {
     let Some(mode) = fastest else { return "static divergence: a root that does not oscillate grows".to_owned() };

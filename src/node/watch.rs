@@ -1,7 +1,7 @@
 //! The latest state of a node for displays and terminals. The node never waits for them longer than a copy takes.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
@@ -9,6 +9,8 @@ use super::sound_view::SoundView;
 use super::status::{Assessment, Inputs, Status};
 use crate::msgs::{Heard, OperatingPoint, Prediction, Vibration, heard_state, level};
 use crate::physics::{Ends, NextWindow, StabilityMap};
+use crate::rig::Rig;
+use crate::session::settings::Settings;
 use crate::session::{Counters, conditions};
 use crate::system::clock;
 
@@ -27,6 +29,10 @@ pub struct Snapshot {
     pub ends: Option<Arc<Ends>>,
     /// The margin below which the node warns at present; `None` before it started.
     pub warn_margin: Option<f64>,
+    /// The rig at its present temperature; `None` while that is the reference.
+    pub rig: Option<Arc<Rig>>,
+    /// The latest temperature of the contact.
+    pub temperature: Option<TemperatureSeen>,
     pub counters: Counters,
     pub passed_over: u64,
     /// Number of restarts of the ROS 2 side.
@@ -37,6 +43,22 @@ pub struct Snapshot {
     pub recording_problem: Option<String>,
 }
 
+/// A temperature of the contact, as displays show it.
+#[derive(Clone, Copy, Debug)]
+pub struct TemperatureSeen {
+    pub celsius: f64,
+    pub received: Instant,
+    /// Age from which on it is stale.
+    pub timeout: Duration,
+}
+
+impl TemperatureSeen {
+    /// Whether it is too old.
+    pub fn is_stale(&self) -> bool {
+        self.received.elapsed() > self.timeout
+    }
+}
+
 impl Snapshot {
     /// Status, message, fastest mode and next window of this state.
     pub fn assessment(&self) -> Assessment {
@@ -44,7 +66,9 @@ impl Snapshot {
         let status = Status::new(Some(prediction.level), self.inputs);
         let map = self.map.as_deref();
         let windows = map.map(|map| (map, self.ends.as_deref().unwrap_or(&map.ends)));
-        Assessment::new(status, prediction, self.input.as_ref(), windows)
+        let assessment = Assessment::new(status, prediction, self.input.as_ref(), windows);
+        let stale = self.temperature.is_some_and(|temperature| temperature.is_stale());
+        if stale { assessment.with_stale_temperature() } else { assessment }
     }
 
     /// The window whose end the margin of the prediction refers to; `None` without a margin.
@@ -166,10 +190,13 @@ struct Watched {
     samples: Option<Vec<Sample>>,
     /// The measured vibrations for the same follower.
     vibrations: Vec<VibrationSample>,
+    /// The temperatures for the same follower, each with the time of reception, ns since the epoch.
+    temperatures: Vec<(i64, f64)>,
     /// The squeals found in samples, for the same follower.
     heard: Vec<Heard>,
     lost: u64,
     sound: Arc<SoundView>,
+    temperature_timeout: Duration,
 }
 
 impl Watch {
@@ -193,6 +220,12 @@ impl Watch {
     pub fn take_vibrations(&self, vibrations: &mut Vec<VibrationSample>) {
         vibrations.clear();
         self.with(|watched| std::mem::swap(&mut watched.vibrations, vibrations));
+    }
+
+    /// As [`Watch::take_samples`], for temperatures: time of reception, ns since the epoch, and °C.
+    pub fn take_temperatures(&self, temperatures: &mut Vec<(i64, f64)>) {
+        temperatures.clear();
+        self.with(|watched| std::mem::swap(&mut watched.temperatures, temperatures));
     }
 
     /// As [`Watch::take_samples`], for squeals found in samples.
@@ -270,8 +303,32 @@ impl Watch {
         self.with(|watched| watched.snapshot.ends = Some(ends.clone()));
     }
 
-    pub(super) fn warn_margin(&self, warn_margin: f64) {
-        self.with(|watched| watched.snapshot.warn_margin = Some(warn_margin));
+    pub(super) fn rig(&self, rig: &Arc<Rig>) {
+        self.with(|Watched { snapshot, .. }| {
+            (snapshot.rig, snapshot.map, snapshot.ends) = (Some(rig.clone()), None, None);
+        });
+    }
+
+    pub(super) fn temperature(&self, time_ns: i64, celsius: f64) {
+        self.with(|Watched { snapshot, samples, temperatures, temperature_timeout: timeout, .. }| {
+            let seen = TemperatureSeen { celsius, received: Instant::now(), timeout: *timeout };
+            snapshot.temperature = Some(seen);
+            if samples.is_some() && temperatures.len() < MOST_SAMPLES {
+                temperatures.push((time_ns, celsius));
+            }
+        });
+    }
+
+    /// Takes note of the settings in force.
+    pub(super) fn settings(&self, settings: &Settings) {
+        let timeout = Duration::try_from_secs_f64(settings.temperature_timeout_s).unwrap_or(Duration::MAX);
+        self.with(|Watched { snapshot, temperature_timeout, .. }| {
+            snapshot.warn_margin = Some(settings.warn_margin);
+            *temperature_timeout = timeout;
+            if let Some(temperature) = &mut snapshot.temperature {
+                temperature.timeout = timeout;
+            }
+        });
     }
 
     pub(super) fn recording_problem(&self, problem: Option<String>) {

@@ -28,13 +28,13 @@ impl<I: Iterator<Item = OperatingPoint>> Ahead<I> {
 
     /// To be called before each prediction. Hands the session the spectra of the coming operating points, unless it can
     /// predict the next one without a solve.
-    pub fn step(&mut self, session: &mut Session, model: &Model) {
+    pub fn step(&mut self, session: &mut Session) {
         let room = (AHEAD_PER_THREAD * self.solvers.len()).saturating_sub(self.window.len());
         self.window.extend(self.points.by_ref().take(room));
         // A single thread would gain nothing.
         if self.solvers.len() > 1 && self.window.front().is_some_and(|next| session.would_solve(next)) {
-            let wanted = session.would_solve_among(self.window.iter());
-            session.hand_in(self.solve(model, &wanted));
+            let (wanted, rig) = (session.would_solve_among(self.window.iter()), session.rig().clone());
+            session.hand_in(self.solve(&rig.model, &wanted));
         }
         self.window.pop_front();
     }

@@ -13,13 +13,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::msgs::{Header, Heard, OperatingPoint, Time, Vibration, Waveform};
+use crate::msgs::{Header, Heard, OperatingPoint, Temperature, Time, Vibration, Waveform};
 use crate::node::rig_info;
 use crate::physics::{self, Chart, Solver};
 use crate::recording::message::{Message, Payload};
 use crate::recording::recorder::{Recorder, RecorderConfig, RecorderError};
 use crate::rig::Rig;
-use crate::session::computed::{Request, compute, parameter_record, record_of};
+use crate::session::computed::{Request, compute, parameter_record, record_of, session_rig};
 use crate::session::{Event, Session};
 use crate::session::{conditions, settings::Settings};
 use crate::sound;
@@ -58,6 +58,7 @@ pub struct Measured {
 pub enum Quantity {
     Conditions(OperatingPoint),
     Vibration(Vibration),
+    Temperature(Temperature),
     /// Consecutive samples of a channel of sound or acceleration.
     Samples(Waveform),
 }
@@ -68,6 +69,7 @@ impl Measured {
         let stamp = match &quantity {
             Quantity::Conditions(input) => input.header.stamp,
             Quantity::Vibration(vibration) => vibration.header.stamp,
+            Quantity::Temperature(measured) => measured.header.stamp,
             Quantity::Samples(block) => Time::from_ns(end_ns(block)),
         };
         let time_ns = u64::try_from(stamp.as_ns()).unwrap_or(0);
@@ -83,7 +85,7 @@ pub struct Predicted {
     pub inputs: u64,
     /// Number of predictions of each level: OK, WARN, SQUEAL, FAULT.
     pub levels: [u64; 4],
-    /// Why the first stability map that failed could not be computed.
+    /// Why the first stability map, or rig at another temperature, that failed could not be computed.
     pub map_failure: Option<String>,
     /// `None` if samples were not searched.
     pub sound: Option<SoundFound>,
@@ -114,13 +116,19 @@ pub fn record(
                 offline.write(log_time_ns, publish_time_ns, Payload::Vibration(vibration));
             }
             Quantity::Samples(block) => offline.samples(log_time_ns, publish_time_ns, block),
+            Quantity::Temperature(measured) => {
+                if let Some(chart) = chart.take() {
+                    offline.begin(measured.header.stamp, log_time_ns, chart);
+                }
+                offline.temperature(measured, log_time_ns, publish_time_ns);
+            }
             Quantity::Conditions(input) => {
                 if let Some(chart) = chart.take() {
                     offline.begin(input.header.stamp, log_time_ns, chart);
                 }
                 offline.silence(input.header.stamp, log_time_ns);
                 offline.prepare(&input, log_time_ns);
-                ahead.step(&mut offline.session, &rig.model);
+                ahead.step(&mut offline.session);
                 offline.input(input, log_time_ns, publish_time_ns);
             }
         }
@@ -130,7 +138,6 @@ pub fn record(
 
 /// A session that is being recorded.
 struct Offline {
-    rig: Arc<Rig>,
     recorder: Recorder,
     session: Session,
     solver: Solver,
@@ -158,7 +165,6 @@ impl Offline {
         Ok(Self {
             session: Session::new(rig.clone(), Settings::for_rig(rig)),
             solver: Solver::new(rig.model.dimension()),
-            rig: rig.clone(),
             recorder,
             last: None,
             given_up: None,
@@ -204,7 +210,7 @@ impl Offline {
 
     /// Records the initial state of the session: rig, settings and chart.
     fn begin(&mut self, stamp: Time, log_time_ns: u64, chart: Option<Arc<Chart>>) {
-        self.write(log_time_ns, log_time_ns, Payload::RigInfo(rig_info(&self.rig)));
+        self.write(log_time_ns, log_time_ns, Payload::RigInfo(rig_info(self.session.rig())));
         let header = Header { stamp, ..Default::default() };
         let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
         for (name, value) in settings {
@@ -247,6 +253,22 @@ impl Offline {
         }
     }
 
+    /// Records a temperature. A rig that follows it and has another one is built for it.
+    fn temperature(&mut self, measured: Temperature, log_time_ns: u64, publish_time_ns: u64) {
+        let (stamp, celsius) = (measured.header.stamp, measured.temperature);
+        self.write(log_time_ns, publish_time_ns, Payload::Temperature(measured));
+        if !self.session.leaves_temperature(celsius) {
+            return;
+        }
+        match session_rig(self.session.rig(), celsius) {
+            Ok(rig) => {
+                self.given_up = None;
+                self.event(stamp, log_time_ns, Event::RigReady(rig));
+            }
+            Err(reason) => drop(self.map_failure.get_or_insert(reason)),
+        }
+    }
+
     /// Records a block of samples and what is found in it; nothing if samples are not searched.
     fn samples(&mut self, log_time_ns: u64, publish_time_ns: u64, block: Waveform) {
         let Some(sound) = &mut self.sound else { return };
@@ -268,8 +290,8 @@ impl Offline {
         if is_map && self.given_up == Some(place) {
             return;
         }
-        let map = self.session.map().cloned();
-        match compute(&self.rig, &mut self.solver, map.as_deref(), &request) {
+        let (rig, map) = (self.session.rig().clone(), self.session.map().cloned());
+        match compute(&rig, &mut self.solver, map.as_deref(), &request) {
             Ok(Some(event)) => self.event(stamp, log_time_ns, event),
             Ok(None) => self.compute(stamp, log_time_ns, Request::Map(*request.point())),
             Err(reason) => {

@@ -103,6 +103,7 @@ impl HeardAndPredicted {
             }
             Payload::OperatingPoint(_)
             | Payload::Vibration(_)
+            | Payload::Temperature(_)
             | Payload::SessionEvent(_)
             | Payload::RigInfo(_)
             | Payload::Sensitivity(_)

@@ -17,7 +17,7 @@ use crate::physics::{Chart, OperatingPoint, Solver, StabilityMap};
 use crate::recording::message::Payload;
 use crate::recording::reader::{FileDamage, Recorded, Recording};
 use crate::rig::Rig;
-use crate::session::computed::{Request, chart_hash, compute, record_of, session_chart};
+use crate::session::computed::{Request, chart_hash, compute, record_of, session_chart, session_rig};
 use crate::session::{Event, Session};
 use crate::session::{conditions, settings::Settings};
 
@@ -78,6 +78,8 @@ pub enum VerifyError {
     NoPredictions { damage: Vec<FileDamage> },
     #[error("cannot compute the stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s: {reason}")]
     Map { normal_load_n: f64, disc_speed_rad_s: f64, reason: String },
+    #[error("cannot build the rig at {celsius} °C: {reason}")]
+    Temperature { celsius: f64, reason: String },
     #[error("cannot chart the rig: {0}")]
     Chart(String),
     #[error("session event of unknown kind {kind}: recorded by a later version?")]
@@ -131,13 +133,13 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
                 found.inputs += 1;
                 if answered.contains(&(input.header.stamp, input.seq)) {
                     found.predicted += 1;
-                    ahead.step(&mut session, &rig.model);
+                    ahead.step(&mut session);
                     step(&mut session, &mut computed, Event::Input(input));
                 }
             }
             Recorded::Known(Payload::SessionEvent(event)) if events.take(&event, &entry.cdr) => {
-                let map = session.map().cloned();
-                let event = session_event(event, rig, charts, map.as_deref(), &mut solver, &mut found)?;
+                let (rig, map) = (session.rig().clone(), session.map().cloned());
+                let event = session_event(event, &rig, charts, map.as_deref(), &mut solver, &mut found)?;
                 step(&mut session, &mut computed, event);
             }
             Recorded::Known(Payload::Prediction(recorded)) => match computed.pop_front() {
@@ -154,6 +156,7 @@ pub fn verify(recording: &Recording, rig: &Arc<Rig>, charts: Charts) -> Result<V
                 | Payload::Sensitivity(_)
                 | Payload::Diagnostics(_)
                 | Payload::Vibration(_)
+                | Payload::Temperature(_)
                 | Payload::Waveform(_)
                 | Payload::Heard(_),
             )
@@ -201,6 +204,11 @@ fn session_event(
     let (event, what) = match kind {
         SessionEventKind::Parameter => return Ok(Event::Parameter { name: recorded.name, value: recorded.value }),
         SessionEventKind::Silence => return Ok(Event::Silence { stamp: recorded.header.stamp }),
+        SessionEventKind::Temperature => {
+            let celsius = recorded.value;
+            let failed = |reason| VerifyError::Temperature { celsius, reason };
+            return session_rig(rig, celsius).map(Event::RigReady).map_err(failed);
+        }
         SessionEventKind::StabilityMap => {
             (computed(Request::Map(point))?, format!("stability map at {normal_load_n} N, {disc_speed_rad_s} rad/s"))
         }

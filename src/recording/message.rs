@@ -1,8 +1,8 @@
 //! Recorded messages of all topics of the node.
 
 use crate::msgs::{
-    self, CdrError, DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Time,
-    Vibration, Waveform, schema::Topic,
+    self, CdrError, DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent,
+    Temperature, Time, Vibration, Waveform, schema::Topic,
 };
 
 /// The content of a recorded message; its variant determines the topic.
@@ -17,6 +17,7 @@ pub enum Payload {
     Vibration(Vibration),
     Waveform(Waveform),
     Heard(Heard),
+    Temperature(Temperature),
 }
 
 impl Payload {
@@ -32,6 +33,7 @@ impl Payload {
             Self::Vibration(_) => Topic::Vibration,
             Self::Waveform(_) => Topic::Waveform,
             Self::Heard(_) => Topic::Heard,
+            Self::Temperature(_) => Topic::Temperature,
         }
     }
 
@@ -47,6 +49,7 @@ impl Payload {
             Self::Vibration(message) => Some(&mut message.header.stamp),
             Self::Waveform(message) => Some(&mut message.header.stamp),
             Self::Heard(message) => Some(&mut message.header.stamp),
+            Self::Temperature(message) => Some(&mut message.header.stamp),
         }
     }
 
@@ -66,6 +69,7 @@ impl Payload {
             Self::Vibration(message) => msgs::to_cdr(message),
             Self::Waveform(message) => msgs::to_cdr(message),
             Self::Heard(message) => msgs::to_cdr(message),
+            Self::Temperature(message) => msgs::to_cdr(message),
         }
     }
 
@@ -85,6 +89,7 @@ impl Payload {
             Topic::Vibration => Self::Vibration(msgs::from_cdr(cdr)?),
             Topic::Waveform => Self::Waveform(msgs::from_cdr(cdr)?),
             Topic::Heard => Self::Heard(msgs::from_cdr(cdr)?),
+            Topic::Temperature => Self::Temperature(msgs::from_cdr(cdr)?),
         })
     }
 }

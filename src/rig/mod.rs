@@ -258,31 +258,6 @@ impl Rig {
         Self::from_files_at(files, None)
     }
 
-    /// The rig at another temperature, built from its files again. Its hash stays that of the files.
-    ///
-    /// # Errors
-    /// [`RigError::MissingKey`] if the rig has no `[temperature]`; [`RigError`] if the temperature is out of range or takes
-    /// the contact out of range.
-    pub fn at_temperature(&self, temperature_c: f64) -> Result<Self, RigError> {
-        self.accepts_temperature(temperature_c)?;
-        Ok(Self { path: self.path.clone(), ..Self::from_files_at(&self.files, Some(temperature_c))? })
-    }
-
-    /// Checks that the rig follows the temperature, and that this one is in range.
-    ///
-    /// # Errors
-    /// [`RigError::MissingKey`], [`RigError::NotFinite`], [`RigError::Range`].
-    pub fn accepts_temperature(&self, temperature_c: f64) -> Result<(), RigError> {
-        if self.temperature.is_none() {
-            return Err(RigError::MissingKey {
-                file: self.name.clone(),
-                field: "temperature".to_owned(),
-                limit: "the table [temperature], which says what follows the temperature".to_owned(),
-            });
-        }
-        temperature::check(&self.name, "temperature_c", temperature_c).map(|_| ())
-    }
-
     fn from_files_at(files: &[RigFile], temperature_c: Option<f64>) -> Result<Self, RigError> {
         let (first, others) = files.split_first().ok_or_else(|| RigError::NoSuchRig {
             value: "no files at all".to_owned(),
@@ -376,11 +351,6 @@ impl Rig {
         let heat = self.temperature.as_ref().is_some_and(Temperature::is_beyond_a_table);
         let heat = heat.then_some("temperature beyond the tables of the rig: factors of their ends");
         self.model.contact_state(p).note().into_iter().chain(beyond).chain(heat)
-    }
-
-    /// The temperature that the rig has, °C; `None` without `[temperature]`.
-    pub fn temperature_c(&self) -> Option<f64> {
-        self.temperature.as_ref().map(Temperature::present_c)
     }
 
     /// Contact stiffness as listed in the rig file, N/m: one value per contact or patch, or one per pair of a patch.

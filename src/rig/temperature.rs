@@ -4,9 +4,9 @@
 //! factor is 1 at the reference temperature, for which the rig file is written. A temperature changes no law of the model: a
 //! rig at another temperature is built from its files again, with the factors on the numbers in them.
 
-use super::RigError;
 use super::raw::{OneOrMany, RawRig};
 use super::settings::{at_most, finite, within};
+use super::{Rig, RigError};
 
 /// Temperatures that are accepted, °C: from absolute zero to beyond any friction material.
 pub const RANGE_C: [f64; 2] = [-273.15, 3000.0];
@@ -166,6 +166,38 @@ impl Temperature {
     }
 }
 
+impl Rig {
+    /// The rig at another temperature, built from its files again. Its hash stays that of the files.
+    ///
+    /// # Errors
+    /// [`RigError::MissingKey`] if the rig has no `[temperature]`; [`RigError`] if the temperature is out of range or takes
+    /// the contact out of range.
+    pub fn at_temperature(&self, temperature_c: f64) -> Result<Self, RigError> {
+        self.accepts_temperature(temperature_c)?;
+        Ok(Self { path: self.path.clone(), ..Self::from_files_at(&self.files, Some(temperature_c))? })
+    }
+
+    /// Checks that the rig follows the temperature, and that this one is in range.
+    ///
+    /// # Errors
+    /// [`RigError::MissingKey`], [`RigError::NotFinite`], [`RigError::Range`].
+    pub fn accepts_temperature(&self, temperature_c: f64) -> Result<(), RigError> {
+        if self.temperature.is_none() {
+            return Err(RigError::MissingKey {
+                file: self.name.clone(),
+                field: "temperature".to_owned(),
+                limit: "the table [temperature], which says what follows the temperature".to_owned(),
+            });
+        }
+        check(&self.name, "temperature_c", temperature_c).map(|_| ())
+    }
+
+    /// The temperature that the rig has, °C; `None` without `[temperature]`.
+    pub fn temperature_c(&self) -> Option<f64> {
+        self.temperature.as_ref().map(Temperature::present_c)
+    }
+}
+
 /// Why a rig has nothing that the table `key` could change; `None` if it has.
 fn nothing_to_act_on(key: &str, raw: &RawRig) -> Option<&'static str> {
     if raw.system.is_some() {
@@ -241,7 +273,7 @@ fn times(values: &mut OneOrMany, factor: f64) {
 mod tests {
     use super::*;
     use crate::physics::{Solver, Vectors};
-    use crate::rig::{Rig, RigFile};
+    use crate::rig::RigFile;
 
     fn rig(text: &str) -> Result<Rig, RigError> {
         Rig::from_files(&[RigFile { name: "rig.toml".to_owned(), bytes: text.as_bytes().to_vec() }])

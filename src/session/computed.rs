@@ -1,4 +1,4 @@
-//! What a session requests and somebody else computes: stability maps, window ends and charts. Live operation, offline
+//! What a session uses and somebody else computes: stability maps, window ends, charts and rigs at other temperatures. Live operation, offline
 //! prediction and verification all compute them here, and record them by the same session events.
 
 use std::sync::Arc;
@@ -68,6 +68,10 @@ pub fn record_of(event: &Event, header: Header) -> Option<SessionEvent> {
         Event::ChartReady(chart) => {
             SessionEvent { kind: SessionEventKind::Chart.number(), hash: chart_hash(chart), ..Default::default() }
         }
+        Event::RigReady(rig) => {
+            let value = rig.temperature_c().unwrap_or(f64::NAN);
+            SessionEvent { kind: SessionEventKind::Temperature.number(), value, ..Default::default() }
+        }
     };
     Some(SessionEvent { header, ..record })
 }
@@ -76,6 +80,14 @@ pub fn record_of(event: &Event, header: Header) -> Option<SessionEvent> {
 pub fn parameter_record(header: Header, name: &str, value: f64) -> SessionEvent {
     let kind = SessionEventKind::Parameter.number();
     SessionEvent { header, kind, name: name.to_owned(), value, ..Default::default() }
+}
+
+/// `rig` at a temperature, °C, as a session uses it.
+///
+/// # Errors
+/// Why it cannot be built, as text.
+pub fn session_rig(rig: &Rig, celsius: f64) -> Result<Arc<Rig>, String> {
+    rig.at_temperature(celsius).map(Arc::new).map_err(|error| error.to_string())
 }
 
 /// The stability map that a session uses at the load and speed of `point`.

@@ -46,6 +46,8 @@ pub enum Event {
     EndsReady(Arc<Ends>),
     /// The chart of the rig was built.
     ChartReady(Arc<Chart>),
+    /// The rig was built for another temperature.
+    RigReady(Arc<Rig>),
 }
 
 /// What the caller has to do after a step.
@@ -182,6 +184,18 @@ impl Session {
         }
     }
 
+    /// The rig that is predicted for, at its present temperature.
+    pub fn rig(&self) -> &Arc<Rig> {
+        &self.rig
+    }
+
+    /// Whether a rig that follows the temperature should be built for this one, °C: it is outside the dead-band of the
+    /// temperature that the rig has.
+    pub fn leaves_temperature(&self, celsius: f64) -> bool {
+        let outside = |present: f64| (celsius - present).abs() > self.settings.dead_band_temperature_k;
+        self.rig.temperature_c().is_some_and(outside)
+    }
+
     /// The settings in force.
     pub fn settings(&self) -> &Settings {
         &self.settings
@@ -280,10 +294,21 @@ impl Session {
             Event::MapReady(map) => (self.map, self.ends) = (Some(map), None),
             Event::EndsReady(ends) => self.ends = Some(ends),
             Event::ChartReady(chart) => self.chart = Some(chart),
+            Event::RigReady(rig) => self.take_rig(rig),
         }
         // The event may change predictions, so the latest one must not be reused.
         self.last = None;
         Ok(Effects::default())
+    }
+
+    /// Replaces the rig by the same rig at another temperature. What was computed for the former is dropped.
+    fn take_rig(&mut self, rig: Arc<Rig>) {
+        self.solver = Solver::new(rig.model.dimension());
+        self.traces = Traces::new(&rig.model);
+        self.scratch = Scratch::default();
+        self.beforehand.clear();
+        (self.chart, self.map, self.ends, self.ends_asked) = (None, None, None, None);
+        self.rig = rig;
     }
 
     /// Predicts for an input; returns what should be computed for later predictions.
@@ -472,6 +497,8 @@ impl Session {
             dead_band_load_n: _,
             dead_band_speed_rad_s: _,
             dead_band_friction: _,
+            dead_band_temperature_k: _,
+            temperature_timeout_s: _,
             map_tolerance: _,
         } = self.settings;
         let ends = begins + squeal_hysteresis;

@@ -24,7 +24,7 @@ pub struct Parameter {
 /// the rig, all of which are named first.
 macro_rules! settings {
     (of $rig:pat, $($name:ident = $initial:expr, from $low:expr, to $high:expr, $description:literal;)*) => {
-        /// Thresholds of levels, dead-bands for reuse, and the silence timeout.
+        /// Thresholds of levels, dead-bands, and the timeouts of inputs.
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub struct Settings { $(#[doc = $description] pub $name: f64,)* }
 
@@ -63,6 +63,10 @@ settings! {
         "changes of disc speed up to this reuse the previous prediction, in rad/s";
     dead_band_friction = 0.0, from 0.0, to 10.0,
         "changes of friction coefficient up to this reuse the previous prediction";
+    dead_band_temperature_k = 2.0, from 0.1, to 1000.0,
+        "changes of temperature up to this keep the rig as it is, in K";
+    temperature_timeout_s = 30.0, from 0.1, to 1e6,
+        "a temperature older than this is stale, in seconds";
     map_tolerance = 0.01, from 0.0, to 1.0,
         "relative change of load or speed after which windows of instability no longer count";
 }

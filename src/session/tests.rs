@@ -415,3 +415,53 @@ fn embedded_rigs_take_the_documented_threshold_of_instability() {
         assert_eq!(Rig::load(embedded.name).expect("embedded").instability_threshold, 1e-6, "{}", embedded.name);
     }
 }
+
+/// The paper's rig, whose contact softens to half its stiffness from 20 to 220 °C.
+fn softening() -> Arc<Rig> {
+    let mut files = Rig::load("nine-dof-case-2").expect("an embedded rig").files;
+    files[0].bytes.extend(b"\n[temperature]\nreference_c = 20.0\ncontact_stiffness = [[20.0, 1.0], [220.0, 0.5]]\n");
+    Arc::new(Rig::from_files(&files).expect("it follows the temperature"))
+}
+
+/// After the rig was replaced, everything is predicted as in a new session of that rig: map, chart and the spectra solved in
+/// advance for the former rig are gone.
+#[test]
+fn a_rig_at_another_temperature_is_predicted_as_if_it_were_the_first() {
+    let cold = softening();
+    let hot = Arc::new(cold.at_temperature(120.0).expect("in range"));
+    let settings = Settings::for_rig(&cold);
+    let mut session = with_map(Session::new(cold.clone(), settings));
+    let chart = crate::session::computed::session_chart(&cold, 1, &|| true).expect("charted");
+    session.step(Event::ChartReady(Arc::new(chart))).unwrap();
+    let before = predict(&mut session, friction(0, 0.3));
+    assert!(before.friction_margin.is_finite() && session.counters().charted == 1);
+    let ahead = session.solver.solve(&cold.model, &cold.reference.with_friction(0.31), Vectors::Both).expect("solved");
+    session.hand_in(vec![ahead]);
+    session.step(Event::RigReady(hot.clone())).unwrap();
+    assert!(session.map().is_none() && session.ends().is_none());
+
+    let mut fresh = Session::new(hot.clone(), settings);
+    for (seq, mu) in [(1, 0.31), (2, 0.3)] {
+        let predicted = predict(&mut session, friction(seq, mu));
+        assert_eq!(format!("{predicted:?}"), format!("{:?}", predict(&mut fresh, friction(seq, mu))), "{mu}");
+        assert!(predicted.friction_margin.is_nan() && predicted.reason.ends_with("margin pending"), "{predicted:?}");
+    }
+    let (mut session, mut fresh) = (with_map(session), with_map(fresh));
+    let predicted = predict(&mut session, friction(3, 0.3));
+    assert_eq!(format!("{predicted:?}"), format!("{:?}", predict(&mut fresh, friction(3, 0.3))));
+    assert_ne!(predicted.critical_friction, before.critical_friction);
+}
+
+#[test]
+fn a_rig_follows_the_temperature_outside_the_dead_band_only() {
+    let rig = softening();
+    let mut session = Session::new(rig.clone(), Settings::for_rig(&rig));
+    let left = |session: &Session| [17.9, 18.0, 20.0, 22.0, 22.1].map(|celsius| session.leaves_temperature(celsius));
+    assert_eq!(left(&session), [true, false, false, false, true]);
+    session.step(Event::Parameter { name: "dead_band_temperature_k".to_owned(), value: 5.0 }).unwrap();
+    assert_eq!(left(&session), [false; 5]);
+    session.step(Event::RigReady(Arc::new(rig.at_temperature(30.0).expect("in range")))).unwrap();
+    assert_eq!(left(&session), [true; 5], "of the present temperature");
+    assert!(!self::session().leaves_temperature(500.0), "a rig that does not follow");
+    assert!(!session.leaves_temperature(f64::NAN));
+}

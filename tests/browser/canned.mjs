@@ -98,12 +98,12 @@ const blank = (level, reason) => ({ level, reason, seq: 40, stamp_s: NOW, reused
 
 const FAULT = "normal load -5 N is below its limit of 0 N";
 const COUNTERS = { solved: 12, charted: 5003, reused: 201, faults: 0, passed_over: 0, ros2_falls: 0 };
-const state = (what) => ({ time_s: NOW, age_s: 0.02, rate_hz: 200, warn_margin: 0.05, map: 1, events: 1, counters: COUNTERS, simulated: false, ...what });
+const state = (what) => ({ time_s: NOW, age_s: 0.02, rate_hz: 200, warn_margin: 0.05, map: 1, events: 1, temperature: null, counters: COUNTERS, simulated: false, ...what });
 
 export const SITUATIONS = {
   ok: state(predicted(0.42, 5216)),
-  warn: state(predicted(0.641, 5216)),
-  squeal: state(predicted(0.72, 5216)),
+  warn: state({ ...predicted(0.641, 5216), temperature: { celsius: 183.44, of_rig: 182, stale: false } }),
+  squeal: state({ ...predicted(0.72, 5216), temperature: { celsius: 183.44, of_rig: null, stale: true } }),
   worst: state(predicted(0.93, 5216)),
   fault: state({ ...blank(3, FAULT), status: "fault", message: FAULT, load: -5, speed: 13.04, mu: 0.42 }),
   waiting: state({ age_s: null, rate_hz: 0, map: 0, events: 0, status: "waiting", message: "no input was received yet", counters: { solved: 0, charted: 0, reused: 0, faults: 1, passed_over: 0, ros2_falls: 0 }, spread: null, trend_per_s: null, fastest: null, next: null }),

@@ -38,6 +38,9 @@ for (const [status, word] of Object.entries(WORDS)) {
       check((await page.title()).startsWith(`${word} · tribometer`), `${where}: the tab says ${await page.title()}`);
       check((await text(page, "link-text")) === (asserts ? "live" : "connected"), `${where}: ${await text(page, "link-text")}`);
       check((await text(page, "reason")).length > 0, `${where}: no message`);
+      const temperature = { warn: " · 183.4 °C, rig at 182.0", squeal: " · 183.4 °C, stale" }[status];
+      const shown = (await page.locator("#temperature-fact").isVisible()) ? await page.locator("#temperature-fact").textContent() : undefined;
+      check(shown === temperature, `${where}: temperature ${shown}`);
       const numbers = await page.evaluate(() => ["margin", "growth", "worst", "unstable"].map((id) => document.getElementById(id).textContent));
       const known = status === "squeal" ? 4 : asserts ? 3 : 0;
       check(numbers.filter((number) => number !== "–").length === known, `${where}: ${numbers}`);

@@ -362,6 +362,7 @@ fn others_read_our_recordings() {
                 Payload::Vibration(m) => serde_json::to_value(m),
                 Payload::Waveform(m) => serde_json::to_value(m),
                 Payload::Heard(m) => serde_json::to_value(m),
+                Payload::Temperature(m) => serde_json::to_value(m),
             };
             assert_eq!(theirs["message"], ours.unwrap(), "{reader}");
         }

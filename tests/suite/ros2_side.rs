@@ -557,6 +557,7 @@ fn the_ros2_side_costs_little_time() {
             ros2.publish_prediction(&bus::answer(&received.message)).expect("published");
         }),
         vibration: Box::new(|_| ()),
+        temperature: Box::new(|_| ()),
         waveform: Box::new(|_| ()),
         parameter: Box::new(|_, _| ()),
         fell: Box::new(|why| panic!("{why}")),

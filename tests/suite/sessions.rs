@@ -84,8 +84,8 @@ fn the_same_command_records_the_same_predictions() {
     };
     let ((_a, first), (_b, second)) = (recorded("nine-dof-4+2", "2"), recorded("nine-dof-4+2", "2"));
     let (first, second) = (messages(&first), messages(&second));
-    // 200 inputs and predictions, the rig, eight settings, one map.
-    assert_eq!(first.len(), 200 + 200 + 1 + 8 + 1);
+    // 200 inputs and predictions, the rig, ten settings, one map.
+    assert_eq!(first.len(), 200 + 200 + 1 + 10 + 1);
     assert!(first == second, "recorded bytes differ");
 }
 

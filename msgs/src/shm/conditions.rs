@@ -3,7 +3,7 @@
 use iceoryx2::prelude::ZeroCopySend;
 
 use super::{Form, FormError, header};
-use crate::{OperatingPoint, Vibration};
+use crate::{OperatingPoint, Temperature, Vibration};
 
 /// An [`OperatingPoint`].
 ///
@@ -89,6 +89,44 @@ impl Form for VibrationForm {
     fn to_message(&self) -> Result<Vibration, FormError> {
         let Self { stamp_ns, frequency_hz, level_db } = *self;
         Ok(Vibration { header: header(stamp_ns)?, frequency_hz, level_db })
+    }
+
+    fn seq(&self) -> u64 {
+        0
+    }
+}
+
+/// A [`Temperature`].
+///
+/// | `squealcast/Temperature/1` | offset | type |
+/// |---|---|---|
+/// | `stamp_ns` (since the epoch) | 0 | i64 |
+/// | `temperature_c` | 8 | f64 |
+/// | `variance_k2` (0 if unknown) | 16 | f64 |
+/// | *size 24, alignment 8* | | |
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, ZeroCopySend)]
+#[type_name("squealcast/Temperature/1")]
+#[expect(missing_docs, reason = "the table above documents every field")]
+pub struct TemperatureForm {
+    pub stamp_ns: i64,
+    pub temperature_c: f64,
+    pub variance_k2: f64,
+}
+
+impl Form for TemperatureForm {
+    type Message = Temperature;
+    const SERVICE: &'static str = "rig/temperature";
+    const WAITING_SAMPLES: usize = 1024;
+
+    fn from_message(message: &Temperature) -> Result<Self, FormError> {
+        let Temperature { header, temperature, variance } = message;
+        Ok(Self { stamp_ns: header.stamp.as_ns(), temperature_c: *temperature, variance_k2: *variance })
+    }
+
+    fn to_message(&self) -> Result<Temperature, FormError> {
+        let Self { stamp_ns, temperature_c, variance_k2 } = *self;
+        Ok(Temperature { header: header(stamp_ns)?, temperature: temperature_c, variance: variance_k2 })
     }
 
     fn seq(&self) -> u64 {

@@ -43,6 +43,13 @@ fn layout_is_the_documented_one() {
         ],
         [0, 8, 16, 24, 32]
     );
+    assert_eq!((size_of::<TemperatureForm>(), align_of::<TemperatureForm>()), (24, 8));
+    let offsets = [
+        offset_of!(TemperatureForm, stamp_ns),
+        offset_of!(TemperatureForm, temperature_c),
+        offset_of!(TemperatureForm, variance_k2),
+    ];
+    assert_eq!(offsets, [0, 8, 16]);
     assert_eq!((size_of::<VibrationForm>(), align_of::<VibrationForm>()), (24, 8));
     assert_eq!(
         [

@@ -27,7 +27,7 @@ impl Ros2NodeConnection {
         parameters: Vec<(String, f64)>,
         sink: &Arc<dyn Sink>,
     ) -> Result<Self, Ros2Error> {
-        let (inputs, vibrations, waveforms, changes) = (sink.clone(), sink.clone(), sink.clone(), sink.clone());
+        let [inputs, vibrations, temperatures, waveforms, changes] = std::array::from_fn(|_| sink.clone());
         let sinks = Sinks {
             // The thread that receives from the child process serves all topics: it must not be held up.
             input: Box::new(move |received| {
@@ -38,6 +38,11 @@ impl Ros2NodeConnection {
             vibration: Box::new(move |received| {
                 if vibrations.takes_inputs() {
                     vibrations.vibration(received);
+                }
+            }),
+            temperature: Box::new(move |received| {
+                if temperatures.takes_inputs() {
+                    temperatures.temperature(received);
                 }
             }),
             waveform: Box::new(move |received| {
@@ -77,7 +82,8 @@ impl Connection for Ros2NodeConnection {
             Outgoing::Diagnostics(message) => self.process.publish_diagnostics(message)?,
             Outgoing::Heard(message) => self.process.publish_heard(message)?,
             // Published by the rig.
-            Outgoing::OperatingPoint(_) | Outgoing::Vibration(_) | Outgoing::Waveform(_) => {}
+            Outgoing::OperatingPoint(_) | Outgoing::Vibration(_) | Outgoing::Waveform(_) | Outgoing::Temperature(_) => {
+            }
         }
         Ok(())
     }
@@ -90,6 +96,7 @@ impl Connection for Ros2NodeConnection {
             Topic::OperatingPoint
             | Topic::Vibration
             | Topic::Waveform
+            | Topic::Temperature
             | Topic::SessionEvent
             | Topic::RigInfo
             | Topic::Diagnostics
@@ -153,6 +160,7 @@ impl Connection for Ros2Source {
             Outgoing::OperatingPoint(message) => Self::publish(self, message)?,
             Outgoing::Vibration(message) => self.publish_vibration(message)?,
             Outgoing::Waveform(message) => self.publish_waveform(message)?,
+            Outgoing::Temperature(message) => self.publish_temperature(message)?,
             // Published by the node.
             Outgoing::Prediction(_)
             | Outgoing::SessionEvent(_)
@@ -169,6 +177,7 @@ impl Connection for Ros2Source {
             Topic::OperatingPoint => Self::readers(self),
             Topic::Vibration => self.vibration_readers(),
             Topic::Waveform => self.waveform_readers(),
+            Topic::Temperature => self.temperature_readers(),
             Topic::Prediction
             | Topic::SessionEvent
             | Topic::RigInfo
@@ -215,6 +224,7 @@ impl Connection for Ros2ReplayConnection {
             Outgoing::Sensitivity(message) => self.node.publish_sensitivity(message)?,
             Outgoing::Diagnostics(message) => self.node.publish_diagnostics(message)?,
             Outgoing::Waveform(message) => self.rig.publish_waveform(message)?,
+            Outgoing::Temperature(message) => self.rig.publish_temperature(message)?,
             Outgoing::Heard(message) => self.node.publish_heard(message)?,
         }
         Ok(())
@@ -226,8 +236,9 @@ impl Connection for Ros2ReplayConnection {
             Topic::OperatingPoint => self.rig.readers().saturating_sub(OWN_READERS),
             Topic::Vibration => self.rig.vibration_readers().saturating_sub(OWN_READERS),
             Topic::Prediction => self.node.readers(topic).saturating_sub(OWN_READERS),
-            // The replay itself receives no samples.
+            // The replay itself receives neither samples nor temperatures.
             Topic::Waveform => self.rig.waveform_readers(),
+            Topic::Temperature => self.rig.temperature_readers(),
             Topic::Sensitivity | Topic::SessionEvent | Topic::RigInfo | Topic::Diagnostics | Topic::Heard => {
                 self.node.readers(topic)
             }

@@ -12,8 +12,8 @@ use thiserror::Error;
 use super::Ros2Options;
 use crate::bus::received::Counts;
 use crate::msgs::{
-    self, CdrError, DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration,
-    Waveform,
+    self, CdrError, DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent,
+    Temperature, Vibration, Waveform,
 };
 use crate::system::clock::Reading;
 
@@ -58,6 +58,10 @@ pub(super) enum FromSide {
     Vibration {
         at: Reading,
         message: Vibration,
+    },
+    Temperature {
+        at: Reading,
+        message: Temperature,
     },
     Waveform {
         at: Reading,

@@ -22,7 +22,8 @@ use super::{NOTE, Ros2Error, Ros2Options};
 use crate::bus::Bus;
 use crate::bus::received::{Counts, Received};
 use crate::msgs::{
-    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Vibration, Waveform, topic,
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Temperature, Vibration,
+    Waveform, topic,
 };
 
 /// The command that runs the ROS 2 side of a node.
@@ -57,6 +58,7 @@ type ParameterSink = Box<dyn FnMut(&str, f64) + Send>;
 pub struct Sinks {
     pub input: Box<dyn FnMut(Received<OperatingPoint>) + Send>,
     pub vibration: Box<dyn FnMut(Received<Vibration>) + Send>,
+    pub temperature: Box<dyn FnMut(Received<Temperature>) + Send>,
     pub waveform: Box<dyn FnMut(Received<Waveform>) + Send>,
     /// A peer set a parameter.
     pub parameter: ParameterSink,
@@ -411,6 +413,9 @@ impl Supervisor {
             FromSide::Refused(_) => {}
             FromSide::Input { at, message } => (self.sinks.input)(Received { bus: Bus::Ros2, at, message }),
             FromSide::Vibration { at, message } => (self.sinks.vibration)(Received { bus: Bus::Ros2, at, message }),
+            FromSide::Temperature { at, message } => {
+                (self.sinks.temperature)(Received { bus: Bus::Ros2, at, message });
+            }
             FromSide::Waveform { at, message } => (self.sinks.waveform)(Received { bus: Bus::Ros2, at, message }),
             FromSide::Parameter { name, value } => {
                 if let Some(parameter) = self.start.parameters.iter_mut().find(|(known, _)| *known == name) {

@@ -18,7 +18,7 @@ use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal,
 use serde::Serialize;
 
 use super::frame::{Frames, FromSide, MAX_TO_SIDE, Next, Start, Status, ToSide, encode};
-use super::{Parameters, Ros2, Ros2Error};
+use super::{Beside, Parameters, Ros2, Ros2Error};
 use crate::bus::received::Received;
 use crate::msgs::{MAX_WAVEFORM_SAMPLES, Prediction};
 use crate::system::memory;
@@ -121,7 +121,7 @@ fn contain() -> io::Result<()> {
 }
 
 fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNode) -> Result<Ros2, Ros2Error> {
-    let (inputs, vibrations, waveforms, parameters) = (node.clone(), node.clone(), node.clone(), node.clone());
+    let [inputs, vibrations, temperatures, waveforms, parameters] = std::array::from_fn(|_| node.clone());
     let parameters = Parameters {
         values: start.parameters,
         validate: Box::new(validate),
@@ -135,7 +135,14 @@ fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNo
         MAX_UNANSWERED,
         move |Received { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }),
         move |Received { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }),
-        Some(Box::new(move |Received { at, message, .. }| waveforms.send_block(&FromSide::Waveform { at, message }))),
+        Some(Beside {
+            temperature: Box::new(move |Received { at, message, .. }| {
+                temperatures.send_short(&FromSide::Temperature { at, message });
+            }),
+            waveform: Box::new(move |Received { at, message, .. }| {
+                waveforms.send_block(&FromSide::Waveform { at, message });
+            }),
+        }),
     )
 }
 

@@ -75,6 +75,10 @@ impl View<'_> {
                 format!("load {:.2} N", input.normal_load_n),
                 format!("speed {:.3} rad/s", input.disc_speed_rad_s),
             ]));
+            if let Some(seen) = &self.snapshot.temperature {
+                let stale = if seen.is_stale() { ", stale" } else { "" };
+                lines.extend(values(&[format!("temperature {:.1} C{stale}", seen.celsius)]));
+            }
         }
         let Some(prediction) = self.snapshot.prediction.as_ref().filter(|_| said.status.is_known()) else {
             return lines;

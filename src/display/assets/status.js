@@ -85,6 +85,7 @@ export class Status {
     put(at("load"), load.text(state.load), state.load);
     put(at("speed"), speed.text(state.speed), state.speed);
     put(at("unstable"), fixed(state.unstable, 0), state.unstable);
+    this.#temperature(state.temperature);
     put(at("age"), known(age) ? fixed(age, 1) : "none yet", age);
     at("age-unit").hidden = !known(age);
     put(at("seq"), known(state.seq) ? String(state.seq) : NONE, state.seq);
@@ -96,6 +97,15 @@ export class Status {
       put(at("counters"), words.join(", "));
     }
     this.#trend(state);
+  }
+
+  /** The temperature of the contact, if one was received; the rig's own where it follows with a dead-band. */
+  #temperature(temperature) {
+    at("temperature-fact").hidden = !temperature;
+    if (!temperature) return;
+    const { celsius, of_rig: ofRig, stale } = temperature;
+    put(at("temperature"), fixed(celsius, 1), celsius);
+    put(at("temperature-note"), stale ? "°C, stale" : known(ofRig) ? `°C, rig at ${fixed(ofRig, 1)}` : "°C");
   }
 
   /** The present or next squeal: the modes, their frequency, the friction coefficient, and the part that moves. */

@@ -36,6 +36,7 @@ struct Repeated {
 enum InForce {
     Rig,
     Setting(String),
+    Temperature,
     StabilityMap,
     /// The window ends of that map.
     WindowEnds,
@@ -48,6 +49,7 @@ impl InForce {
             Payload::RigInfo(_) => Some(Self::Rig),
             Payload::SessionEvent(event) => match SessionEventKind::of(event)? {
                 SessionEventKind::Parameter => Some(Self::Setting(event.name.clone())),
+                SessionEventKind::Temperature => Some(Self::Temperature),
                 SessionEventKind::StabilityMap => Some(Self::StabilityMap),
                 SessionEventKind::WindowEnds => Some(Self::WindowEnds),
                 SessionEventKind::Chart => Some(Self::Chart),
@@ -60,7 +62,18 @@ impl InForce {
             | Payload::Diagnostics(_)
             | Payload::Vibration(_)
             | Payload::Waveform(_)
-            | Payload::Heard(_) => None,
+            | Payload::Heard(_)
+            | Payload::Temperature(_) => None,
+        }
+    }
+
+    /// Those that no longer hold once this one changes: window ends belong to their map, and everything that was computed
+    /// belongs to the rig at its temperature.
+    fn outdates(&self) -> &'static [Self] {
+        match self {
+            Self::StabilityMap => &[Self::WindowEnds],
+            Self::Temperature => &[Self::StabilityMap, Self::WindowEnds, Self::Chart],
+            Self::Rig | Self::Setting(_) | Self::WindowEnds | Self::Chart => &[],
         }
     }
 }
@@ -190,9 +203,8 @@ impl Worker {
             self.repeat(message.log_time_ns);
         }
         if let Some(kind) = InForce::of(&message.payload) {
-            // Window ends belong to their map.
-            if kind == InForce::StabilityMap {
-                self.in_force.remove(&InForce::WindowEnds);
+            for outdated in kind.outdates() {
+                self.in_force.remove(outdated);
             }
             let repeated = Repeated { topic, publish_time_ns: message.publish_time_ns, cdr: cdr.clone() };
             self.in_force.insert(kind, repeated);
