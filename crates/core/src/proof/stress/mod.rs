@@ -15,9 +15,13 @@
 //! | speed towards zero | lateral damping grows as `μN/v`, modes become static; below 0.01 rad/s `μ` is taken as 0 |
 //! | matrices far from normal | bounds grow with the condition numbers of the roots |
 //! | other order of nodes and modes, other signs or units | the same roots within their bounds |
+//! | pairs that open and close | see [`contact`] |
+//! | a disc at its critical speed | a wave stands still in the pad's frame; its root is known to rounding, or the solve is an error |
 //!
 //! Where rounding leaves no accurate digits, a solve is an error (a residual or trace exceeds its limit), never a
 //! wrong number.
+
+mod contact;
 
 use faer::{Mat, c64};
 
@@ -39,24 +43,32 @@ pub struct Case {
     pub run: fn() -> Result<String, String>,
 }
 
+impl Case {
+    fn new(what: &'static str, run: fn() -> Result<String, String>) -> Self {
+        Self { what, run }
+    }
+}
+
 /// All cases.
 pub fn cases() -> Vec<Case> {
-    let case = |what, run| Case { what, run };
-    vec![
-        case("at, and 1e-16 to 1e-2 away from, every merging point", merging_points),
-        case("three modes meeting, 0 and 1e-16 to 1e-2 apart", three_modes),
-        case("disc doublets split by 1e-12", doublets),
-        case("free modes, contact closed and open", free_modes),
-        case("static divergence, damped and undamped", divergence),
-        case("contact stiffness 1e-6 to 1e12 times nominal", contact_stiffness),
-        case("frequencies scaled by 1e-10 to 1e10", scales),
-        case("friction coefficients from -20 to 20", friction),
-        case("load towards zero", vanishing_load),
-        case("speed towards zero, lateral friction without bound", vanishing_speed),
-        case("matrices far from normal, departures 1 to 1e8", non_normal),
-        case("nodes and modes permuted, modes sign-flipped", permuted),
-        case("a scan of 100 000 friction coefficients, 20 modes", scanned),
-    ]
+    let mut cases = vec![
+        Case::new("at, and 1e-16 to 1e-2 away from, every merging point", merging_points),
+        Case::new("three modes meeting, 0 and 1e-16 to 1e-2 apart", three_modes),
+        Case::new("disc doublets split by 1e-12", doublets),
+        Case::new("free modes, contact closed and open", free_modes),
+        Case::new("static divergence, damped and undamped", divergence),
+        Case::new("contact stiffness 1e-6 to 1e12 times nominal", contact_stiffness),
+        Case::new("frequencies scaled by 1e-10 to 1e10", scales),
+        Case::new("friction coefficients from -20 to 20", friction),
+        Case::new("load towards zero", vanishing_load),
+        Case::new("speed towards zero, lateral friction without bound", vanishing_speed),
+        Case::new("matrices far from normal, departures 1 to 1e8", non_normal),
+        Case::new("nodes and modes permuted, modes sign-flipped", permuted),
+        Case::new("a disc at and near its critical speed", critical_speed),
+        Case::new("a scan of 100 000 friction coefficients, 20 modes", scanned),
+    ];
+    cases.extend(contact::cases());
+    cases
 }
 
 const REFERENCE: OperatingPoint =
@@ -361,6 +373,49 @@ fn vanishing_speed() -> Result<String, String> {
         }
     }
     Ok(format!("up to {statics} static roots; {}", checked.said()))
+}
+
+/// Waves of `m` diameters and frequency `ω` on a disc that turns with `Ω`, in the pad's frame: `λ = ±i(ω ± mΩ)`. At
+/// `Ω = ω/m` the wave that runs against the rotation stands still.
+fn critical_speed() -> Result<String, String> {
+    let mut checked = Checked::default();
+    let (omega, m) = (6.0, 3.0);
+    let of_speed = |matrix: Mat<f64>, power| Term { matrix, law: Law::DiscSpeed { power } };
+    let constant =
+        Term { matrix: Mat::from_fn(2, 2, |i, j| if i == j { omega * omega } else { 0.0 }), law: Law::Constant };
+    let spin = of_speed(Mat::from_fn(2, 2, |i, j| if i == j { -m * m } else { 0.0 }), 2);
+    let gyroscopic = of_speed(faer::mat![[0.0, 2.0 * m], [-2.0 * m, 0.0]], 1);
+    let model = Model::new(2, vec![constant, spin], vec![gyroscopic], ContactLaw::default(), None).map_err(text)?;
+    let critical = omega / m;
+    let (mut largest, mut refused): (f64, u32) = (0.0, 0);
+    for off in distances() {
+        for sign in [1.0, -1.0] {
+            let p = OperatingPoint { disc_speed_rad_s: sign * (critical + off), ..REFERENCE };
+            // Below 1e-12 only rounding is left of the slow wave, so a solve may be an error.
+            let near = off.abs() < 1e-12;
+            let roots = match Solver::new(2).solve(&model, &p, Vectors::Both) {
+                Ok(spectrum) => spectrum.roots,
+                Err(_) if near => {
+                    refused += 1;
+                    continue;
+                }
+                Err(error) => return Err(format!("{p:?}: {error}")),
+            };
+            if !near {
+                checked.solve(&model, &p)?;
+            }
+            for root in &roots {
+                let waves = [omega - m * p.disc_speed_rad_s, omega + m * p.disc_speed_rad_s];
+                let errors = waves.map(|wave| (root.square + c64::new(wave * wave, 0.0)).norm());
+                let error = errors[0].min(errors[1]);
+                if error > root.error.square {
+                    return Err(format!("{p:?}: λ² of {root:?} is off by {error:e}"));
+                }
+                largest = largest.max(error);
+            }
+        }
+    }
+    Ok(format!("λ² within {largest:.1e} of (ω ± mΩ)², {refused} refused; {}", checked.said()))
 }
 
 /// Blocks `[[1, b], [0, 1 + g]]`, transformed by random reflections; condition number `√(1 + b²/g²)`.
