@@ -8,7 +8,7 @@ use super::on_basis::{Ranges, TOLERANCE, basis_of};
 use super::signals::on_stop;
 use super::steps::ProgressOptions;
 use super::{Outcome, positive, write_file};
-use crate::export::write_full_model;
+use crate::export::{Besides, write_full_model};
 use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::files::whole_file::remove_begun;
 use crate::full_model::FullModelFile;
@@ -58,7 +58,7 @@ impl Options {
         let mut steps = self.progress.steps(2);
         let folder = self.output.join("tribometer");
         let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
-        write_full_model(&tribometer, false, &folder, |_| ())?;
+        write_full_model(&tribometer, Besides::default(), &folder, |_| ())?;
         steps.say(&format!("{} written", folder.display()));
         let full = FullModelFile::load(&folder.join("tribometer.toml"))?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));

@@ -4,7 +4,7 @@ use clap::Args;
 
 use super::Outcome;
 use super::signals::on_stop;
-use crate::export::write_full_model;
+use crate::export::{Besides, write_full_model};
 use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::files::whole_file::remove_begun;
 
@@ -20,6 +20,10 @@ pub struct Options {
     /// Also write the matrices of the disc that turns in the frame of the pad: gyroscopic, spin and stress-stiffening terms
     #[arg(long)]
     rotation: bool,
+    /// Let the contact pairs follow the state of steady sliding by the law of a friction lining, under a load on the top of
+    /// the spring holder; without it their springs are always closed
+    #[arg(long)]
+    lining: bool,
     /// Folder to write into
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
@@ -35,9 +39,8 @@ impl Options {
         let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
         let (pad, disc) = (tribometer.pad.structure.dof(), tribometer.disc.structure.dof());
         note!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());
-        write_full_model(&tribometer, self.rotation, &self.output, |file| {
-            note!("{}", self.output.join(file).display())
-        })?;
+        let besides = Besides { rotation: self.rotation, lining: self.lining };
+        write_full_model(&tribometer, besides, &self.output, |file| note!("{}", self.output.join(file).display()))?;
         Ok(Outcome::Done)
     }
 }

@@ -13,7 +13,7 @@ mod vtk;
 pub use basis::basis_rig;
 pub use calculix::write_deck;
 pub use error::ExportError;
-pub use full_model::write_full_model;
+pub use full_model::{Besides, write_full_model};
 pub use matrix_market::{write_skew, write_symmetric};
 pub use rig::{HASH_DIGITS, ModalSide, modal_rig, modal_sides, source_remarks};
 pub use state::{StateOfRig, state_on_basis, state_on_modes};

@@ -28,7 +28,7 @@ macro_rules! embedded {
 
 /// All embedded rigs. The first is the default of `run` and `demo`. A static: of a constant, the program would hold a copy of
 /// all files for each use.
-pub static EMBEDDED: [Embedded; 9] = [
+pub static EMBEDDED: [Embedded; 10] = [
     embedded!(
         "tribometer",
         "pad-on-disc tribometer of 22032 degrees of freedom on a basis of 55 vectors (default)",
@@ -41,6 +41,13 @@ pub static EMBEDDED: [Embedded; 9] = [
         "tribometer-80+80-pad-a17eb7113e19.npz",
         "tribometer-80+80-disc-694d2050be74.npz",
         "tribometer-80+80-residual-c3ebf5556a34.npz"
+    ),
+    embedded!(
+        "tribometer-lining",
+        "the same tribometer on 40 modes of each part, with a lining whose stiffness follows the load",
+        "tribometer-lining-pad-e276271e8232.npz",
+        "tribometer-lining-disc-11354b9969ed.npz",
+        "tribometer-lining-residual-a70ab997edd5.npz"
     ),
     embedded!(
         "rough-pad",

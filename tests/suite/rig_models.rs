@@ -164,6 +164,7 @@ fn every_embedded_rig_loads_and_describes_itself() {
         let rig = Rig::load(embedded.name).unwrap();
         let (mu_max, description) = match embedded.name {
             "rough-pad" => (1.0, "7 pairs"),
+            "tribometer-lining" => (0.6, "294 pairs"),
             name if name.starts_with("tribometer") => (1.0, "294 pairs"),
             _ => (20.0, "2 pairs"),
         };

@@ -130,3 +130,27 @@ fn the_embedded_rigs_stand_for_the_default_tribometer() {
     let args = ["verify", "tribometer", "--against", &text(&path), "--points", "1", "--seed", "7", "--no-windows"];
     run(args.into_iter().chain(["--tolerance", "1e-6"])).exits(0);
 }
+
+/// The contact of the rig with a lining follows the load: at a friction coefficient of 0.19 it squeals at 500 N, and not at 200 N
+/// or 1000 N. The contact force is the load in the full model as in the embedded rig, which was compared with its full model at
+/// held-out points.
+#[test]
+fn the_load_on_a_lining_decides_whether_it_squeals() {
+    let temp = tempfile::tempdir().unwrap();
+    let folder = text(&temp.path().join("lining"));
+    run(["tribometer", "--lining", "--dof", "5000", "-o", &folder]).exits(0);
+    let full = run(["full", &format!("{folder}/tribometer.toml"), "--mu", "0.3", "--load", "500", "--band-hz", "1500"]);
+    let full = full.exits(0).stdout;
+    assert!(full.contains("294 of 294 pairs closed, contact force 500.000 N"), "{full}");
+    let rig = Rig::load("tribometer-lining").unwrap();
+    let certificate = rig.reduction.as_ref().expect("it was compared with its full model");
+    assert_eq!((certificate.missed, certificate.invented), (0, 0));
+    let squeals = |load: &str| {
+        let found = run(["predict", "tribometer-lining", "--load", load, "--mu", "0.19", "--json"]).exits(0).stdout;
+        let found: serde_json::Value = serde_json::from_str(&found).unwrap();
+        let force = found["contact"]["contact_force_n"].as_f64().unwrap();
+        assert!((force / load.parse::<f64>().unwrap() - 1.0).abs() < 1e-9, "{force} N at {load} N");
+        found["max_growth_rate_per_s"].as_f64().unwrap() > 1.0
+    };
+    assert_eq!(["200", "500", "1000"].map(squeals), [false, true, false]);
+}

@@ -167,13 +167,20 @@ pub struct Tribometer {
     pub pad: Part,
     /// The lower part: disc and holders.
     pub disc: Part,
+    /// Nodes of the upper part on which the normal load presses down: the top of the spring holder.
+    pub loaded: Vec<usize>,
+    /// Area of the pad's face, m².
+    pub contact_area_m2: f64,
 }
 
 impl Tribometer {
     /// The rig meshed with bricks of about `spacing_m`, m, away from the contact patch. The upper part is meshed more
     /// finely, because its column is thinner than the disc is wide.
     pub fn with_spacing(dimensions: &Dimensions, spacing_m: f64) -> Self {
-        Self { pad: upper_part(dimensions, 0.6 * spacing_m), disc: lower_part(dimensions, spacing_m) }
+        let (pad, loaded) = upper_part(dimensions, 0.6 * spacing_m);
+        let [from, to] = dimensions.pad_x;
+        let contact_area_m2 = (to - from) * 2.0 * dimensions.pad_half_z;
+        Self { pad, disc: lower_part(dimensions, spacing_m), loaded, contact_area_m2 }
     }
 
     /// The coarsest mesh found with at least `dof` degrees of freedom in both parts together.
@@ -269,8 +276,8 @@ fn between(lines: &[f64], from: f64, to: f64) -> Vec<f64> {
     lines.iter().copied().filter(|&line| line > from - NEAR && line < to + NEAR).collect()
 }
 
-/// The upper part, above the contact.
-fn upper_part(d: &Dimensions, spacing: f64) -> Part {
+/// The upper part, above the contact, and the nodes at its top.
+fn upper_part(d: &Dimensions, spacing: f64) -> (Part, Vec<usize>) {
     let [pad_x, pad_z] = patch_lines(d);
     let (bearing_z, plate_z) = (d.column_half[1] + d.bearing_depth, d.column_half[1] + d.bearing_depth + d.plate_depth);
     let halves = [d.pad_holder_half, d.column_half, d.cylinder_half, d.spring_holder_half];
@@ -321,11 +328,11 @@ fn upper_part(d: &Dimensions, spacing: f64) -> Part {
 
     let interface = level(&pad, 0).collect();
     let mut structure = Structure { mesh, ..Structure::default() };
-    let top = level(&spring_holder, spring_holder.counts()[1] - 1);
-    structure.fixed.extend(top.flat_map(|node| [(node, 0), (node, 2)]));
+    let top: Vec<usize> = level(&spring_holder, spring_holder.counts()[1] - 1).collect();
+    structure.fixed.extend(top.iter().flat_map(|&node| [(node, 0), (node, 2)]));
     hold_plate(&mut structure, &plate, [levels[4], levels[5]], d.bearing_half_x);
     join_cylinder(&mut structure, &cylinder, &spring_holder, levels[7], d.cylinder_half);
-    Part { structure, interface }
+    (Part { structure, interface }, top)
 }
 
 /// Adds the springs between the top of the cylinder and the spring holder above it: at the middle, the corners and the
