@@ -4,7 +4,9 @@ use serde_json::Value;
 use squealcast::msgs::{Waveform, heard_state};
 use squealcast::recording::reader::Recording;
 
-use super::{Content, Node, RIG, alone, peer, peer_program, read_by_others, say, say_versions, verify};
+use super::{
+    Content, Node, RIG, alone, peer, peer_program, peer_program_in, read_by_others, say, say_versions, verify,
+};
 
 const BLOCKS: usize = 141;
 
@@ -44,7 +46,17 @@ fn with_conditions(node: &Node, python: &std::path::Path) {
 
 #[test]
 fn a_squeal_in_samples_of_rclpy_is_found_published_and_recorded() {
-    let (Some(ros_python), Some(python)) = (peer_program("ros-python"), peer_program("python")) else { return };
+    rclpy_is_heard("");
+}
+
+#[test]
+fn a_squeal_in_samples_of_rclpy_of_jazzy_is_found_published_and_recorded() {
+    rclpy_is_heard("-jazzy");
+}
+
+/// `ros` is the suffix of the folder of peers.
+fn rclpy_is_heard(ros: &str) {
+    let (Some(ros_python), Some(python)) = (peer_program_in(ros, "ros-python"), peer_program("python")) else { return };
     let _alone = alone();
     say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
     let mut node = Node::start_with(RIG, true, &["--record-sound"]);
