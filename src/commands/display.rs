@@ -7,7 +7,7 @@ use clap::Args;
 use super::{finite, not_negative};
 use crate::display::comparison::Criteria;
 use crate::display::live::Live;
-use crate::display::server::{About, Server, Source};
+use crate::display::server::{About, Pages, Server};
 use crate::node::Watch;
 use crate::rig::Rig;
 
@@ -91,13 +91,13 @@ impl DisplayOptions {
     }
 }
 
-/// Serves `source` on the first free address of `addresses` and reports it; does nothing without addresses.
+/// Serves `pages` on the first free address of `addresses` and reports it; does nothing without addresses.
 ///
 /// # Errors
 /// None of the addresses is free.
-pub fn serve(addresses: &[SocketAddr], source: Arc<dyn Source>) -> anyhow::Result<Option<Server>> {
+pub fn serve(addresses: &[SocketAddr], pages: Pages) -> anyhow::Result<Option<Server>> {
     let Some(first) = addresses.first() else { return Ok(None) };
-    let server = Server::start(addresses, source)
+    let server = Server::start(addresses, pages)
         .with_context(|| format!("no display on {first}; another address with --display, none with --no-display"))?;
     note!("display: http://{}/", server.address());
     Ok(Some(server))
@@ -110,7 +110,8 @@ impl DisplayOptions {
     /// # Errors
     /// The address given by the user is taken.
     pub fn of_node(&self, rig: &Arc<Rig>, watch: &Watch, about: About) -> anyhow::Result<Option<Server>> {
-        match serve(&self.addresses()?, Arc::new(Live::new(rig.clone(), watch.clone(), about))) {
+        let live = Live::new(rig.clone(), watch.clone(), about);
+        match serve(&self.addresses()?, Pages::One(Arc::new(live))) {
             Err(error) if self.display.is_none() => {
                 note!("warning: {}", super::failure(&error));
                 Ok(None)

@@ -1,4 +1,4 @@
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::ensure;
@@ -11,11 +11,13 @@ use super::replay::recorded_rig;
 use super::{Outcome, signals};
 use crate::display::comparison::Criteria;
 use crate::display::recorded::Recorded;
+use crate::display::server::Pages;
+use crate::display::shelf::Shelf;
 use crate::msgs::schema::Topic;
 use crate::recording::reader::Recording;
 use crate::rig::Rig;
 
-/// Show a recording on the page, with a time line
+/// Show recordings on the page, with a time line. Of several, the page shows the last by name and lets you choose
 #[derive(Debug, Args)]
 pub struct Options {
     #[command(flatten)]
@@ -54,20 +56,49 @@ pub fn read(
     Ok(recorded)
 }
 
+/// How the page names recordings: by their own names, or, if two have the same, by their paths.
+fn names(paths: &[PathBuf]) -> Vec<String> {
+    let own = |path: &PathBuf| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+    let names: Vec<String> = paths.iter().map(own).collect();
+    let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
+    if distinct.len() == names.len() { names } else { paths.iter().map(|path| path.display().to_string()).collect() }
+}
+
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let addresses = self.display.addresses()?;
         ensure!(!addresses.is_empty(), "--no-display leaves nothing to view");
-        let (path, recording) = self.recordings.only()?;
-        let recorded = read(&path, &Arc::new(recording), self.rig.as_deref(), self.criteria.criteria())?;
+        let pages = self.pages()?;
         let (stop, stopped) = bounded::<()>(1);
         signals::on_stop(move || {
             // The receiver may have gone: the command has then stopped already.
             let _ = stop.send(());
         })?;
-        let server = display::serve(&addresses, Arc::new(recorded))?;
+        let server = display::serve(&addresses, pages)?;
         let _ = stopped.recv();
         drop(server);
         Ok(Outcome::Done)
+    }
+
+    /// The page of one recording, or those of several, which are read when they are looked at.
+    fn pages(self) -> anyhow::Result<Pages> {
+        let Self { recordings, rig, criteria, .. } = self;
+        let paths = recordings.paths()?;
+        let names = names(&paths);
+        let open = move |path: &Path| {
+            let recording = Arc::new(recordings.open(path)?);
+            read(path, &recording, rig.as_deref(), criteria.criteria())
+        };
+        if let [path] = &paths[..] {
+            return Ok(Pages::One(Arc::new(open(path)?)));
+        }
+        note!("{} recordings: the page begins with the last, {}", paths.len(), names[names.len() - 1]);
+        Ok(Pages::Recordings(Shelf::new(
+            names,
+            Box::new(move |index| match open(&paths[index]) {
+                Ok(recorded) => Ok(Arc::new(recorded)),
+                Err(error) => Err(super::failure(&error)),
+            }),
+        )))
     }
 }

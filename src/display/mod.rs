@@ -21,6 +21,7 @@ pub mod report;
 mod running_score;
 pub mod server;
 pub mod shape;
+pub mod shelf;
 mod sound_detail;
 pub mod sound_page;
 mod sound_report;

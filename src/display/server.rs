@@ -1,4 +1,4 @@
-//! Serves a [`Source`] to browsers: HTTP/1.1, GET only, with one stream of states.
+//! Serves [`Pages`] to browsers: HTTP/1.1, GET only, with one stream of states.
 //!
 //! Runs on its own thread. A state is encoded once for all pages, at most 30 times a second. A page that reads too
 //! slowly misses states. `connections` limits what clients can use. No request changes anything.
@@ -12,11 +12,11 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::body::Body;
-use axum::extract::{Query, Request, State as Shared};
+use axum::extract::{Extension, Query, RawPathParams, Request, State as Shared};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::sse::{Event as Sent, Sse};
-use axum::response::{IntoResponse, Response};
+use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::get;
 use serde::{Deserialize, Serialize};
 use tokio::net::TcpListener;
@@ -30,6 +30,7 @@ use super::comparison::Comparison;
 use super::connections::{self, Bounds};
 use super::events::{Events, PageColumn, page_columns};
 use super::heard::SquealsInSound;
+use super::shelf::Shelf;
 use super::sound_page::{SoundShown, SpectrogramPicture};
 use crate::node::status::InputSources;
 use crate::rig::Rig;
@@ -75,6 +76,13 @@ pub trait Source: Send + Sync + 'static {
     /// # Errors
     /// Why it is not known.
     fn contact(&self, at_s: Option<f64>) -> Result<String, String>;
+}
+
+/// What a server shows.
+pub enum Pages {
+    One(Arc<dyn Source>),
+    /// Several recordings, each below its number, from 1.
+    Recordings(Shelf),
 }
 
 /// Constant properties of a source.
@@ -145,11 +153,11 @@ pub struct Server {
 }
 
 impl Server {
-    /// Serves `source` on the first free address of `addresses`.
+    /// Serves `pages` on the first free address of `addresses`.
     ///
     /// # Errors
     /// No address is free, or the system cannot provide a runtime.
-    pub fn start(addresses: &[SocketAddr], source: Arc<dyn Source>) -> io::Result<Self> {
+    pub fn start(addresses: &[SocketAddr], pages: Pages) -> io::Result<Self> {
         // Few threads for blocking work, since the allocator keeps memory for each.
         let mut runtime = tokio::runtime::Builder::new_current_thread();
         let runtime = runtime.enable_io().enable_time().max_blocking_threads(BLOCKING_THREADS).build()?;
@@ -161,7 +169,7 @@ impl Server {
             // niceness; a refusal of the system has no other effect.
             let _ = rustix::process::nice(5);
             runtime.block_on(async {
-                tokio::select! { () = serve(listener, address, source) => {}, _ = stopped => {} }
+                tokio::select! { () = serve(listener, address, pages) => {}, _ = stopped => {} }
             });
             runtime.shutdown_background();
         })?;
@@ -185,15 +193,15 @@ impl Drop for Server {
 
 #[derive(Clone)]
 struct App {
-    source: Arc<dyn Source>,
+    pages: Arc<Pages>,
     states: watch::Sender<Arc<str>>,
     listeners: Arc<AtomicUsize>,
     address: SocketAddr,
 }
 
-async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Source>) {
-    let app = App { source, states: watch::Sender::new("".into()), listeners: Arc::default(), address };
-    let router = Router::new()
+async fn serve(listener: TcpListener, address: SocketAddr, pages: Pages) {
+    let app = App { pages: Arc::new(pages), states: watch::Sender::new("".into()), listeners: Arc::default(), address };
+    let page = Router::new()
         .route("/stream", get(stream))
         .route("/about.json", get(about))
         .route("/state.json", get(state))
@@ -207,22 +215,74 @@ async fn serve(listener: TcpListener, address: SocketAddr, source: Arc<dyn Sourc
         .route("/map.json", get(map))
         .route("/shape.json", get(shape))
         .route("/contact.json", get(contact))
-        .fallback(get(asset))
-        .layer(from_fn_with_state(app.clone(), guard))
-        .with_state(app.clone());
+        .route_layer(from_fn_with_state(app.clone(), choose))
+        // Neither needs a recording to be open.
+        .route("/recordings.json", get(recordings))
+        .route("/", get(asset))
+        .route("/{file}", get(asset))
+        .route("/vendor/{file}", get(asset));
+    let router = match &*app.pages {
+        Pages::One(_) => page,
+        Pages::Recordings(shelf) => {
+            // The last by name, which of sessions is the latest.
+            let last = format!("/{}/", shelf.names().len());
+            Router::new().route("/", get(async move || Redirect::temporary(&last))).nest("/{number}/", page)
+        }
+    };
+    let router = router.layer(from_fn_with_state(app.clone(), guard)).with_state(app.clone());
     tokio::select! {
         () = connections::serve(listener, router, Bounds::default()) => {}
         () = send_states(app) => {}
     }
 }
 
+/// The number of the recording in the path of a request.
+fn number(path: &RawPathParams) -> Option<usize> {
+    path.iter().find(|(name, _)| *name == "number")?.1.parse().ok()
+}
+
+/// Hands the source that a request is about to its handler.
+async fn choose(Shared(app): Shared<App>, path: RawPathParams, mut request: Request, next: Next) -> Response {
+    let source = match &*app.pages {
+        Pages::One(source) => Ok(source.clone()),
+        Pages::Recordings(_) => {
+            let (pages, number) = (app.pages.clone(), number(&path));
+            let opened = tokio::task::spawn_blocking(move || match &*pages {
+                Pages::One(source) => Ok(source.clone()),
+                Pages::Recordings(shelf) => shelf.source(number),
+            });
+            opened.await.unwrap_or_else(|_| Err("the recording cannot be read".to_owned()))
+        }
+    };
+    match source {
+        Ok(source) => {
+            request.extensions_mut().insert(source);
+            next.run(request).await
+        }
+        Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
+    }
+}
+
+/// The names of the recordings, and the number of the one of this page; none if the server has only one page.
+async fn recordings(Shared(app): Shared<App>, path: RawPathParams) -> Response {
+    let names = match &*app.pages {
+        Pages::One(_) => &[][..],
+        Pages::Recordings(shelf) => shelf.names(),
+    };
+    json(serde_json::json!({ "names": names, "number": number(&path) }).to_string())
+}
+
 async fn send_states(app: App) {
+    let Pages::One(source) = &*app.pages else {
+        // Recordings have nothing to send.
+        return std::future::pending().await;
+    };
     let mut ticks = interval(EVERY);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         ticks.tick().await;
         let listened_to = app.listeners.load(Ordering::Relaxed) > 0;
-        if let Some(state) = app.source.tick(listened_to) {
+        if let Some(state) = source.tick(listened_to) {
             app.states.send_replace(state.into());
         }
     }
@@ -309,33 +369,33 @@ struct ShapeAsked {
     at: Option<f64>,
 }
 
-async fn about(Shared(app): Shared<App>) -> Response {
-    json(serde_json::to_string(&app.source.about()).unwrap_or_default())
+async fn about(Extension(source): Extension<Arc<dyn Source>>) -> Response {
+    json(serde_json::to_string(&source.about()).unwrap_or_default())
 }
 
-async fn state(Shared(app): Shared<App>, Query(moment): Query<Moment>) -> Response {
-    aside(move || json(app.source.state(moment.at))).await
+async fn state(Extension(source): Extension<Arc<dyn Source>>, Query(moment): Query<Moment>) -> Response {
+    aside(move || json(source.state(moment.at))).await
 }
 
-async fn history(Shared(app): Shared<App>) -> Response {
-    aside(move || json(app.source.history())).await
+async fn history(Extension(source): Extension<Arc<dyn Source>>) -> Response {
+    aside(move || json(source.history())).await
 }
 
-async fn comparison(Shared(app): Shared<App>) -> Response {
-    aside(move || json(serde_json::to_string(&app.source.comparison()).unwrap_or_default())).await
+async fn comparison(Extension(source): Extension<Arc<dyn Source>>) -> Response {
+    aside(move || json(serde_json::to_string(&source.comparison()).unwrap_or_default())).await
 }
 
-async fn events_json(Shared(app): Shared<App>) -> Response {
+async fn events_json(Extension(source): Extension<Arc<dyn Source>>) -> Response {
     aside(move || {
-        let events = app.source.events();
+        let events = source.events();
         let shown: Vec<_> = events.iter().collect();
         json(serde_json::to_string(&shown).unwrap_or_default())
     })
     .await
 }
 
-async fn squeals_in_sound(Shared(app): Shared<App>) -> Response {
-    aside(move || json(app.source.squeals_in_sound().to_json())).await
+async fn squeals_in_sound(Extension(source): Extension<Arc<dyn Source>>) -> Response {
+    aside(move || json(source.squeals_in_sound().to_json())).await
 }
 
 #[derive(Deserialize)]
@@ -370,16 +430,16 @@ impl SpectrogramAsked {
     }
 }
 
-async fn sound(Shared(app): Shared<App>) -> Response {
-    aside(move || json(serde_json::to_string(&app.source.sound()).unwrap_or_default())).await
+async fn sound(Extension(source): Extension<Arc<dyn Source>>) -> Response {
+    aside(move || json(serde_json::to_string(&source.sound()).unwrap_or_default())).await
 }
 
-async fn spectrogram(Shared(app): Shared<App>, Query(asked): Query<SpectrogramAsked>) -> Response {
+async fn spectrogram(Extension(source): Extension<Arc<dyn Source>>, Query(asked): Query<SpectrogramAsked>) -> Response {
     let part = match asked.part() {
         Ok(part) => part,
         Err(reason) => return (StatusCode::BAD_REQUEST, reason).into_response(),
     };
-    aside(move || match app.source.spectrogram(&asked.channel, part) {
+    aside(move || match source.spectrogram(&asked.channel, part) {
         Some(picture) => {
             // Numbers only, so it is a valid header.
             let covers = serde_json::to_string(&picture.covers).unwrap_or_default();
@@ -392,35 +452,35 @@ async fn spectrogram(Shared(app): Shared<App>, Query(asked): Query<SpectrogramAs
     .await
 }
 
-async fn events_csv(Shared(app): Shared<App>) -> Response {
+async fn events_csv(Extension(source): Extension<Arc<dyn Source>>) -> Response {
     aside(move || {
         let headers = [
             (header::CONTENT_TYPE, "text/csv; charset=utf-8"),
             (header::CONTENT_DISPOSITION, "attachment; filename=\"squealcast-events.csv\""),
         ];
-        (headers, app.source.events().to_csv()).into_response()
+        (headers, source.events().to_csv()).into_response()
     })
     .await
 }
 
-async fn map(Shared(app): Shared<App>, Query(asked): Query<MapAsked>) -> Response {
-    aside(move || match app.source.map(asked.number) {
+async fn map(Extension(source): Extension<Arc<dyn Source>>, Query(asked): Query<MapAsked>) -> Response {
+    aside(move || match source.map(asked.number) {
         Some(curves) => json(curves.to_string()),
         None => (StatusCode::NOT_FOUND, "no such stability map").into_response(),
     })
     .await
 }
 
-async fn shape(Shared(app): Shared<App>, Query(asked): Query<ShapeAsked>) -> Response {
-    aside(move || match app.source.shape(asked.id, asked.at) {
+async fn shape(Extension(source): Extension<Arc<dyn Source>>, Query(asked): Query<ShapeAsked>) -> Response {
+    aside(move || match source.shape(asked.id, asked.at) {
         Ok(shape) => json(shape),
         Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
     })
     .await
 }
 
-async fn contact(Shared(app): Shared<App>, Query(asked): Query<Moment>) -> Response {
-    aside(move || match app.source.contact(asked.at) {
+async fn contact(Extension(source): Extension<Arc<dyn Source>>, Query(asked): Query<Moment>) -> Response {
+    aside(move || match source.contact(asked.at) {
         Ok(contact) => json(contact),
         Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
     })

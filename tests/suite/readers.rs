@@ -339,7 +339,7 @@ fn commands_take_a_folder_of_sessions() {
         bag(&folder.path().join("conditions.mcap"), &[written("/rig/operating_point", T0, point(0, T0, 1.0, 0.1))]);
     let failed = run(["replay", "--verify", &empty, first]).exits(1).says("100 predictions identical");
     failed.complains("1 of 2 recordings could not be verified");
-    run(["view", first, second]).exits(1).complains("2 recordings are given, expected one");
+    run(["replay", first, second]).exits(1).complains("2 recordings are given, expected one");
     let played = ["replay", &sessions, "--no-ros", "--shm-prefix", "test-several/", "--wait", "0", "--rate", "100"];
     run(played).exits(0).complains("2 recordings: the last by name").complains(second);
 }

@@ -21,7 +21,21 @@ const ask = async (path) => {
 /** Interval between updates of the numbers, ms: faster changes cannot be read. */
 const NUMBERS_EVERY = 300;
 
-const about = await ask("about.json");
+// Of several recordings each has its page below its number.
+if (/\/\d+\/$/.test(location.pathname)) {
+  const { names, number } = await ask("recordings.json");
+  const choice = at("recordings");
+  choice.append(...names.map((name, k) => new Option(name, k + 1, false, k + 1 === number)));
+  choice.closest("label").hidden = false;
+  choice.addEventListener("change", () => location.assign(`../${choice.value}/`));
+}
+const about = await ask("about.json").catch((error) => {
+  at("level").textContent = "NO DATA";
+  at("reason").textContent = error.message;
+  at("link").dataset.link = "gone";
+  at("link-text").textContent = "not shown";
+  throw error;
+});
 const recording = about.kind === "recording";
 at("rig").textContent = about.rig;
 at("simulated").hidden = !about.simulated;

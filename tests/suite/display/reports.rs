@@ -69,6 +69,51 @@ fn a_long_recording_opens_at_once_and_is_reported() {
     assert_eq!(csv.lines().count(), 1 + squeals);
 }
 
+/// Several recordings have a page each, below a number, and are read when they are looked at.
+#[test]
+fn several_recordings_have_a_page_each() {
+    let _alone = alone();
+    let directory = tempfile::tempdir().unwrap();
+    let at = |name: &str| directory.path().join(name);
+    let rigs = ["nine-dof", "nine-dof-case-2", "nine-dof-3+2", "nine-dof-case-2"];
+    for (k, rig) in rigs.iter().enumerate() {
+        let simulated = Command::new(env!("CARGO_BIN_EXE_squealcast"))
+            .args(["simulate", "--rate", "20", "--duration", "2", "--rig", rig, "--record"])
+            .arg(at("made"))
+            .output()
+            .unwrap();
+        assert!(simulated.status.success(), "{}", String::from_utf8_lossy(&simulated.stderr));
+        let made = std::fs::read_dir(at("made")).unwrap().next().unwrap().unwrap().path();
+        std::fs::rename(made, at(&format!("session-{}", k + 1))).unwrap();
+    }
+    std::fs::remove_dir(at("made")).unwrap();
+    std::fs::create_dir(at("session-9")).unwrap();
+    std::fs::write(at("session-9").join("part_0.mcap"), b"\x89MCAP0\r\n").unwrap();
+
+    let shown = Shown::start(&["view", directory.path().to_str().unwrap()]);
+    let (status, head, _) = shown.get("/");
+    assert!(status == 307 && head.contains("location: /5/"), "{status} {head}");
+    let json = |path: &str| -> serde_json::Value { serde_json::from_str(&shown.get(path).2).unwrap() };
+    let names = ["session-1", "session-2", "session-3", "session-4", "session-9"];
+    assert_eq!(json("/2/recordings.json"), serde_json::json!({ "names": names, "number": 2 }));
+    // More than are kept in memory, and back.
+    for number in [1, 2, 3, 4, 1] {
+        assert_eq!(json(&format!("/{number}/about.json"))["rig"], rigs[number - 1]);
+        assert_eq!(json(&format!("/{number}/state.json"))["seq"], 0);
+    }
+    for none in ["/0/about.json", "/6/about.json", "/x/about.json", "/about.json"] {
+        assert_eq!(shown.get(none).0, 404, "{none}");
+    }
+    let (status, _, reason) = shown.get("/5/about.json");
+    assert!(status == 404 && reason.contains("session-9"), "{status} {reason}");
+    if browser_ready() {
+        let names = serde_json::json!(names).to_string();
+        let seen = browse("recordings.mjs", &[&format!("http://{}/", shown.address), &names]);
+        assert_eq!(seen["rigs"], serde_json::json!(rigs));
+    }
+    shown.stop();
+}
+
 #[test]
 fn a_recording_of_faults_is_not_called_quiet() {
     let directory = tempfile::tempdir().unwrap();
