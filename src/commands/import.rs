@@ -27,12 +27,12 @@ pub struct Options {
 /// How a tribometer's log is read
 #[derive(Clone, Debug, Args)]
 pub struct LogArgs {
-    /// Take a quantity from a column by its name: time_s, normal_load_n, disc_speed_rad_s, friction_coefficient or
-    /// friction_force_n. `-NAME` reverses the sign, as of a load that is negative where it presses
+    /// Take a quantity from a column by its name: time_s, normal_load_n, disc_speed_rad_s, friction_coefficient,
+    /// friction_force_n or temperature_c. `-NAME` reverses the sign, as of a load that is negative where it presses
     #[arg(long = "column", value_name = "QUANTITY=NAME", value_parser = column)]
     columns: Vec<(Field, String)>,
-    /// A quantity that is not in the log, of the same value in every line: normal_load_n, disc_speed_rad_s or
-    /// friction_coefficient
+    /// A quantity that is not in the log, of the same value in every line: normal_load_n, disc_speed_rad_s,
+    /// friction_coefficient or temperature_c
     #[arg(long = "constant", value_name = "QUANTITY=VALUE", value_parser = constant)]
     constants: Vec<(Field, f64)>,
     /// Distance from the disc's axis at which a sliding speed in m/s was measured, m
@@ -97,8 +97,12 @@ impl Options {
         let path = imported.path.display();
         let points = imported.log.samples.len() as u64;
         note!("{path}: {points} operating points");
-        if imported.messages > points {
-            note!("{path}: {} blocks of samples", imported.messages - points);
+        let temperatures = imported.log.samples.iter().filter(|sample| sample.temperature_c.is_some()).count() as u64;
+        if temperatures > 0 {
+            note!("{path}: {temperatures} temperatures");
+        }
+        if imported.messages > points + temperatures {
+            note!("{path}: {} blocks of samples", imported.messages - points - temperatures);
         }
         note!("to predict them: squealcast predict-log {path} --rig RIG -o DIR");
         Ok(outcome)

@@ -11,7 +11,7 @@ use super::sound_files::SoundFileArgs;
 use super::{Outcome, print};
 use crate::files::chart_file::ChartFile;
 use crate::import::sound_blocks::{Beside, join};
-use crate::import::{operating_point, read_log};
+use crate::import::{operating_point, read_log, temperature};
 use crate::msgs::schema::Topic;
 use crate::node::kept_chart;
 use crate::offline::{self, Measured, Predicted, Quantity, SoundFound};
@@ -131,9 +131,13 @@ impl Options {
         let settings = self.sound.is_given().then(|| self.detection.settings());
         let mut sound = self.sound.open(path, log.samples.first().map_or(0, |first| first.stamp_ns), settings)?;
         let inputs = || log.samples.iter().zip(0..).map(|(sample, seq)| operating_point(seq, sample));
-        let timed = inputs().map(|input| (input.header.stamp.as_ns(), input));
+        let timed = inputs().zip(&log.samples).flat_map(|(input, sample)| {
+            let heat = temperature(sample).map(Quantity::Temperature);
+            let quantities = heat.into_iter().chain([Quantity::Conditions(input)]);
+            quantities.map(|quantity| (sample.stamp_ns, quantity))
+        });
         let measured = join(timed, &mut sound.blocks).map(|beside| match beside {
-            Beside::Other(input) => Measured::at_its_stamp(Quantity::Conditions(input)),
+            Beside::Other(quantity) => Measured::at_its_stamp(quantity),
             Beside::Samples(block) => Measured::at_its_stamp(Quantity::Samples(block)),
         });
         let points = inputs().map(|input| conditions(&input));

@@ -120,6 +120,10 @@ mod tests {
             one.normal_load_n = if on { 500.0 } else { 5.0 };
             one.disc_speed_rad_s = 10.0;
             history.push(&one);
+            // From 20 °C, by 1 K/s, measured twice a second until 25 s.
+            if k % 10 == 0 && time_s < 25.0 {
+                history.push_temperature((time_s * 1e9) as i64, 20.0 + time_s);
+            }
         }
         let mut squeals = SquealsInSound::default();
         for one in [
@@ -135,6 +139,11 @@ mod tests {
         assert_eq!(times, [(5.0, 12.0), (20.0, 30.0)]);
         assert_eq!((found[0].squeals, found[0].level_db, found[0].load_n), (2, Some(85.0), (500.0, 500.0)));
         assert_eq!((found[1].squeals, found[1].level_db), (0, None));
+        let range = |one: &Application| one.temperature_c.map(|(low, high)| (low.round(), high.round()));
+        assert_eq!((range(&found[0]), range(&found[1])), (Some((25.0, 32.0)), Some((40.0, 45.0))));
+        let (known_s, celsius) = history.temperature_before(50.0).expect("the last one");
+        assert!((celsius - 44.5).abs() < 0.1 && (known_s - 24.5).abs() < 0.2, "{known_s} {celsius}");
+        assert!(history.temperature_before(-1.0).is_none());
         assert_eq!(at(&history, 6.01).and_then(|bin| bin.ranges[0]), Some((500.0, 500.0)));
         assert!(at(&history, 100.0).is_none());
     }

@@ -1,4 +1,4 @@
-//! Converts a tribometer log to a recording of operating points; reads files of sampled sound and acceleration.
+//! Converts a tribometer log to a recording of operating points and temperatures; reads files of sampled sound and acceleration.
 
 pub mod samples;
 pub mod samples_csv;
@@ -17,7 +17,7 @@ use mcap::records::Metadata;
 use sha2::{Digest, Sha256};
 
 use crate::files::input_file;
-use crate::msgs::{Header, OperatingPoint, Time, schema::Topic};
+use crate::msgs::{Header, OperatingPoint, Temperature, Time, schema::Topic};
 use crate::recording::mcap_file::{RecordingFile, WriteError};
 use crate::recording::message::Payload;
 use crate::sound::search::end_ns;
@@ -73,7 +73,7 @@ pub struct ReadLog {
     pub log: TribometerLog,
 }
 
-/// Writes the operating points (`/rig/operating_point`) of the log `input` to the recording `output`, completely or not
+/// Writes the operating points (`/rig/operating_point`), and the temperatures (`/rig/temperature`), of the log `input` to the recording `output`, completely or not
 /// at all.
 ///
 /// # Errors
@@ -132,6 +132,12 @@ pub fn operating_point(seq: u64, sample: &Sample) -> OperatingPoint {
     }
 }
 
+/// The temperature of a sample, if it has one.
+pub fn temperature(sample: &Sample) -> Option<Temperature> {
+    let header = Header { stamp: Time::from_ns(sample.stamp_ns), frame_id: String::new() };
+    sample.temperature_c.map(|temperature| Temperature { header, temperature, variance: 0.0 })
+}
+
 fn write(file: &mut RecordingFile, read: &ReadLog, sound: &mut SoundBlocks) -> Result<(), ImportError> {
     let ReadLog { path, bytes, log } = read;
     let source = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
@@ -152,20 +158,25 @@ fn write(file: &mut RecordingFile, read: &ReadLog, sound: &mut SoundBlocks) -> R
     file.write_metadata(&Metadata { name: METADATA_NAME.to_owned(), metadata })?;
     let channel = file.own_channel(Topic::OperatingPoint)?;
     let sound_channel = if sound.is_empty() { None } else { Some(file.own_channel(Topic::Waveform)?) };
-    let points = (0_u32..).zip(&log.samples).map(|(seq, sample)| (sample.stamp_ns, (seq, sample)));
-    let mut block_seq = 0;
-    for entry in join(points, sound) {
-        let (channel, seq, time_ns, payload) = match entry {
-            Beside::Other((seq, sample)) => {
-                let point = operating_point(seq.into(), sample);
-                (Some(channel), seq, sample.stamp_ns, Payload::OperatingPoint(point))
-            }
-            Beside::Samples(block) => {
-                block_seq += 1;
-                (sound_channel, block_seq - 1, end_ns(&block), Payload::Waveform(block))
-            }
+    let with_temperature = log.samples.iter().any(|sample| sample.temperature_c.is_some());
+    let heat_channel = if with_temperature { Some(file.own_channel(Topic::Temperature)?) } else { None };
+    // The rig has the temperature of a line in the prediction for its conditions.
+    let measured = (0_u64..).zip(&log.samples).flat_map(|(seq, sample)| {
+        let heat = temperature(sample).map(Payload::Temperature);
+        let payloads = heat.into_iter().chain([Payload::OperatingPoint(operating_point(seq, sample))]);
+        payloads.map(|payload| (sample.stamp_ns, (sample.stamp_ns, payload)))
+    });
+    let mut sequences = BTreeMap::new();
+    for entry in join(measured, sound) {
+        let (channel, time_ns, payload) = match entry {
+            Beside::Other((time_ns, payload @ Payload::Temperature(_))) => (heat_channel, time_ns, payload),
+            Beside::Other((time_ns, payload)) => (Some(channel), time_ns, payload),
+            Beside::Samples(block) => (sound_channel, end_ns(&block), Payload::Waveform(block)),
         };
         let Some(channel) = channel else { continue };
+        let next: &mut u32 = sequences.entry(payload.topic()).or_default();
+        let seq = *next;
+        *next += 1;
         let cdr =
             payload.to_cdr().map_err(|error| ImportError::Encode { path: path.clone(), reason: error.to_string() })?;
         let time_ns = u64::try_from(time_ns).unwrap_or(0);

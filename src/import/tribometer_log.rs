@@ -36,7 +36,9 @@ pub enum LogError {
     Decimal { comma: String, comma_line: usize, point: String, point_line: usize },
     #[error("constant {field} = {value} is outside of {min} to {max}")]
     Constant { field: Field, value: f64, min: f64, max: f64 },
-    #[error("{field} cannot be constant; expected normal_load_n, disc_speed_rad_s or friction_coefficient")]
+    #[error(
+        "{field} cannot be constant; expected normal_load_n, disc_speed_rad_s, friction_coefficient or temperature_c"
+    )]
     NoConstant { field: Field },
     #[error("line {line}, column {column:?}: {value:?} is not {expected}")]
     Value { line: usize, column: String, value: String, expected: &'static str },
@@ -75,6 +77,7 @@ pub struct LogOptions {
     pub normal_load_n: [f64; 2],
     pub disc_speed_rad_s: [f64; 2],
     pub friction_coefficient: [f64; 2],
+    pub temperature_c: [f64; 2],
     /// Skip invalid lines instead of refusing the log.
     pub skip_bad_lines: bool,
 }
@@ -92,6 +95,7 @@ impl Default for LogOptions {
             normal_load_n: [0.0, 1e6],
             disc_speed_rad_s: [-1e4, 1e4],
             friction_coefficient: [0.0, 2.0],
+            temperature_c: [-273.15, 3000.0],
             skip_bad_lines: false,
         }
     }
@@ -105,6 +109,8 @@ pub struct Sample {
     pub normal_load_n: f64,
     pub disc_speed_rad_s: f64,
     pub friction_coefficient: f64,
+    /// `None` if the log has no temperature there.
+    pub temperature_c: Option<f64>,
 }
 
 /// A column that is used.
@@ -174,6 +180,11 @@ pub fn parse(text: &str, options: &LogOptions) -> Result<TribometerLog, LogError
         _ => (header.columns.clone(), 0),
     };
     let iso = rows(unit_rows).next().transpose()?.is_some_and(|first| is_iso(&first, &columns));
+    let is_chosen = |field| options.columns.iter().any(|(chosen, _)| *chosen == field);
+    columns.retain(|column| {
+        let Column { field, ref unit, .. } = *column;
+        !field.is_optional() || is_chosen(field) || field.unit(unit).is_some()
+    });
     for column in &mut columns {
         resolve_unit(column, header.line, iso, options)?;
     }
@@ -278,6 +289,32 @@ mod tests {
         assert_eq!(first("2024-01-31 12:00:00.25"), 1_706_702_400_250_000_000);
         let unix = read("time_s,load_n,speed_rad_s,mu\n1706702400.123456789,500,13,0.3\n").unwrap();
         assert_eq!(unix.samples[0].stamp_ns, 1_706_702_400_123_456_789);
+    }
+
+    /// A temperature is taken where one column certainly holds it, and may be measured more slowly than the rest.
+    #[test]
+    fn a_temperature_is_read_where_there_is_one() {
+        let temperatures = |header: &str, options: &LogOptions| -> Vec<Option<f64>> {
+            let text = format!("time_s;load_n;speed_rad_s;mu;{header}\n0;500;13;0.3;85.5;x\n1;500;13;0.3;;y\n");
+            let log = parse(&text, options).unwrap_or_else(|error| panic!("{header}: {error}"));
+            log.samples.iter().map(|sample| sample.temperature_c).collect()
+        };
+        let usual = LogOptions::default();
+        for header in ["temperature_c;note", "Contact temperature [°C];note", "Temperatur (C);note"] {
+            assert_eq!(temperatures(header, &usual), [Some(85.5), None], "{header}");
+        }
+        for header in ["temperature;note", "temperature [F];note", "pad_c;note", "temperature [°C];Temperature (C)"] {
+            assert_eq!(temperatures(header, &usual), [None, None], "{header}");
+        }
+        let columns = vec![(Field::TemperatureC, "pad_c".to_owned())];
+        let chosen = LogOptions { columns, ..LogOptions::default() };
+        assert_eq!(temperatures("pad_c;note", &chosen), [Some(85.5), None]);
+        let constants = vec![(Field::TemperatureC, 40.0)];
+        let constant = LogOptions { constants, ..LogOptions::default() };
+        assert_eq!(temperatures("pad_c;note", &constant), [Some(40.0); 2]);
+        let hot = LogOptions { temperature_c: [0.0, 80.0], ..LogOptions::default() };
+        let error = parse("time_s,load_n,speed_rad_s,mu,temperature_c\n0,500,13,0.3,85.5\n", &hot).unwrap_err();
+        assert_eq!(error.to_string(), "line 2, column \"temperature_c\": 85.5 is outside of 0 to 80");
     }
 
     #[test]

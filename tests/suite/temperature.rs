@@ -373,3 +373,31 @@ fn a_stale_temperature_is_said() {
     assert!(warned);
     run(["replay", "--verify", &text(&recording)]).exits(0);
 }
+
+/// A log with a temperature, predicted directly and as an imported recording: the same predictions, at its temperatures.
+#[test]
+fn a_log_with_a_temperature_is_predicted_at_it() {
+    let folder = folder();
+    let rig = softening(folder.path());
+    let lines = (0..60).map(|k| {
+        let celsius = if k % 4 == 0 { (20.0 + f64::from(k)).to_string() } else { String::new() };
+        format!("{},500,13,{},{celsius}\n", 0.01 * f64::from(k), 0.3 + 0.002 * f64::from(k))
+    });
+    let head = "time_s,normal_load_n,disc_speed_rad_s,friction_coefficient,temperature_c\n".to_owned();
+    let log = write(folder.path(), "stop.csv", &(head + &lines.collect::<String>()));
+    let imported = text(&folder.path().join("stop.mcap"));
+    run(["import", &log, "--output", &imported]).exits(0).complains("60 operating points").complains("15 temperatures");
+    let predicted = |from: &str, to: &str| {
+        let out = folder.path().join(to);
+        run(["predict-log", from, "--rig", &rig, "--output", &text(&out)]).exits(0);
+        std::fs::read_dir(&out).expect("the folder").next().expect("a session").expect("readable").path()
+    };
+    let (direct, indirect) = (predicted(&log, "direct"), predicted(&imported, "indirect"));
+    let (events, predictions) = events_and_predictions(&direct);
+    assert_eq!(events, (1..15).map(|k| 20.0 + 4.0 * f64::from(k)).collect::<Vec<_>>());
+    assert_eq!(format!("{:?}", (&events, &predictions)), format!("{:?}", events_and_predictions(&indirect)));
+    let at = json(["predict", &rig, "--temperature", "76", "--mu", &(0.3 + 0.002 * 59.0).to_string(), "--json"]);
+    let expected = at["modes"].as_array().expect("modes").iter().map(|mode| mode["frequency_hz"].as_f64().expect("Hz"));
+    assert!(predictions[59].modes.iter().map(|mode| mode.frequency_hz).eq(expected));
+    run(["replay", "--verify", &text(&direct)]).exits(0).says("60 predictions identical, 0 different");
+}

@@ -14,6 +14,8 @@ listed! {
         FrictionCoefficient,
         /// Alternative to the friction coefficient, which is then this force over the normal load.
         FrictionForceN,
+        /// Temperature of the contact. A log need not have it.
+        TemperatureC,
     }
 }
 
@@ -26,12 +28,23 @@ impl Field {
             Self::DiscSpeedRadS => "disc_speed_rad_s",
             Self::FrictionCoefficient => "friction_coefficient",
             Self::FrictionForceN => "friction_force_n",
+            Self::TemperatureC => "temperature_c",
         }
     }
 
     /// The field of a [`name`](Self::name).
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|field| field.name() == name)
+    }
+
+    /// Whether a log can do without it, and without an alternative. A column that is not certain to hold it is omitted.
+    pub fn is_optional(self) -> bool {
+        match self {
+            Self::TemperatureC => true,
+            Self::Time | Self::NormalLoadN | Self::DiscSpeedRadS | Self::FrictionCoefficient | Self::FrictionForceN => {
+                false
+            }
+        }
     }
 
     /// Usual column names, words joined by `_`.
@@ -107,6 +120,7 @@ impl Field {
                 "reibungskraft",
                 "daq_fx",
             ],
+            Self::TemperatureC => &["temperature", "contact_temperature", "temperatur", "kontakttemperatur"],
         }
     }
 
@@ -145,6 +159,7 @@ impl Field {
             ],
             // The force that Rtec tribometers divide by the load is named where others have a unit.
             Self::FrictionCoefficient => &[("-", 1.0), ("1", 1.0), ("", 1.0), ("Fx", 1.0)],
+            Self::TemperatureC => &[("°C", 1.0), ("C", 1.0), ("degC", 1.0), ("deg C", 1.0)],
         }
     }
 
@@ -152,7 +167,9 @@ impl Field {
     pub(super) fn sliding_units(self) -> &'static [(&'static str, f64)] {
         match self {
             Self::DiscSpeedRadS => &[("m/s", 1.0), ("mm/s", 1e-3), ("mm/sec", 1e-3)],
-            Self::Time | Self::NormalLoadN | Self::FrictionCoefficient | Self::FrictionForceN => &[],
+            Self::Time | Self::NormalLoadN | Self::FrictionCoefficient | Self::FrictionForceN | Self::TemperatureC => {
+                &[]
+            }
         }
     }
 

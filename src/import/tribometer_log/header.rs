@@ -81,6 +81,9 @@ fn header_columns(cells: &[String], line: usize, options: &LogOptions) -> Result
         let mut found = found.by_ref().filter_map(|(index, cell)| Some((index, recognise(cell, field)?)));
         if let Some((index, unit)) = found.next() {
             if let Some((second, _)) = found.next() {
+                if field.is_optional() {
+                    continue;
+                }
                 trouble.get_or_insert(LogError::TwoColumns {
                     line,
                     field,

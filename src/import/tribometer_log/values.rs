@@ -104,12 +104,21 @@ pub(super) fn sample(
             };
             continue;
         }
+        // Thermometers are slower than loads: an empty cell is no measurement.
+        if column.field.is_optional() && cell.is_empty() {
+            continue;
+        }
         let number = plain_number(cell, decimal).and_then(|text| text.parse::<f64>().ok());
         let value = number.filter(|value| value.is_finite()).ok_or_else(|| wrong("a finite number"))? * column.factor;
         let (target, range) = match column.field {
             Field::NormalLoadN => (&mut sample.normal_load_n, Some(options.normal_load_n)),
             Field::DiscSpeedRadS => (&mut sample.disc_speed_rad_s, Some(options.disc_speed_rad_s)),
             Field::FrictionCoefficient => (&mut sample.friction_coefficient, None),
+            Field::TemperatureC => {
+                check(row, column, value, options.temperature_c)?;
+                sample.temperature_c = Some(value);
+                continue;
+            }
             // Columns are in the order of `Field::ALL`, so the load is already known. Without load there is no contact
             // and the friction coefficient is meaningless.
             Field::FrictionForceN | Field::Time => {
@@ -127,12 +136,19 @@ pub(super) fn sample(
 
 /// A sample with the quantities that have the same value in every line.
 pub(super) fn with_constants(options: &LogOptions) -> Result<Sample, LogError> {
-    let mut sample = Sample { stamp_ns: 0, normal_load_n: 0.0, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
+    let mut sample = Sample {
+        stamp_ns: 0,
+        normal_load_n: 0.0,
+        disc_speed_rad_s: 0.0,
+        friction_coefficient: 0.0,
+        temperature_c: None,
+    };
     for &(field, value) in &options.constants {
         let (target, [min, max]) = match field {
             Field::NormalLoadN => (&mut sample.normal_load_n, options.normal_load_n),
             Field::DiscSpeedRadS => (&mut sample.disc_speed_rad_s, options.disc_speed_rad_s),
             Field::FrictionCoefficient => (&mut sample.friction_coefficient, options.friction_coefficient),
+            Field::TemperatureC => (sample.temperature_c.insert(value), options.temperature_c),
             Field::Time | Field::FrictionForceN => return Err(LogError::NoConstant { field }),
         };
         *target = value;

@@ -15,8 +15,8 @@ use serde_json::Value;
 use squealcast::bus::received::Received;
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::{Ros2Options, Ros2Source};
-use squealcast::bus::shm::{ShmOptions, ShmSink, ShmSource, ShmVibrationSource};
-use squealcast::msgs::{Header, Prediction, Time, Vibration};
+use squealcast::bus::shm::{ShmOptions, ShmSink, ShmSource, ShmTemperatureSource, ShmVibrationSource};
+use squealcast::msgs::{Header, Prediction, Temperature, Time, Vibration};
 
 #[test]
 fn rclpy_is_answered_at_500_hz_for_30_s_and_the_recording_serves_others() {
@@ -228,4 +228,37 @@ fn collect(received: &Receiver<Prediction>, count: u64) -> HashMap<u64, u32> {
         }
     }
     answered
+}
+
+/// A temperature from rclpy, by the best effort of its profile for sensors, and one over shared memory: the rig follows both,
+/// and the recording holds them.
+#[test]
+fn a_rig_follows_the_temperature_that_rclpy_publishes() {
+    let (Some(ros_python), Some(python)) = (peer_program("ros-python"), peer_program("python")) else { return };
+    let _alone = alone();
+    say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut node = Node::start(&crate::temperature::softening(folder.path()), true);
+    let report = peer(&ros_python, "rclpy_temperature.py", &["--domain", &node.domain(), "--celsius", "150.5"]);
+    assert_eq!(report["followed"], serde_json::json!([150.5]), "{report}");
+    // Conditions, so that the recording can be verified.
+    let conditions =
+        ["--prefix", &node.prefix, "--rate", "100", "--count", "50", "--first-seq", "1", "--patience", "15"];
+    assert_eq!(peer(&python, "shm_peer.py", &conditions)["answered"], 50);
+    let options = ShmOptions { service_prefix: node.prefix.clone(), ..Default::default() };
+    let shm = ShmTemperatureSource::new(&options).expect("joined");
+    let header = Header { stamp: Time::from_ns(now_ns()), frame_id: String::new() };
+    let colder = Temperature { header, temperature: 60.25, variance: 0.0 };
+    assert!(shm.publish(&colder).expect("published") > 0, "the node reads");
+    let more = ["--prefix", &node.prefix, "--rate", "100", "--count", "50", "--first-seq", "51", "--patience", "15"];
+    assert_eq!(peer(&python, "shm_peer.py", &more)["answered"], 50);
+    node.interrupt();
+    let content = Content::read(&node.recording());
+    let (last, from_rclpy) = content.temperatures.split_last().expect("temperatures");
+    assert_eq!((last.temperature, last.header.stamp), (60.25, colder.header.stamp));
+    assert!(!from_rclpy.is_empty() && from_rclpy.iter().all(|t| (t.temperature, t.variance) == (150.5, 0.25)));
+    assert!(from_rclpy.iter().all(|t| t.header.frame_id == "pad"));
+    let found = read_by_others(&python, &node.recording());
+    assert_eq!(found["topics"]["/rig/temperature"], content.temperatures.len(), "{found}");
+    verify(&node.recording());
 }

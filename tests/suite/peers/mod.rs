@@ -21,7 +21,9 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use crate::domain::Domain;
 use crate::program::{self, PATIENCE, cache_folder, promised};
 use serde_json::Value;
-use squealcast::msgs::{Header, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, Time, Vibration, Waveform};
+use squealcast::msgs::{
+    Header, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, Temperature, Time, Vibration, Waveform,
+};
 use squealcast::recording::message::Payload;
 use squealcast::recording::reader::{Recorded, Recording};
 use tempfile::TempDir;
@@ -268,6 +270,7 @@ struct Content {
     rigs: Vec<RigInfo>,
     sensitivities: Vec<Sensitivity>,
     vibrations: Vec<Vibration>,
+    temperatures: Vec<Temperature>,
     waveforms: Vec<Waveform>,
     heard: Vec<Heard>,
     /// FAULTs for silence with inputs before and after.
@@ -302,6 +305,7 @@ impl Content {
                 }
                 Recorded::Known(Payload::SessionEvent(_)) => {}
                 Recorded::Known(Payload::Vibration(vibration)) => content.vibrations.push(vibration),
+                Recorded::Known(Payload::Temperature(measured)) => content.temperatures.push(measured),
                 Recorded::Known(Payload::Waveform(waveform)) => content.waveforms.push(waveform),
                 Recorded::Known(Payload::Heard(heard)) => content.heard.push(heard),
                 Recorded::Known(Payload::Sensitivity(sensitivity)) => content.sensitivities.push(sensitivity),
