@@ -55,13 +55,14 @@ impl ShmConnection {
         Ok(ports)
     }
 
-    /// The ports of a rig: publishes operating points and, if the rig measures it, the vibration.
+    /// The ports of a rig: publishes operating points and, if the rig measures them, vibration and sound.
     ///
     /// # Errors
     /// Errors of iceoryx2.
-    pub fn of_rig(options: &ShmOptions, measures_vibration: bool) -> Result<Self, ShmError> {
+    pub fn of_rig(options: &ShmOptions, measures_vibration: bool, measures_sound: bool) -> Result<Self, ShmError> {
         Ok(Self {
             vibrations: measures_vibration.then(|| ShmVibrationSource::new(options)).transpose()?,
+            waveforms: measures_sound.then(|| ShmWaveformSource::new(options)).transpose()?,
             operating_points: Some(ShmSource::new(options)?),
             ..Self::default()
         })

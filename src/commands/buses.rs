@@ -115,13 +115,21 @@ impl Buses {
         })
     }
 
-    /// Joins the buses as a rig, which publishes operating points and, if it measures it, the vibration.
+    /// Joins the buses as a rig, which publishes operating points and, if it measures them, vibration and
+    /// sound.
     ///
     /// # Errors
     /// A bus cannot be joined, or all are switched off.
-    pub fn join_as_rig(&self, measures_vibration: bool) -> anyhow::Result<Vec<Box<dyn Connection>>> {
+    pub fn join_as_rig(
+        &self,
+        measures_vibration: bool,
+        measures_sound: bool,
+    ) -> anyhow::Result<Vec<Box<dyn Connection>>> {
         self.join_some(|bus| match bus {
-            Bus::Shm => boxed(self.shm.as_ref().map(|shm| ShmConnection::of_rig(shm, measures_vibration)), SHM_FAILED),
+            Bus::Shm => boxed(
+                self.shm.as_ref().map(|shm| ShmConnection::of_rig(shm, measures_vibration, measures_sound)),
+                SHM_FAILED,
+            ),
             Bus::Ros2 => boxed(self.ros2.as_ref().map(|ros2| Ros2Source::start(ros2, |_| {})), ROS2_FAILED),
             Bus::Simulator => Ok(None),
         })

@@ -33,6 +33,7 @@ mod run;
 mod score;
 mod signals;
 mod simulate;
+mod simulated_modes;
 mod simulated_sound;
 mod sound_files;
 mod steps;

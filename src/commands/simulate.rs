@@ -6,7 +6,8 @@ use std::time::{Duration, Instant};
 use clap::Args;
 
 use super::buses::BusOptions;
-use super::simulated_sound::SoundOptions;
+use super::simulated_modes::SimulatedModes;
+use super::simulated_sound::{LiveSound, SoundOptions};
 use super::{Outcome, finite, not_negative, positive, signals};
 use crate::bus::Outgoing;
 use crate::bus::ros_args::RosArgs;
@@ -38,6 +39,10 @@ pub struct Options {
     /// Rig file, or the name of an embedded rig, for --record
     #[arg(long, value_name = "RIG", requires = "record")]
     rig: Option<String>,
+    /// Also publish what a microphone hears, in Pa on /rig/waveform: modes of this rig that are unstable at the conditions grow
+    /// at their rates up to 95 dB(A)
+    #[arg(long, value_name = "RIG", conflicts_with = "record")]
+    sound_of: Option<String>,
     #[command(flatten)]
     sound: SoundOptions,
     #[command(flatten)]
@@ -147,11 +152,14 @@ impl Options {
     }
 
     fn publish(&self, profile: Profile, period: Duration, ros_args: RosArgs) -> anyhow::Result<Outcome> {
-        let mut buses = self.buses.resolve(ros_args)?.join_as_rig(self.vibration.tone.is_some())?;
+        let mut buses =
+            self.buses.resolve(ros_args)?.join_as_rig(self.vibration.tone.is_some(), self.sound_of.is_some())?;
+        let rig = self.sound_of.as_deref().map(Rig::load).transpose()?.map(Arc::new);
         let stopped = Arc::new(AtomicBool::new(false));
         let stop = stopped.clone();
         signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;
         let mut measuring = Measuring::new(Simulator::new(profile, self.seed), self.vibration, period);
+        let mut microphone = rig.map(|rig| (SimulatedModes::start(rig), LiveSound::new(self.seed, clock::now_ns())));
         let started = Instant::now();
         for seq in 0u32.. {
             let time_s = measuring.time_s(seq);
@@ -163,6 +171,14 @@ impl Options {
                 break;
             }
             let (conditions, vibration) = measuring.measure(seq, clock::now_ns());
+            if let Some((modes, sound)) = &mut microphone {
+                while let Some(block) = sound.next_before(time_s, || modes.latest()) {
+                    for bus in &mut buses {
+                        bus.publish(Outgoing::Waveform(&block))?;
+                    }
+                }
+                modes.measured(&conditions);
+            }
             for bus in &mut buses {
                 bus.publish(Outgoing::OperatingPoint(&conditions))?;
                 if let Some(vibration) = &vibration {

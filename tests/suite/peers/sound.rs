@@ -3,10 +3,12 @@
 use serde_json::Value;
 use squealcast::msgs::{Waveform, heard_state};
 use squealcast::recording::reader::Recording;
+use tempfile::TempDir;
 
 use super::{
     Content, Node, RIG, alone, peer, peer_program, peer_program_in, read_by_others, say, say_versions, verify,
 };
+use crate::program;
 
 const BLOCKS: usize = 141;
 
@@ -81,4 +83,31 @@ fn a_squeal_in_samples_of_iceoryx2_in_python_is_found_published_and_recorded() {
     check(&report, &node);
     assert!(Recording::open(&node.recording()).expect("a recording").is_complete());
     verify(&node.recording());
+}
+
+/// A simulated rig at a friction coefficient of 0.9, at which mode 15 of the tribometer squeals at 3112.7 Hz (`predict
+/// tribometer --mu 0.9 --load 500 --speed 13`), is heard by a node over each bus.
+#[test]
+fn the_sound_of_a_simulated_rig_is_heard_over_both_buses() {
+    let _alone = alone();
+    let profile = TempDir::new().expect("a folder");
+    let point = |time_s: f64| {
+        format!(
+            "[[point]]\ntime_s = {time_s}\nnormal_load_n = 500\ndisc_speed_rad_s = 13\nfriction_coefficient = 0.9\n"
+        )
+    };
+    let profile = program::write(profile.path(), "profile.toml", &(point(0.0) + &point(60.0)));
+    for other in ["--no-ros", "--no-shm"] {
+        let mut node = Node::start_with("tribometer", true, &["--record-sound", other]);
+        let simulate =
+            ["simulate", "--sound-of", "tribometer", "--profile", &profile, "--rate", "50", "--duration", "12"];
+        let buses = [other, "--loopback", "--domain", &node.domain(), "--shm-prefix", &node.prefix];
+        program::run(simulate.iter().chain(&buses)).exits(0);
+        node.interrupt();
+        let content = Content::read(&node.recording());
+        assert!(content.waveforms.len() > 300, "{other}: {} blocks", content.waveforms.len());
+        let near = |heard: &&squealcast::msgs::Heard| (heard.frequency_hz - 3112.7).abs() < 2.0;
+        let heard = content.heard.iter().find(near).unwrap_or_else(|| panic!("{other}: {:?}", content.heard));
+        say(&format!("{other}: {:.2} Hz, {:.2} dB(A)", heard.frequency_hz, heard.level_db));
+    }
 }
