@@ -72,7 +72,7 @@ impl Options {
         }
         let load = self.load.unwrap_or(rig.reference.normal_load_n);
         rig.has_stiffness_to_scale()?;
-        let present = rig.contact_stiffness_n_per_m();
+        let present = rig.stiffness_to_scale(load)?;
         let Some(low) = present.iter().copied().reduce(f64::min).filter(|low| *low > 0.0) else {
             bail!("{}: has no contact stiffness above 0 to start from", rig.name);
         };

@@ -369,26 +369,57 @@ impl Rig {
     /// [`RigError::Kind`] if the law of the rig's `[contact_state]` has no stiffness.
     pub fn has_stiffness_to_scale(&self) -> Result<(), RigError> {
         let law = match self.model.statics().map(|statics| &statics.parts().law) {
-            None | Some(PressureLaw::Linear { .. } | PressureLaw::Power { .. }) => return Ok(()),
-            Some(PressureLaw::Exponential { .. }) => "exponential",
+            None => return Ok(()),
+            Some(PressureLaw::Linear { .. } | PressureLaw::Power { .. } | PressureLaw::Exponential { .. }) => {
+                return Ok(());
+            }
             Some(PressureLaw::Table(_)) => "table",
         };
         Err(RigError::Kind {
             file: self.name.clone(),
             field: "contact_state.law".to_owned(),
             value: format!("is \"{law}\", in which no stiffness can be changed"),
-            limit: "linear or power, whose forces are proportional to stiffness_n_per_m".to_owned(),
+            limit: "linear, power or exponential".to_owned(),
         })
     }
 
-    /// The same rig with the stiffness of every contact pair multiplied by `factor`.
+    /// Whether the stiffness of the contact at a load is inversely proportional to the roughness height of its law.
+    fn stiffens_with_smoothness(&self) -> bool {
+        match self.model.statics().map(|statics| &statics.parts().law) {
+            Some(PressureLaw::Exponential { .. }) => true,
+            Some(PressureLaw::Linear { .. } | PressureLaw::Power { .. } | PressureLaw::Table(_)) | None => false,
+        }
+    }
+
+    /// The stiffness that [`Self::with_contact_stiffness_times`] multiplies, of each pair: that of the rig file; of an
+    /// exponential law the tangent stiffness at the load `normal_load_n` without friction.
+    ///
+    /// # Errors
+    /// [`RigError::ContactState`] if there is no state without friction.
+    pub fn stiffness_to_scale(&self, normal_load_n: f64) -> Result<Vec<f64>, RigError> {
+        match self.model.statics().filter(|_| self.stiffens_with_smoothness()) {
+            None => Ok(self.contact_stiffness_n_per_m()),
+            Some(statics) => {
+                let refused = |source| RigError::ContactState { file: self.name.clone(), source };
+                Ok(statics.state(normal_load_n, 0.0).map_err(refused)?.tangent_n_per_m)
+            }
+        }
+    }
+
+    /// The same rig with the stiffness of every contact pair multiplied by `factor`. That of an exponential law is
+    /// proportional to the force of the pair over the roughness height, which is divided.
     ///
     /// # Errors
     /// [`RigError`] if the rig's own files cannot be read again, if `factor` takes the stiffness out of range, or if the
     /// law of its `[contact_state]` has no stiffness.
     pub fn with_contact_stiffness_times(&self, factor: f64) -> Result<Self, RigError> {
         self.has_stiffness_to_scale()?;
-        let Some(text) = self.visit_contact_stiffness(&mut |value| factor * value) else { return Ok(self.clone()) };
+        let text = if self.stiffens_with_smoothness() {
+            self.with_roughness(&mut |height| height / factor)
+        } else {
+            self.visit_contact_stiffness(&mut |value| factor * value)
+        };
+        let Some(text) = text else { return Ok(self.clone()) };
         let mut files = self.files.clone();
         files[0].bytes = text.into_bytes();
         Self::from_files_at(&files, self.temperature_c())
@@ -405,12 +436,20 @@ impl Rig {
         let Some(Contact { pairs, residual, places: _ }) = &self.contact else { return Ok(self.model.clone()) };
         self.has_stiffness_to_scale()?;
         let mut pairs = pairs.clone();
-        pairs.stiffness_n_per_m.iter_mut().for_each(|stiffness| *stiffness *= factor);
+        // The damping of an exponential law is a property of the material, not of its roughness height.
+        if !self.stiffens_with_smoothness() {
+            pairs.stiffness_n_per_m.iter_mut().for_each(|stiffness| *stiffness *= factor);
+        }
         let free = self.model.without_contact();
         match (self.model.statics(), residual) {
             (Some(statics), residual) => {
                 let mut parts = statics.parts().clone();
-                parts.area.iter_mut().for_each(|stiffness| *stiffness *= factor);
+                match &mut parts.law {
+                    PressureLaw::Exponential { roughness_m, .. } => *roughness_m /= factor,
+                    PressureLaw::Linear { .. } | PressureLaw::Power { .. } | PressureLaw::Table(_) => {
+                        parts.area.iter_mut().for_each(|stiffness| *stiffness *= factor);
+                    }
+                }
                 let statics =
                     Statics::new(parts).map_err(|source| RigError::ContactState { file: self.name.clone(), source })?;
                 free.with_steady_contact(&pairs, Arc::new(statics), residual.as_ref())
@@ -419,6 +458,14 @@ impl Rig {
             (None, None) => free.with_contact(&pairs),
         }
         .map_err(|source| RigError::Model { file: self.name.clone(), source })
+    }
+
+    /// The text of the rig file with `change` applied to the roughness height of its law; `None` if the file cannot be parsed.
+    fn with_roughness(&self, change: &mut dyn FnMut(f64) -> f64) -> Option<String> {
+        let text = std::str::from_utf8(&self.files.first()?.bytes).ok()?;
+        let mut table: toml::Table = text.parse().ok()?;
+        change_numbers(table.get_mut("contact_state")?.get_mut("roughness_m")?, change);
+        Some(table.to_string())
     }
 
     /// The text of the rig file with `change` applied to every contact stiffness; `None` if the file cannot be parsed.
