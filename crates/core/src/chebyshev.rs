@@ -23,7 +23,7 @@ pub fn coefficients(values: &[f64]) -> Vec<f64> {
 pub fn transform(values: &mut [f64], count: usize, axes: usize) {
     for axis in 0..axes {
         let stride = count.pow(axis as u32);
-        for start in (0..values.len()).filter(|index| index / stride % count == 0) {
+        for start in (0..values.len()).filter(|index| (index / stride).is_multiple_of(count)) {
             let line: Vec<f64> = (0..count).map(|k| values[start + k * stride]).collect();
             for (k, coefficient) in coefficients(&line).into_iter().enumerate() {
                 values[start + k * stride] = coefficient;

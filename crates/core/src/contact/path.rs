@@ -582,7 +582,7 @@ impl<'a> Equations<'a> {
     }
 
     /// The state, started from `anchor`; `None` if it is not certain to be its continuation.
-    fn from_anchor(&self, anchor: &Anchor, work: &mut Work) -> Option<SteadyState> {
+    fn continued_from(&self, anchor: &Anchor, work: &mut Work) -> Option<SteadyState> {
         let along = [self.load - anchor.state.load_n, self.x - anchor.state.friction];
         let mut at = self.evaluate(self.predicted(&anchor.state, along));
         for _ in 0..MOST_CHORDS {
@@ -791,7 +791,7 @@ pub(super) fn from_anchor(
     let scales = Scales::new(statics, load);
     let flexibility = std::mem::replace(&mut work.flexibility, Mat::new());
     let equations = Equations::within(flexibility, statics, load, s_mu, 0.0, &scales);
-    let state = equations.from_anchor(anchor, work);
+    let state = equations.continued_from(anchor, work);
     work.flexibility = equations.flexibility;
     state
 }
