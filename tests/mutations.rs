@@ -232,7 +232,9 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
             .collect(),
         "rig" => ["nine-dof", "nine-dof-3+2", "hoffmann", "hulten", "brake4669", "tribometer", "rough-pad"]
             .map(|name| project(&format!("launch/rigs/{name}.toml")))
-            .to_vec(),
+            .into_iter()
+            .chain([[project("launch/rigs/rough-pad.toml"), HEATED.to_vec()].concat()])
+            .collect(),
         "pressures" => text(&["closure_m,pressure_pa\n0,0\n1e-6,1e4\n2e-6,4e4\n\n5e-6, 3e5\n"]),
         "scale" => text(&["friction_coefficient / 0.3 + 1", "-(normal_load_n/500)^0.5 * (1 - 2e-3*disc_speed_rad_s)"]),
         "full_model" => targets::full_models(),
@@ -246,6 +248,7 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
             "time_s,normal_load_n,disc_speed_rad_s,friction_coefficient\n0.0,500,13,0.35\n0.1,501,13,0.36\n",
             "Pruefstand 3\nZeit [s];Normalkraft [N];Drehzahl [1/min];Reibwert\n0,0;500,5;124;0,35\n0,1;501;124;0,36\n",
             "Time,Load,Speed,Friction force\n,N,rpm,N\n2026-01-01T00:00:00Z,500,124,170\n",
+            "Fx,Fz,T,COF,temperature_c\ng,g,sec,,C\n9,-200,0.0,0.04,21\n9,-201,0.1,0.04,22\nStep 2\n9,-200,0.0,0.04,21\n",
         ]),
         "wav" => {
             let long = [b"RF64".as_slice(), &[255; 4], b"WAVEds64", &[28, 0, 0, 0], &[8; 28]].concat();
@@ -278,6 +281,9 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
         other => panic!("no sound inputs of {other}"),
     }
 }
+
+/// A table to be added to a rig.
+const HEATED: &[u8] = b"\n[temperature]\nreference_c = 20.0\ncontact_stiffness = [[20.0, 1.0], [300.0, 0.5]]\n";
 
 fn text_of_array() -> Option<Vec<u8>> {
     Some(b"%%MatrixMarket matrix array real skew-symmetric\n3 3\n1\n2\n3\n".to_vec())

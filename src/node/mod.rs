@@ -62,8 +62,8 @@ const LATEST: Duration = Duration::from_millis(500);
 /// The time of a prediction is estimated as the minimum over this many, since on a busy machine any of them may have
 /// been interrupted.
 const TIMED: usize = 16;
-/// Number of inputs, of measured vibrations, and of temperatures, whose stamp and sequence number are remembered. A message that arrives
-/// over both buses is recognised by them and handled once.
+/// Number of inputs, of measured vibrations, and of temperatures, whose stamp and sequence number are remembered. A message
+/// that arrives over both buses is recognised by them and handled once.
 const REMEMBERED: usize = 8192;
 const VIBRATIONS_REMEMBERED: usize = 1024;
 const TEMPERATURES_REMEMBERED: usize = 64;

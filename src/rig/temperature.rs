@@ -25,7 +25,7 @@ pub struct RawTemperature {
     friction_slope: Option<Vec<[f64; 2]>>,
 }
 
-/// Factors at one temperature, in the order of [`Temperature::TABLES`].
+/// Factors at one temperature.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Factors {
     pub contact_stiffness: f64,

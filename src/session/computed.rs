@@ -1,5 +1,5 @@
-//! What a session uses and somebody else computes: stability maps, window ends, charts and rigs at other temperatures. Live operation, offline
-//! prediction and verification all compute them here, and record them by the same session events.
+//! What a session uses and somebody else computes: stability maps, window ends, charts and rigs at other temperatures.
+//! Live operation, offline prediction and verification all compute them here, and record them by the same session events.
 
 use std::sync::Arc;
 

@@ -7,6 +7,7 @@ use std::sync::LazyLock;
 
 use squealcast::bus::params_file;
 use squealcast::full_model::FullModelFile;
+use squealcast::import::tribometer_log::{Field, LogOptions};
 use squealcast::import::wav::Wav;
 use squealcast::import::{samples_csv, tribometer_log, uff58};
 use squealcast::msgs::schema::Topic;
@@ -49,7 +50,9 @@ pub const TARGETS: [Target; 16] = [
     Target {
         name: "rig",
         read: |bytes| {
-            let _ = Rig::from_files(&[RigFile { name: "rig.toml".to_owned(), bytes: bytes.to_vec() }]);
+            if let Ok(rig) = Rig::from_files(&[RigFile { name: "rig.toml".to_owned(), bytes: bytes.to_vec() }]) {
+                let _ = rig.at_temperature(150.0);
+            }
         },
     },
     Target { name: "pressures", read: |bytes| drop(read_pressures("a.csv", bytes)) },
@@ -65,7 +68,16 @@ pub const TARGETS: [Target; 16] = [
     Target {
         name: "log",
         read: |bytes| {
-            let _ = tribometer_log::parse(&tribometer_log::decode_text(bytes), &Default::default());
+            let text = tribometer_log::decode_text(bytes);
+            let _ = tribometer_log::parse(&text, &LogOptions::default());
+            let options = LogOptions {
+                columns: vec![(Field::NormalLoadN, "-Fz".to_owned())],
+                constants: vec![(Field::DiscSpeedRadS, 13.0)],
+                times_restart: true,
+                skip_bad_lines: true,
+                ..LogOptions::default()
+            };
+            let _ = tribometer_log::parse(&text, &options);
         },
     },
     Target { name: "wav", read: wav },

@@ -15,7 +15,7 @@
 //! | speed towards zero | lateral damping grows as `μN/v`, modes become static; below 0.01 rad/s `μ` is taken as 0 |
 //! | matrices far from normal | bounds grow with the condition numbers of the roots |
 //! | other order of nodes and modes, other signs or units | the same roots within their bounds |
-//! | pairs that open and close | see [`contact`] |
+//! | pairs that open and close | see `contact.rs` beside it |
 //! | a disc at its critical speed | a wave stands still in the pad's frame; its root is known to rounding, or the solve is an error |
 //!
 //! Where rounding leaves no accurate digits, a solve is an error (a residual or trace exceeds its limit), never a
