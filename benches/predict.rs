@@ -113,7 +113,11 @@ fn states(criterion: &mut Criterion) {
     let closed = parts.free.clone().with_contact(&parts.pairs).expect("the rig is well formed");
     let mut models = vec![("always closed", closed)];
     for (name, law) in laws {
-        let statics = Arc::new(statics(&parts, law, 1e-6).expect("the statics are well formed"));
+        // With as many anchors as a rig has.
+        let loads: Vec<f64> = (0..6).map(|k| 50.0 * 40f64.powf(f64::from(k) / 5.0)).collect();
+        let frictions: Vec<f64> = (0..=8).map(|k| 0.125 * f64::from(k)).collect();
+        let statics = statics(&parts, law, 1e-6).expect("the statics are well formed");
+        let statics = Arc::new(statics.with_anchors(&loads, &frictions));
         let model = parts.free.clone().with_steady_contact(&parts.pairs, statics.clone(), None);
         models.push((name, model.expect("the rig is well formed")));
         let mut next = points.iter().cycle();
