@@ -10,8 +10,12 @@ use super::fit::{Basis, Fit, Fitted};
 use super::samples::Sample;
 use super::{Channels, Cluster, Leaf, MAX_AXES};
 
-/// Factor by which error bounds exceed estimated and observed errors.
+/// Factor by which error bounds exceed estimated and observed errors. Leaves are split until this many times the estimate is
+/// within the tolerance.
 const SAFETY: f64 = 4.0;
+/// The factor of bounds with a contact state, which makes roots less smooth functions of the load: of 10⁴ held-out conditions
+/// of a rig of 160 modes, roots at two were up to 5.4 times the estimate away.
+const SAFETY_WITH_STATE: f64 = 12.0;
 /// Required error of a charted pad participation; if it is not reached, the participation is NaN.
 pub const SHARE_TOLERANCE: f64 = 1e-4;
 /// Relative distance below which two roots are considered merging.
@@ -121,6 +125,11 @@ impl Builder<'_> {
         Ok(settled)
     }
 
+    /// Factor by which the error bounds of this model exceed estimated errors.
+    fn safety(&self) -> f64 {
+        if self.sampler.model.statics().is_some() { SAFETY_WITH_STATE } else { SAFETY }
+    }
+
     /// Expands the symmetric functions of the branches `members`.
     fn expand(&self, branches: &Branches<'_>, fit: &Fit, members: &[usize]) -> Expansion {
         let (size, parts) = (members.len(), branches.parts());
@@ -142,8 +151,8 @@ impl Builder<'_> {
         for k in 0..size {
             let floor = branches.rounding * size as f64 * condition * radius.max(branches.rounding).powi(k as i32);
             for fitted in &fitted[k * parts..(k + 1) * parts] {
+                expansion.errors[k] += self.safety() * fitted.missing + floor;
                 let missing = SAFETY * fitted.missing;
-                expansion.errors[k] += missing + floor;
                 let excess = missing / (allowed[k] / parts as f64 + 8.0 * floor);
                 if excess.is_nan() || excess > 1.0 && failing.is_none_or(|(worst, _)| excess > worst) {
                     failing = Some((excess, fitted.worst_axis));
@@ -251,8 +260,9 @@ impl Builder<'_> {
         let mut remainder_errors = [0.0; 2];
         for (k, fitted) in fit.expand(rest).into_iter().enumerate() {
             let floor = 64.0 * f64::EPSILON * largest[k] * self.sampler.model.dimension() as f64;
-            remainder_errors[k] = SAFETY * fitted.missing + floor;
-            if remainder_errors[k].is_nan() || remainder_errors[k] > 1e-6 * largest[k] + 2.0 * floor {
+            remainder_errors[k] = self.safety() * fitted.missing + floor;
+            let converged = SAFETY * fitted.missing <= 1e-6 * largest[k] + floor;
+            if !converged {
                 return Err(fitted.worst_axis);
             }
             remainders.push(fitted.coefficients);
