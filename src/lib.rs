@@ -3,6 +3,7 @@
 //! - [`rig`] reads rig files; [`full_model`] reads the finite-element models that [`reduction`] reduces to rigs.
 //! - [`physics`] computes roots, stability maps, window ends and charts.
 //! - [`session`] turns inputs and session events into predictions, as a pure step.
+//! - [`analysis`] predicts, sweeps and finds windows over given conditions.
 //! - [`node`] runs a session on a [`bus`] and records it ([`recording`]); [`offline`] runs one without buses.
 //! - [`sound`] detects squeal in sampled sound or acceleration.
 //! - [`display`] shows a node or a recording; [`figures`] draws; [`study`] measures and reproduces.
@@ -18,6 +19,7 @@ macro_rules! note {
 pub use squealcast_core::{contact, fem, physics, proof, reduction};
 pub use squealcast_msgs as msgs;
 
+pub mod analysis;
 pub mod bus;
 pub mod commands;
 pub mod display;

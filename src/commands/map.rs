@@ -4,9 +4,9 @@ use std::sync::Mutex;
 use anyhow::bail;
 use clap::Args;
 
-use super::condition::{Condition, Place, change_between, in_parallel};
 use super::steps::ProgressOptions;
 use super::{AtTemperature, Conditions, Outcome, RigName, finite, print, write_file};
+use crate::analysis::condition::{Condition, Place, change_between, in_parallel};
 use crate::figures::plane::{self, Axis, Cell, Edge, Plane};
 use crate::physics::{MapOptions, Solver, StabilityMap, Summary, Vectors};
 use crate::rig::Rig;

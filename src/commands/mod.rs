@@ -5,7 +5,6 @@ mod bench;
 mod buses;
 mod check;
 mod completions;
-mod condition;
 mod critical;
 mod demo;
 mod display;

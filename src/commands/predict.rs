@@ -1,13 +1,11 @@
-use std::sync::Arc;
-
 use clap::Args;
 use serde::Serialize;
 
 use super::{AtTemperature, Conditions, Outcome, RigName, format, print};
+use crate::analysis;
 use crate::contact::SteadyState;
-use crate::physics::{MapOptions, Mode, OperatingPoint, Solver, StabilityMap, Summary, Vectors};
+use crate::physics::Mode;
 use crate::rig::Rig;
-use crate::session::map_options;
 
 /// Predict the vibration modes of a rig under one set of conditions
 #[derive(Debug, Args)]
@@ -96,7 +94,7 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = self.temperature.of(Rig::load(&self.rig)?)?;
         let point = self.conditions.point(&rig.name, &rig.reference, &rig.limits)?;
-        let (summary, state) = predict(&rig, &point)?;
+        let (summary, state) = analysis::predict(&rig, &point)?;
         let state = state.as_deref();
         if self.json {
             let report = Report {
@@ -117,17 +115,4 @@ impl Options {
         }
         Ok(Outcome::Done)
     }
-}
-
-/// The modes at `point`, with identities from the map that a session uses there, and the contact state.
-fn predict(rig: &Rig, point: &OperatingPoint) -> anyhow::Result<(Summary, Option<Arc<SteadyState>>)> {
-    let mut solver = Solver::new(rig.model.dimension());
-    let spectrum = solver.solve(&rig.model, point, Vectors::Right)?;
-    let mu = point.friction_coefficient;
-    let searched = map_options(rig);
-    let path =
-        MapOptions { mu_min: mu.min(searched.mu_min), mu_max: mu.max(searched.mu_max), windows: false, ..searched };
-    let map = StabilityMap::build(&rig.model, &mut solver, point, &path)?;
-    let summary = Summary::of_spectrum(&spectrum, Some(&map), rig.band_max_hz, rig.instability_threshold);
-    Ok((summary, spectrum.state))
 }

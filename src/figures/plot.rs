@@ -9,6 +9,8 @@ use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
+use crate::analysis::condition::Condition;
+use crate::analysis::sweep::{Sweep, Swept};
 use crate::display::curves::Curves;
 use crate::display::history::{Bin, History};
 use crate::msgs::level;
@@ -81,6 +83,19 @@ pub struct PlotError(String);
 
 /// A range of a condition in which a mode is unstable; its end is `None` beyond the figure.
 pub type Shaded = (f64, Option<f64>);
+
+/// The modes of a sweep over `condition`, with those beside its windows, as points of curves.
+pub fn swept(sweep: &Sweep, condition: Condition) -> Vec<Point> {
+    let point = |swept: &Swept| Point {
+        x: condition.of(&swept.place),
+        id: swept.mode.id,
+        frequency_hz: swept.mode.root.frequency_hz(),
+        growth_rate_per_s: swept.mode.root.growth_rate_per_s(),
+    };
+    let mut points: Vec<Point> = sweep.modes.iter().chain(&sweep.beside_ends).map(point).collect();
+    points.sort_by(|a, b| a.x.total_cmp(&b.x));
+    points
+}
 
 /// Growth rates and frequencies of followed modes over a condition named `x_label`, in two panels, with shaded windows
 /// of instability.

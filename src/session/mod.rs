@@ -232,6 +232,11 @@ impl Session {
         &self.prediction
     }
 
+    /// The modes of the latest prediction that is not a FAULT: all of the band, ascending in frequency.
+    pub fn modes(&self) -> &[Mode] {
+        &self.summary.modes
+    }
+
     /// Whether `point` can be predicted without a dense solve: reused or charted. A dense solve is still needed if the
     /// chart fails its check there.
     pub fn answers_at_once(&self, point: &OperatingPoint) -> bool {

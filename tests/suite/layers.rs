@@ -27,6 +27,7 @@ const PROGRAM: &[&str] = &[
     "full_model",
     "export",
     "session",
+    "analysis",
     "simulator",
     "recording",
     "bus",

@@ -1,10 +1,9 @@
-//! One condition as the variable of a command: friction coefficient, load, speed or temperature.
+//! One condition as a variable: friction coefficient, load, speed or temperature.
 
 use std::borrow::Cow;
 use std::panic::resume_unwind;
 
-use anyhow::Context;
-
+use super::AnalysisError;
 use crate::msgs::listed;
 use crate::physics::{OperatingPoint, Solver};
 use crate::rig::{Rig, RigError};
@@ -14,26 +13,26 @@ const EDGE_TOLERANCE: f64 = 1e-6;
 
 /// An operating point, with the temperature of a rig that has one, °C.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Place {
+pub struct Place {
     pub point: OperatingPoint,
     pub temperature_c: Option<f64>,
 }
 
 impl Place {
     /// The conditions that every table of places begins with.
-    pub(super) const COLUMNS: [&str; 3] = ["normal_load_n", "disc_speed_rad_s", "friction_coefficient"];
+    pub const COLUMNS: [&str; 3] = ["normal_load_n", "disc_speed_rad_s", "friction_coefficient"];
     /// The column after them, of a rig with a temperature.
-    pub(super) const TEMPERATURE_COLUMN: &str = "temperature_c";
+    pub const TEMPERATURE_COLUMN: &str = "temperature_c";
 
     /// The values of these columns.
-    pub(super) fn cells(&self) -> impl Iterator<Item = String> {
+    pub fn cells(&self) -> impl Iterator<Item = String> {
         let OperatingPoint { normal_load_n, disc_speed_rad_s, friction_coefficient } = self.point;
         let conditions = [normal_load_n, disc_speed_rad_s, friction_coefficient];
         conditions.into_iter().chain(self.temperature_c).map(|value| value.to_string())
     }
 
     /// The columns of a table of places of `rig`.
-    pub(super) fn columns(rig: &Rig) -> impl Iterator<Item = &'static str> {
+    pub fn columns(rig: &Rig) -> impl Iterator<Item = &'static str> {
         Self::COLUMNS.into_iter().chain(rig.temperature_c().map(|_| Self::TEMPERATURE_COLUMN))
     }
 
@@ -41,7 +40,7 @@ impl Place {
     ///
     /// # Errors
     /// [`RigError`] if the rig has no such temperature.
-    pub(super) fn rig<'a>(&self, rig: &'a Rig) -> Result<Cow<'a, Rig>, RigError> {
+    pub fn rig<'a>(&self, rig: &'a Rig) -> Result<Cow<'a, Rig>, RigError> {
         match self.temperature_c {
             Some(celsius) if rig.temperature_c() != Some(celsius) => rig.at_temperature(celsius).map(Cow::Owned),
             Some(_) | None => Ok(Cow::Borrowed(rig)),
@@ -52,13 +51,13 @@ impl Place {
     ///
     /// # Errors
     /// The condition that is out of range.
-    pub(super) fn check(&self, rig: &Rig) -> anyhow::Result<()> {
-        rig.limits.check(&self.point).with_context(|| rig.name.clone())?;
+    pub fn check(&self, rig: &Rig) -> Result<(), AnalysisError> {
+        super::check(rig, &self.point)?;
         Ok(self.temperature_c.map_or(Ok(()), |celsius| rig.accepts_temperature(celsius))?)
     }
 
     /// The conditions that are not `varied`, in words.
-    pub(super) fn fixed(&self, varied: &[Condition]) -> String {
+    pub fn fixed(&self, varied: &[Condition]) -> String {
         let words =
             Condition::ALL.into_iter().filter(|condition| !varied.contains(condition)).filter_map(|condition| {
                 Some(condition.of(self)).filter(|value| !value.is_nan()).map(|value| match condition {
@@ -74,7 +73,7 @@ impl Place {
 
 listed! {
     /// A condition.
-    pub(super) enum Condition {
+    pub enum Condition {
         Friction,
         Load,
         Speed,
@@ -84,7 +83,7 @@ listed! {
 
 impl Condition {
     /// Name with unit, for axes.
-    pub(super) fn label(self) -> &'static str {
+    pub fn label(self) -> &'static str {
         match self {
             Self::Friction => "friction coefficient",
             Self::Load => "normal load, N",
@@ -94,7 +93,7 @@ impl Condition {
     }
 
     /// `place` with this condition at `value`.
-    pub(super) fn set(self, place: Place, value: f64) -> Place {
+    pub fn set(self, place: Place, value: f64) -> Place {
         let point = place.point;
         match self {
             Self::Friction => Place { point: point.with_friction(value), ..place },
@@ -105,7 +104,7 @@ impl Condition {
     }
 
     /// The value of this condition at `place`; NaN for the temperature of a rig without one.
-    pub(super) fn of(self, place: &Place) -> f64 {
+    pub fn of(self, place: &Place) -> f64 {
         match self {
             Self::Friction => place.point.friction_coefficient,
             Self::Load => place.point.normal_load_n,
@@ -117,12 +116,7 @@ impl Condition {
 
 /// Where `holds` changes between `low`, where it is `before`, and `high`, where it is not, by bisection. An unknown state
 /// counts as changed.
-pub(super) fn change_between(
-    mut low: f64,
-    mut high: f64,
-    before: bool,
-    mut holds: impl FnMut(f64) -> Option<bool>,
-) -> f64 {
+pub fn change_between(mut low: f64, mut high: f64, before: bool, mut holds: impl FnMut(f64) -> Option<bool>) -> f64 {
     let least = EDGE_TOLERANCE * (high - low);
     while high - low > least {
         let middle = 0.5 * (low + high);
@@ -135,10 +129,10 @@ pub(super) fn change_between(
 }
 
 /// `task` for every value, on all cores: each is computed by one thread and does not depend on the others.
-pub(super) fn in_parallel<T: Send>(
-    values: &[f64],
+pub fn in_parallel<V: Copy + Sync, T: Send>(
+    values: &[V],
     dimension: usize,
-    task: impl Fn(f64, &mut Solver) -> T + Sync,
+    task: impl Fn(V, &mut Solver) -> T + Sync,
 ) -> Vec<T> {
     let threads = std::thread::available_parallelism().map_or(1, usize::from).min(values.len());
     let part = |first: usize| {
