@@ -19,6 +19,7 @@ ARGUMENTS = [
     DeclareLaunchArgument("domain", default_value="", description="DDS domain; empty: ROS_DOMAIN_ID, or 0"),
     DeclareLaunchArgument("loopback", default_value="false", description="true: speak to this machine alone"),
     DeclareLaunchArgument("record", default_value="", description="folder to record into; empty: no recording"),
+    DeclareLaunchArgument("managed", default_value="false", description="true: start unconfigured, as a managed node"),
     DeclareLaunchArgument("params_file", default_value=str(HERE / "params.yaml"), description="the node's parameters"),
     DeclareLaunchArgument("executable", default_value="squealcast", description="the program, or its path"),
 ]
@@ -28,14 +29,17 @@ def start_node(context):
     given = {argument.name: LaunchConfiguration(argument.name).perform(context) for argument in ARGUMENTS}
     if not Path(given["params_file"]).is_file():
         raise RuntimeError(f"params_file:={given['params_file']}: no such file")  # launch would start the node without
-    if given["loopback"].lower() not in ("true", "false"):
-        raise RuntimeError(f"loopback:={given['loopback']}: neither true nor false")
+    for name in ("loopback", "managed"):
+        if given[name].lower() not in ("true", "false"):
+            raise RuntimeError(f"{name}:={given[name]}: neither true nor false")
 
     arguments = ["run", given["rig"]]
     if given["domain"]:
         arguments += ["--domain", given["domain"]]
     if given["loopback"].lower() == "true":
         arguments += ["--loopback"]
+    if given["managed"].lower() == "true":
+        arguments += ["--managed"]
     if given["record"]:
         arguments += ["--record", given["record"]]
     return [

@@ -2,6 +2,8 @@
 
 use thiserror::Error;
 
+use super::lifecycle::State;
+use super::log::Severity;
 use super::ros2::Ros2Error;
 use super::shm::ShmError;
 use super::{Bus, Counts, Received};
@@ -24,6 +26,8 @@ pub enum Outgoing<'a> {
     Waveform(&'a Waveform),
     Heard(&'a Heard),
     Temperature(&'a Temperature),
+    /// A line for the log of the bus.
+    Log(Severity, &'a str),
 }
 
 /// Why a bus refused to publish a message.
@@ -92,4 +96,7 @@ pub trait Sink: Send + Sync {
 
     /// Takes a parameter value that a peer has set and that was validated.
     fn parameter(&self, name: &str, value: f64);
+
+    /// Takes the state into which a peer has brought the node. Messages received later find the node in this state.
+    fn lifecycle(&self, state: State);
 }

@@ -4,7 +4,10 @@
 //! is joined; what a bus receives goes to a [`Sink`].
 
 mod connection;
+pub mod lifecycle;
+pub mod log;
 pub mod params_file;
+pub mod qos_overrides;
 pub mod received;
 pub mod ros2;
 pub mod ros_args;

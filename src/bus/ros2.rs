@@ -9,8 +9,10 @@
 mod connection;
 mod discovery;
 mod frame;
+mod lifecycle;
 mod link;
 mod loopback;
+mod parameters;
 pub mod process;
 mod qos_conflicts;
 pub mod side;
@@ -21,17 +23,20 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use ros2_client::{MessageTypeName, NodeOptions, ParameterValue, Publisher};
+use ros2_client::{Log, MessageTypeName, Publisher};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 pub use self::connection::{Ros2NodeConnection, Ros2ReplayConnection};
+pub use self::parameters::{Accepted, Describe, Parameters, Validate};
 
 use self::discovery::Discovery;
 use self::link::{Durability, Link, MAX_BLOCKS_WAITING, MAX_UNANSWERED, MAX_WAITING};
 use super::Bus;
+use super::lifecycle::State;
+use super::log::Severity;
 use super::received::{Counters, Counts, Received};
-use super::ros_args::{RosArgs, USE_SIM_TIME};
+use super::ros_args::{RosArgs, RosArgsError};
 use crate::msgs::schema::Topic;
 use crate::msgs::{
     DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Temperature, Vibration,
@@ -42,6 +47,9 @@ use crate::msgs::{
 pub const NODE_NAME: &str = "squealcast";
 /// Name of the rig's node before remapping.
 pub const SOURCE_NODE_NAME: &str = "rig";
+
+/// The topic of log lines, one for all namespaces.
+const ROSOUT: &str = "/rosout";
 
 /// Prefix of notes about ROS 2 on standard error.
 const NOTE: &str = "ROS 2: ";
@@ -98,6 +106,8 @@ pub enum Ros2Error {
     Node { name: String, reason: String },
     #[error("ROS topic {name}: {reason}")]
     Topic { name: String, reason: String },
+    #[error(transparent)]
+    Args(#[from] RosArgsError),
     #[error("ROS thread: {0}")]
     Thread(#[from] std::io::Error),
     #[error("not published on {topic}: {reason}")]
@@ -107,58 +117,14 @@ pub enum Ros2Error {
     Side(String),
 }
 
-/// Validates a parameter value before it is accepted; the error text is sent to the peer.
-pub type Validate = Box<dyn Fn(&str, f64) -> Result<(), String> + Send + Sync>;
-/// Receives a parameter value after it was accepted.
-pub type Accepted = Box<dyn Fn(&str, f64) + Send + Sync>;
-
-/// The parameters of the node.
-pub struct Parameters {
-    /// Names and initial values (see [`RosArgs::parameters`]).
-    pub values: Vec<(String, f64)>,
-    /// Called for every value, including the initial ones.
-    pub validate: Validate,
-    /// Called on the node's thread for every value that a peer has set and `validate` accepted.
-    pub accepted: Accepted,
-}
-
-impl Parameters {
-    /// No parameters.
-    pub fn none() -> Self {
-        Self { values: Vec::new(), validate: Box::new(|_, _| Ok(())), accepted: Box::new(|_, _| ()) }
-    }
-
-    /// Node options with these parameters. `accepted` is only called once `started` is set: before that the node sets
-    /// the initial values.
-    fn declare(self, started: Arc<AtomicBool>) -> NodeOptions {
-        let Self { values, validate, accepted } = self;
-        let options = NodeOptions::new()
-            .enable_rosout(true)
-            .start_parameter_services(true)
-            .parameter_validator(Box::new(move |name, value| match value {
-                ParameterValue::Double(value) if !value.is_finite() => Err(format!("{name}: {value} is not finite")),
-                ParameterValue::Double(value) => validate(name, *value),
-                ParameterValue::NotSet => Err(format!("{name} cannot be removed")),
-                _ => Err(format!("{name} is a double")),
-            }))
-            .parameter_set_action(Box::new(move |name, value| {
-                if let (ParameterValue::Double(value), true) = (value, started.load(Ordering::Acquire)) {
-                    accepted(name, *value);
-                }
-                Ok(())
-            }));
-        values
-            .iter()
-            .filter(|(name, _)| name != USE_SIM_TIME)
-            .fold(options, |options, (name, value)| options.declare_parameter(name, ParameterValue::Double(*value)))
-    }
-}
-
-/// Receives what a node takes beside operating points and the measured vibration.
+/// What a node has beside operating points and the measured vibration.
 struct Beside {
     temperature: Box<dyn FnMut(Received<Temperature>) + Send>,
     /// Blocks of samples of microphones and accelerometers.
     waveform: Box<dyn FnMut(Received<Waveform>) + Send>,
+    /// The state in which the node starts, and what gets every later one.
+    state: State,
+    changed: lifecycle::Changed,
 }
 
 /// The node's side: receives operating points, the measured vibration, temperatures and samples, and publishes all other
@@ -174,6 +140,8 @@ pub struct Ros2 {
     sensitivity: Publisher<Sensitivity>,
     diagnostics: Publisher<DiagnosticArray>,
     heard: Publisher<Heard>,
+    /// `None` if the user has switched it off.
+    rosout: Option<Publisher<Log>>,
     /// Counts of the blocks of samples.
     waveform_counters: Arc<Counters>,
     beats: Arc<AtomicU64>,
@@ -196,7 +164,7 @@ impl Ros2 {
     }
 
     /// As [`Self::start`]. Publishing a prediction fails once a reader has left `max_unanswered` of them
-    /// unacknowledged. With `beside`, temperatures and samples are received too.
+    /// unacknowledged. With `beside`, temperatures and samples are received too, and the node is managed.
     fn start_with(
         options: &Ros2Options,
         parameters: Parameters,
@@ -206,7 +174,7 @@ impl Ros2 {
         beside: Option<Beside>,
     ) -> Result<Self, Ros2Error> {
         let started = Arc::new(AtomicBool::new(false));
-        let mut link = Link::join(options, NODE_NAME, parameters.declare(Arc::clone(&started)))?;
+        let mut link = Link::join(options, NODE_NAME, parameters, started.clone())?;
         let prediction = prediction_publisher(&mut link, max_unanswered)?;
         let rig = link.publisher(topic::RIG, ours("RigInfo"), Durability::TransientLocal, MAX_UNANSWERED)?;
         let session_event =
@@ -216,23 +184,25 @@ impl Ros2 {
         let diagnostics_type = MessageTypeName::new("diagnostic_msgs", "DiagnosticArray");
         let diagnostics = link.publisher(topic::DIAGNOSTICS, diagnostics_type, Durability::Volatile, MAX_UNANSWERED)?;
         let heard = link.publisher(topic::HEARD, ours("Heard"), Durability::Volatile, MAX_UNANSWERED)?;
+        let rosout = link.rosout()?;
         let vibration = link.aside(topic::VIBRATION, ours("Vibration"), MAX_WAITING, vibration, Arc::default())?;
         let waveform_counters = Arc::<Counters>::default();
         let counters = waveform_counters.clone();
         let beside = beside
-            .map(|Beside { temperature, waveform }| {
+            .map(|Beside { temperature, waveform, state, changed }| {
                 let kind = MessageTypeName::new("sensor_msgs", "Temperature");
                 let temperature = link.aside(topic::TEMPERATURE, kind, MAX_WAITING, temperature, Arc::default())?;
                 let waveform = link.aside(topic::WAVEFORM, ours("Waveform"), MAX_BLOCKS_WAITING, waveform, counters)?;
-                Ok::<_, Ros2Error>((temperature, waveform))
+                let lifecycle = lifecycle::add(&mut link, state, changed)?;
+                Ok::<_, Ros2Error>((temperature, waveform, lifecycle))
             })
             .transpose()?;
         let beats = Arc::new(AtomicU64::new(0));
         let beating = beats.clone();
         let aside = Box::pin(async move {
             let beside = async {
-                if let Some((temperature, waveform)) = beside {
-                    tokio::join!(temperature, waveform);
+                if let Some((temperature, waveform, lifecycle)) = beside {
+                    tokio::join!(temperature, waveform, lifecycle);
                 }
             };
             tokio::join!(vibration, beside, beat(&beating));
@@ -248,6 +218,7 @@ impl Ros2 {
             sensitivity,
             diagnostics,
             heard,
+            rosout,
             waveform_counters,
             beats,
             link,
@@ -306,7 +277,7 @@ impl Ros2 {
 
     /// Number of readers of the sensitivities, including killed ones whose lease has not expired.
     pub fn sensitivity_readers(&self) -> usize {
-        self.sensitivity.get_subscription_count(self.link.node())
+        self.sensitivity.get_subscription_count(&self.link.node())
     }
 
     /// Publishes diagnostics.
@@ -325,15 +296,34 @@ impl Ros2 {
         publish(&self.heard, topic::HEARD, heard)
     }
 
+    /// Writes a line to `/rosout`, unless the user wants only more severe ones.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn log(&self, severity: Severity, text: &str) -> Result<(), Ros2Error> {
+        let Some(rosout) = self.rosout.as_ref().filter(|_| self.link.logs(severity)) else { return Ok(()) };
+        let now = self.link.node().time_now().into();
+        let line = Log {
+            stamp: now,
+            level: severity as u8,
+            name: self.full_name().trim_start_matches('/').replace('/', "."),
+            msg: text.to_owned(),
+            file: String::new(),
+            function: String::new(),
+            line: 0,
+        };
+        publish(rosout, ROSOUT, &line)
+    }
+
     /// Number of readers of the predictions, including killed ones whose lease has not expired. A [`Ros2Source`] counts
     /// twice: it has a reliable and a best-effort reader.
     pub fn prediction_readers(&self) -> usize {
-        self.prediction.get_subscription_count(self.link.node())
+        self.prediction.get_subscription_count(&self.link.node())
     }
 
     /// Number of readers of a topic published here, including killed ones whose lease has not expired.
     pub fn readers(&self, topic: Topic) -> usize {
-        let node = self.link.node();
+        let node = &self.link.node();
         match topic {
             Topic::Prediction => self.prediction.get_subscription_count(node),
             Topic::RigInfo => self.rig.get_subscription_count(node),
@@ -394,8 +384,7 @@ impl Ros2Source {
         options: &Ros2Options,
         sink: impl FnMut(Received<Prediction>) + Send + 'static,
     ) -> Result<Self, Ros2Error> {
-        let node_options = Parameters::none().declare(Arc::new(AtomicBool::new(true)));
-        let mut link = Link::join(options, SOURCE_NODE_NAME, node_options)?;
+        let mut link = Link::join(options, SOURCE_NODE_NAME, Parameters::none(), Arc::new(AtomicBool::new(true)))?;
         let operating_point =
             link.publisher(topic::OPERATING_POINT, ours("OperatingPoint"), Durability::Volatile, MAX_UNANSWERED)?;
         let vibration = link.publisher(topic::VIBRATION, ours("Vibration"), Durability::Volatile, MAX_UNANSWERED)?;
@@ -432,7 +421,7 @@ impl Ros2Source {
 
     /// Number of readers of the temperature, including killed ones whose lease has not expired. A node counts twice.
     pub fn temperature_readers(&self) -> usize {
-        self.temperature.get_subscription_count(self.link.node())
+        self.temperature.get_subscription_count(&self.link.node())
     }
 
     /// Publishes a block of samples without blocking.
@@ -445,18 +434,18 @@ impl Ros2Source {
 
     /// Number of readers of the samples, including killed ones whose lease has not expired. A node counts twice.
     pub fn waveform_readers(&self) -> usize {
-        self.waveform.get_subscription_count(self.link.node())
+        self.waveform.get_subscription_count(&self.link.node())
     }
 
     /// Number of readers of the operating points, including killed ones whose lease has not expired. A node counts
     /// twice: it has a reliable and a best-effort reader.
     pub fn readers(&self) -> usize {
-        self.operating_point.get_subscription_count(self.link.node())
+        self.operating_point.get_subscription_count(&self.link.node())
     }
 
     /// Number of readers of the vibration, including killed ones whose lease has not expired. A node counts twice.
     pub fn vibration_readers(&self) -> usize {
-        self.vibration.get_subscription_count(self.link.node())
+        self.vibration.get_subscription_count(&self.link.node())
     }
 
     /// Number of known publishers of predictions, including killed ones whose lease has not expired.

@@ -9,7 +9,11 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use super::log::Severity;
 use super::params_file::{self, ParamsFileError};
+use super::qos_overrides::{QosOverrides, Role, is_override};
+use crate::msgs::schema::Topic;
+use crate::msgs::topic;
 
 /// An invalid ROS argument.
 #[derive(Debug, Error)]
@@ -24,6 +28,8 @@ pub enum RosArgsError {
     Parameter { text: String },
     #[error("parameter {name}: {value:?} is no number")]
     NotANumber { name: String, value: String },
+    #[error("parameter {parameter}: {value:?}, expected {expected}")]
+    Qos { parameter: String, value: String, expected: &'static str },
     #[error("{value:?} is no log level, expected DEBUG, INFO, WARN, ERROR or FATAL, or LOGGER:= and one of them")]
     LogLevel { value: String },
     #[error(transparent)]
@@ -51,6 +57,9 @@ enum ParameterSource {
 pub struct RosArgs {
     rules: Vec<Rule>,
     sources: Vec<ParameterSource>,
+    /// The least severity of lines on `/rosout`; `None` if not given.
+    log_level: Option<Severity>,
+    without_rosout: bool,
 }
 
 /// Parameters by name.
@@ -86,7 +95,9 @@ impl RosArgs {
                 "-r" | "--remap" => self.rules.push(Rule::parse(&value()?)?),
                 "-p" | "--param" => self.sources.push(parse_parameter(&value()?)?),
                 "--params-file" => self.sources.push(ParameterSource::File(value()?.into())),
-                "--log-level" => check_log_level(&value()?)?,
+                "--log-level" => self.log_level = Some(parse_log_level(&value()?)?),
+                "--enable-rosout-logs" => self.without_rosout = false,
+                "--disable-rosout-logs" => self.without_rosout = true,
                 "--log-config-file" | "--log-file-name" | "-e" | "--enclave" => drop(value()?),
                 _ if LOG_SWITCHES.iter().any(|switch| {
                     ["--enable-", "--disable-"].iter().any(|on_off| arg.strip_prefix(on_off) == Some(switch))
@@ -145,10 +156,11 @@ impl RosArgs {
     ) -> Result<(Values, Vec<String>), RosArgsError> {
         let mut values: Vec<(String, f64)> = declared.iter().map(|&(name, value)| (name.to_owned(), value)).collect();
         let mut ignored = Vec::new();
-        let mut set = |name: String, value: String| {
+        for (name, value) in self.given(namespace, node)? {
             match (values.iter_mut().find(|(known, _)| *known == name), value.trim().parse()) {
                 (Some(slot), Ok(number)) => slot.1 = number,
                 (Some(_), Err(_)) => return Err(RosArgsError::NotANumber { name, value }),
+                (None, _) if is_override(&name) => {}
                 (None, _) if name == USE_SIM_TIME => {
                     if value != "false" {
                         ignored.push(format!("{USE_SIM_TIME} is ignored: times are those of this machine"));
@@ -159,38 +171,62 @@ impl RosArgs {
                     ignored.push(format!("parameter {name} is ignored, there are: {known}"));
                 }
             }
-            Ok(())
-        };
+        }
+        Ok((values, ignored))
+    }
+
+    /// The quality of service that a user has chosen for the topics of a node, and the parameters that are for other
+    /// topics, as sentences to report.
+    ///
+    /// # Errors
+    /// A file cannot be read, or a policy does not have the value.
+    pub fn qos_overrides(&self, namespace: &str, node: &str) -> Result<(QosOverrides, Vec<String>), RosArgsError> {
+        let mut overrides = QosOverrides::default();
+        for (name, value) in self.given(namespace, node)? {
+            if is_override(&name) {
+                overrides.take(name, value)?;
+            }
+        }
+        let topics =
+            Topic::ALL.map(|known| (Role::of_node(known), self.topic(topic::relative(known.name()), namespace, node)));
+        let dropped = overrides.keep(|role, topic| topics.iter().any(|known| (known.0, &*known.1) == (role, topic)));
+        let ignored =
+            dropped.into_iter().map(|name| format!("parameter {name} is ignored: no such topic of this node"));
+        Ok((overrides, ignored.collect()))
+    }
+
+    /// The least severity of the lines on `/rosout`; `None` if there are to be none.
+    pub fn log_level(&self) -> Option<Severity> {
+        (!self.without_rosout).then(|| self.log_level.unwrap_or(Severity::Info))
+    }
+
+    /// The parameters given for a node, as text, in the order given.
+    fn given(&self, namespace: &str, node: &str) -> Result<Vec<(String, String)>, RosArgsError> {
+        let mut given = Vec::new();
         for source in &self.sources {
             match source {
                 ParameterSource::Value { node: only, name, value } => {
                     if only.as_deref().is_none_or(|only| only == node) {
-                        set(name.clone(), value.clone())?;
+                        given.push((name.clone(), value.clone()));
                     }
                 }
-                ParameterSource::File(path) => {
-                    for (name, value) in params_file::read(path, namespace, node)? {
-                        set(name, value)?;
-                    }
-                }
+                ParameterSource::File(path) => given.extend(params_file::read(path, namespace, node)?),
             }
         }
-        Ok((values, ignored))
+        Ok(given)
     }
 }
 
-const LOG_SWITCHES: [&str; 3] = ["rosout-logs", "stdout-logs", "external-lib-logs"];
+/// Accepted without effect: lines on standard error are for the user who started the program.
+const LOG_SWITCHES: [&str; 2] = ["stdout-logs", "external-lib-logs"];
 
 /// A parameter that every ROS 2 node has; this node does not support simulated time.
 pub(super) const USE_SIM_TIME: &str = "use_sim_time";
 
-/// Checks `LEVEL` or `LOGGER:=LEVEL`. It has no effect: the node logs the same at every level.
-fn check_log_level(text: &str) -> Result<(), RosArgsError> {
+/// `LEVEL` or `LOGGER:=LEVEL`; the node has one logger.
+fn parse_log_level(text: &str) -> Result<Severity, RosArgsError> {
     let level = text.split_once(":=").map_or(text, |(_, level)| level);
-    if ["DEBUG", "INFO", "WARN", "ERROR", "FATAL"].iter().any(|known| level.eq_ignore_ascii_case(known)) {
-        return Ok(());
-    }
-    Err(RosArgsError::LogLevel { value: text.to_owned() })
+    Severity::parse(level).ok_or_else(|| RosArgsError::LogLevel { value: text.to_owned() })
 }
 
 impl Rule {
@@ -325,11 +361,29 @@ mod tests {
             [
                 "parameter start_type_description_service is ignored, there are: warn_margin",
                 "parameter frames is ignored, there are: warn_margin",
-                "parameter qos_overrides./parameter_events.publisher.depth is ignored, there are: warn_margin",
                 "parameter warn_margn is ignored, there are: warn_margin",
                 "use_sim_time is ignored: times are those of this machine",
             ]
         );
+    }
+
+    #[test]
+    fn quality_of_service_is_chosen_for_topics_of_the_node() {
+        let args = ros(
+            "--ros-args -r rig/operating_point:=conditions -p qos_overrides./left/conditions.subscription.depth:=7 \
+             -p qos_overrides./parameter_events.publisher.depth:=10",
+        );
+        let (overrides, ignored) = args.qos_overrides("/left", "squealcast").expect("valid");
+        assert_eq!(overrides.of(Role::Subscription, "/left/conditions").depth, Some(7));
+        let name = "qos_overrides./parameter_events.publisher.depth";
+        assert_eq!(ignored, [format!("parameter {name} is ignored: no such topic of this node")]);
+    }
+
+    #[test]
+    fn lines_on_rosout_have_a_least_severity() {
+        assert_eq!(ros("").log_level(), Some(Severity::Info));
+        assert_eq!(ros("--ros-args --log-level squealcast:=warn").log_level(), Some(Severity::Warn));
+        assert_eq!(ros("--ros-args --disable-rosout-logs").log_level(), None);
     }
 
     #[test]

@@ -106,7 +106,7 @@ impl Connection for ShmConnection {
                 Ok(())
             }
             // These have no form in shared memory.
-            Outgoing::SessionEvent(_) | Outgoing::RigInfo(_) | Outgoing::Diagnostics(_) => Ok(()),
+            Outgoing::SessionEvent(_) | Outgoing::RigInfo(_) | Outgoing::Diagnostics(_) | Outgoing::Log(..) => Ok(()),
         }
     }
 

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use anyhow::{Context, ensure};
 use clap::Args;
 
+use crate::bus::lifecycle::State;
 use crate::bus::ros_args::RosArgs;
 use crate::bus::ros2::{NODE_NAME, Ros2Error, Ros2NodeConnection, Ros2Options, Ros2ReplayConnection, Ros2Source};
 use crate::bus::shm::ShmOptions;
@@ -72,6 +73,7 @@ pub struct NodeStart {
 /// What tells a user how to do without a bus that cannot be joined.
 const SHM_FAILED: &str = "shared memory; --no-shm stays off it";
 const ROS2_FAILED: &str = "ROS 2; --no-ros stays off it";
+const MANAGED_ALONE: &str = "--managed needs ROS 2, over which the node is configured; --no-ros is given";
 const NO_BUS: &str = "no bus to publish on: --no-shm and --no-ros are both given";
 
 impl Buses {
@@ -87,7 +89,8 @@ impl Buses {
         let name = ros2.args.node_name(NODE_NAME);
         let namespace = ros2.args.namespace(&name, "/");
         let (values, ignored) = ros2.args.parameters(&declared, &namespace, &name)?;
-        for what in ignored {
+        let (_, of_other_topics) = ros2.args.qos_overrides(&namespace, &name)?;
+        for what in ignored.into_iter().chain(of_other_topics) {
             note!("ROS 2: {what}");
         }
         for (name, value) in &values {
@@ -96,19 +99,21 @@ impl Buses {
         Ok(NodeStart { name: NodeName::new(&namespace, &name), settings, parameters: values })
     }
 
-    /// Joins the buses as a node with these `parameters`, which receives into `sink`.
+    /// Joins the buses as a node with these `parameters`, which starts in `state` and receives into `sink`.
     ///
     /// # Errors
     /// A bus cannot be joined.
     pub fn join_as_node(
         &self,
         parameters: &[(String, f64)],
+        state: State,
         sink: &Arc<dyn Sink>,
     ) -> anyhow::Result<Vec<Box<dyn Connection>>> {
+        ensure!(state == State::Active || self.ros2.is_some(), MANAGED_ALONE);
         self.join(|bus| match bus {
             Bus::Shm => boxed(self.shm.as_ref().map(|shm| ShmConnection::of_node(shm, sink)), SHM_FAILED),
             Bus::Ros2 => {
-                let start = |ros2| Ros2NodeConnection::start(ros2, parameters.to_vec(), sink);
+                let start = |ros2| Ros2NodeConnection::start(ros2, parameters.to_vec(), state, sink);
                 boxed(self.ros2.as_ref().map(start), ROS2_FAILED)
             }
             Bus::Simulator => Ok(None),

@@ -10,7 +10,10 @@ pub struct Options {}
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
-        side::serve(|name, value| settings::validate(name, value).map(drop).map_err(|error| error.to_string()))?;
+        side::serve(
+            |name, value| settings::validate(name, value).map(drop).map_err(|error| error.to_string()),
+            |name| settings::find(name).map(|known| (known.description, [known.low, known.high])),
+        )?;
         Ok(Outcome::Done)
     }
 }

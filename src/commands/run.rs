@@ -9,6 +9,7 @@ use super::display::{DisplayOptions, ThresholdOption};
 use super::hear::DetectionArgs;
 use super::{Outcome, live, signals};
 use crate::bus::Sink;
+use crate::bus::lifecycle;
 use crate::bus::ros_args::RosArgs;
 use crate::display::server::{About, Server};
 use crate::files::chart_file::ChartFile;
@@ -45,6 +46,9 @@ pub struct NodeOptions {
     /// Neither load nor store a chart on disk
     #[arg(long)]
     no_chart_cache: bool,
+    /// Start unconfigured, as a managed node of ROS 2: it waits for configure and activate (`ros2 lifecycle set`)
+    #[arg(long)]
+    managed: bool,
     /// Print log lines instead of a live table, even on a terminal
     #[arg(long)]
     plain: bool,
@@ -104,7 +108,8 @@ pub fn serve(
     let NodeStart { name: node_name, settings, parameters } = buses.node(Settings::for_rig(rig))?;
     let watch = Watch::default();
     let (node, inlet) = Node::new(rig.clone(), settings, watch.clone());
-    let mut node = node.with_sound(options.sound.options());
+    let state = if options.managed { lifecycle::State::Unconfigured } else { lifecycle::State::Active };
+    let mut node = node.with_sound(options.sound.options()).starting_as(state);
     // Before the recording begins, so that it is always finished when a signal arrives.
     let stop = inlet.clone();
     signals::on_stop(move || stop.stop())?;
@@ -120,7 +125,7 @@ pub fn serve(
     // Before the recording begins: if the address is taken, no recording is left behind.
     let display = options.display.of_node(rig, &watch, about)?;
     let sink: Arc<dyn Sink> = Arc::new(sink);
-    let mut joined = buses.join_as_node(&parameters, &sink)?;
+    let mut joined = buses.join_as_node(&parameters, state, &sink)?;
     for warning in joined.iter_mut().flat_map(|bus| bus.report().warnings) {
         note!("warning: {warning}");
     }

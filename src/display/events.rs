@@ -27,7 +27,7 @@ impl EventKind {
             Status::Squeal => Some(Self::Squeal),
             Status::Fault => Some(Self::Fault),
             Status::NoData => Some(Self::NoData),
-            Status::Waiting | Status::Ok | Status::Warn => None,
+            Status::Waiting | Status::Inactive | Status::Ok | Status::Warn => None,
         }
     }
 

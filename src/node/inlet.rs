@@ -7,7 +7,9 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use crossbeam_channel::Sender;
 
 use super::detection::DetectionInlet;
+use super::lifecycle::Lifecycle;
 use super::{Incoming, Worker};
+use crate::bus::lifecycle::State;
 use crate::bus::{Received, Sink};
 use crate::msgs;
 
@@ -28,6 +30,7 @@ pub struct Inlet {
     running: Running,
     lost: Arc<AtomicU64>,
     takes_bus_inputs: bool,
+    lifecycle: Lifecycle,
     detection: DetectionInlet,
 }
 
@@ -36,9 +39,10 @@ impl Inlet {
         queue: Sender<Incoming>,
         running: Running,
         lost: Arc<AtomicU64>,
+        lifecycle: Lifecycle,
         detection: DetectionInlet,
     ) -> Self {
-        Self { queue, running, lost, takes_bus_inputs: true, detection }
+        Self { queue, running, lost, takes_bus_inputs: true, lifecycle, detection }
     }
 
     /// The same inlet for buses that deliver parameters only, since the inputs come from this process.
@@ -57,8 +61,12 @@ impl Inlet {
     }
 
     /// Predicts for an input on this thread if `may_predict`, it needs no dense solve, and the node is idle with an empty
-    /// queue. Otherwise queues it. Never blocks. Returns false if the queue is full: the input is lost and counted.
+    /// queue. Otherwise queues it. Never blocks. Returns false if the queue is full: the input is lost and counted. A node
+    /// that is not active drops it.
     pub fn input(&self, received: Received<msgs::OperatingPoint>, may_predict: bool) -> bool {
+        if !self.lifecycle.receives() {
+            return true;
+        }
         // Items are only taken out of the queue under this lock. If the queue is empty here, no input can be overtaken.
         if may_predict
             && let Ok(mut running) = self.running.0.try_lock()
@@ -89,20 +97,32 @@ impl Sink for Inlet {
     }
 
     fn vibration(&self, received: Received<msgs::Vibration>) {
-        self.queue_or_lose(Incoming::Vibration(received));
+        if self.lifecycle.receives() {
+            self.queue_or_lose(Incoming::Vibration(received));
+        }
     }
 
     fn temperature(&self, received: Received<msgs::Temperature>) {
-        self.queue_or_lose(Incoming::Temperature(received));
+        if self.lifecycle.receives() {
+            self.queue_or_lose(Incoming::Temperature(received));
+        }
     }
 
     fn waveform(&self, received: Received<msgs::Waveform>) {
-        self.detection.waveform(received);
+        if self.lifecycle.receives() {
+            self.detection.waveform(received);
+        }
     }
 
     fn parameter(&self, name: &str, value: f64) {
         if self.queue.try_send(Incoming::Parameter { name: name.to_owned(), value }).is_err() {
             note!("parameter {name} = {value} is ignored: the node's queue is full");
         }
+    }
+
+    fn lifecycle(&self, state: State) {
+        self.lifecycle.set(state);
+        // Wakes the node. If the queue is full, it is awake.
+        let _ = self.queue.try_send(Incoming::Lifecycle);
     }
 }

@@ -12,6 +12,8 @@
 
 mod detection;
 mod inlet;
+mod lifecycle;
+mod log;
 mod mapper;
 mod outputs;
 #[cfg(test)]
@@ -37,6 +39,7 @@ pub use outputs::{NodeName, Outputs};
 pub use sensitivity::end_derivatives;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, TemperatureSeen, UnstableMode, VibrationSample, Watch};
 
+use crate::bus::lifecycle::State;
 use crate::bus::{Bus, Received};
 use crate::files::chart_file::ChartFile;
 use crate::msgs::{self, Header, RigInfo, Time};
@@ -49,6 +52,7 @@ use crate::session::{conditions, settings::Settings};
 use crate::system::clock;
 use detection::DetectionInlet;
 use inlet::Running;
+use lifecycle::{Charting, Lifecycle};
 use mapper::Mapper;
 use sensitivity::Question;
 use statistics::Statistics;
@@ -96,6 +100,8 @@ pub enum Incoming {
     Chart { rig: Arc<Rig>, chart: Result<Arc<Chart>, String> },
     /// The rig at a temperature, followed by its map if it has one, or why it could not be built.
     Rig { celsius: f64, result: Result<Vec<Event>, String> },
+    /// A peer has requested another state.
+    Lifecycle,
     /// End of the run.
     Stop,
 }
@@ -116,6 +122,11 @@ struct Worker {
     outputs: Outputs,
     mapper: Mapper,
     statistics: Statistics,
+    log: log::NodeLog,
+    lifecycle: Lifecycle,
+    /// The state that was last followed.
+    state: State,
+    charting: Charting,
     watch: Watch,
     received_before: Remembered,
     vibration_received_before: Remembered,
@@ -152,7 +163,8 @@ impl Node {
         let (sender, queue) = bounded(QUEUE);
         let (running, lost) = (Running::default(), Arc::<AtomicU64>::default());
         let (detection, samples) = detection::Prepared::new();
-        let inlet = Inlet::new(sender.clone(), running.clone(), lost.clone(), samples.clone());
+        let lifecycle = Lifecycle::default();
+        let inlet = Inlet::new(sender.clone(), running.clone(), lost.clone(), lifecycle.clone(), samples.clone());
         let worker = Worker {
             session: Session::new(rig.clone(), settings),
             mapper: Mapper::spawn(rig.clone(), sender.clone()),
@@ -162,6 +174,10 @@ impl Node {
             rig,
             outputs: Outputs::default(),
             statistics: Statistics::new(lost),
+            log: log::NodeLog::new(),
+            lifecycle: lifecycle.clone(),
+            state: State::Active,
+            charting: Charting::default(),
             watch,
             received_before: Remembered::new(REMEMBERED),
             vibration_received_before: Remembered::new(VIBRATIONS_REMEMBERED),
@@ -179,10 +195,17 @@ impl Node {
         (Self { worker, sender, queue, running, detection }, inlet)
     }
 
-    /// Builds the chart of the rig in the background, or loads it from the file `kept`. Predictions use the chart as
-    /// soon as it is available.
+    /// Builds the chart of the rig in the background once the node runs, or loads it from the file `kept`. Predictions
+    /// use the chart as soon as it is available.
     pub fn with_chart(mut self, kept: Option<ChartFile>) -> Self {
-        self.worker.mapper.chart(kept);
+        self.worker.charting = Charting::Wanted(kept);
+        self
+    }
+
+    /// Starts in this state instead of active. Buses change it later.
+    pub fn starting_as(mut self, state: State) -> Self {
+        self.worker.lifecycle.set(state);
+        self.worker.state = state;
         self
     }
 
@@ -231,6 +254,7 @@ impl Worker {
     /// Handles all items, until none is left or diagnostics are due; then detects silence and publishes diagnostics.
     fn work_off(&mut self, incoming: &Receiver<Incoming>) -> Next {
         loop {
+            self.follow_lifecycle();
             while self.backlog.len() < QUEUE {
                 match incoming.try_recv() {
                     Ok(later) => self.admit(later),
@@ -243,7 +267,10 @@ impl Worker {
                 Some(Incoming::Stop) => return Next::Stop,
                 Some(Incoming::Input(received)) => {
                     self.inputs_waiting -= 1;
-                    self.input(received);
+                    // It came before the node was deactivated.
+                    if self.state == State::Active || self.lifecycle.receives() {
+                        self.input(received);
+                    }
                 }
                 Some(Incoming::Vibration(received)) => self.vibration(received),
                 Some(Incoming::Temperature(received)) => self.temperature(received),
@@ -253,6 +280,7 @@ impl Worker {
                 Some(Incoming::Sensitivity(found)) => self.sensitivity(*found),
                 Some(Incoming::Chart { rig, chart }) => self.chart(&rig, chart),
                 Some(Incoming::Rig { celsius, result }) => self.rig_ready(celsius, result),
+                Some(Incoming::Lifecycle) => {}
             }
             if Instant::now() >= self.next_diagnostics {
                 break;
@@ -290,15 +318,13 @@ impl Worker {
         }
     }
 
-    /// Publishes the rig, records the initial settings and requests the map at the reference conditions.
     fn begin(&mut self) {
-        self.outputs.rig_info(rig_info(&self.rig));
-        let settings: Vec<(&str, f64)> = self.session.settings().values().collect();
-        for (name, value) in settings {
-            self.outputs.session_event(parameter_record(now_header(), name, value));
-        }
         self.watch.settings(self.session.settings());
-        self.mapper.request_map(self.rig.reference);
+        self.statistics.state(self.state);
+        self.watch.state(self.state);
+        if self.state.is_prepared() {
+            self.prepare();
+        }
     }
 
     /// Appends an item to the backlog. Duplicates from the other bus are dropped here: once queued, a duplicate would
@@ -529,10 +555,12 @@ impl Worker {
         let pending = self.mapper.pending();
         let sound = self.detection.report();
         let outputs = &mut self.outputs;
+        self.statistics.unheard = self.lifecycle.unheard();
         self.statistics.temperature_timeout_s = self.session.settings().temperature_timeout_s;
         let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, sound, outputs);
         self.watch.counters(counters, self.statistics.passed_over, self.statistics.restarts);
         self.watch.recording_problem(self.outputs.recorder.as_ref().and_then(|recorder| recorder.status().problem()));
+        self.log.write(&array, &mut self.outputs);
         self.outputs.diagnostics(array);
     }
 }

@@ -1,5 +1,6 @@
 //! The buses and the recorder that a node publishes to. A message that a bus refuses is counted; the node never waits.
 
+use crate::bus::log::Severity;
 use crate::bus::ros2::NODE_NAME;
 use crate::bus::{Bus, Connection, Outgoing, Report};
 use crate::msgs::schema::Topic;
@@ -100,6 +101,13 @@ impl Outputs {
     pub fn diagnostics(&mut self, diagnostics: DiagnosticArray) {
         self.publish(Outgoing::Diagnostics(&diagnostics));
         self.record(Reading::now(), Payload::Diagnostics(diagnostics));
+    }
+
+    /// Writes a line to the logs of the buses. A line that a bus refuses is not worth a warning.
+    pub fn log(&mut self, severity: Severity, text: &str) {
+        for bus in &mut self.buses {
+            drop(bus.publish(Outgoing::Log(severity, text)));
+        }
     }
 
     pub fn heard(&mut self, heard: Heard) {

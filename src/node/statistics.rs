@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use super::Outputs;
 use super::detection::SoundReport;
 use super::status::{Inputs, Status};
+use crate::bus::lifecycle::State as NodeState;
 use crate::bus::{Bus, Counts, Report};
 use crate::msgs::{DiagnosticArray, DiagnosticStatus, Header, KeyValue};
 use crate::physics::Chart;
@@ -15,7 +16,7 @@ use crate::rig::Rig;
 use crate::session::Counters;
 
 /// Levels of `diagnostic_msgs/DiagnosticStatus`.
-mod diagnostic_level {
+pub(super) mod diagnostic_level {
     pub const OK: u8 = 0;
     pub const WARN: u8 = 1;
     pub const ERROR: u8 = 2;
@@ -49,6 +50,9 @@ pub struct Statistics {
     pub refused: Option<String>,
     inputs: Inputs,
     level: Option<u8>,
+    state: NodeState,
+    /// Messages that came while the node was not active.
+    pub unheard: u64,
     /// The losses counted at the last report.
     lost_before: Lost,
     sound_before: SoundReport,
@@ -121,6 +125,17 @@ impl Statistics {
     /// Takes note of a silence.
     pub fn silence(&mut self) {
         self.inputs.silence();
+    }
+
+    /// Takes note of the state of the node. What it received before no longer counts.
+    pub fn state(&mut self, state: NodeState) {
+        self.state = state;
+        (self.inputs, self.level) = (Inputs::default(), None);
+    }
+
+    /// Whether the rig in force is charted.
+    pub fn is_charted(&self) -> bool {
+        self.chart.is_some()
     }
 
     pub fn charted(&mut self, chart: &Chart) {
@@ -209,9 +224,13 @@ impl Statistics {
         }
         warnings.extend(lost.since(&self.lost_before));
         self.lost_before = lost;
-        let status = Status::new(self.level, self.inputs);
+        let status = Status::new(self.state, self.level, self.inputs);
         let level = if warnings.is_empty() { level_of(status) } else { level_of(status).max(diagnostic_level::WARN) };
         let mut message = status.name().to_owned();
+        if status == Status::Inactive {
+            message += "; ";
+            message += self.state.sentence();
+        }
         for warning in &warnings {
             message += "; ";
             message += warning;
@@ -301,6 +320,7 @@ impl Statistics {
             pair("inputs_passed_over", self.passed_over),
             pair("inputs_lost", self.lost.load(Ordering::Relaxed)),
             pair("inputs_waiting", queued),
+            pair("messages_while_not_active", self.unheard),
             pair("predictions_solved", solved),
             pair("predictions_from_chart", charted),
             pair("predictions_reused", reused),
@@ -331,7 +351,8 @@ impl Statistics {
 /// no prediction, which is an error.
 fn level_of(status: Status) -> u8 {
     match status {
-        Status::Ok => diagnostic_level::OK,
+        // A managed node that waits is as its manager wants it.
+        Status::Ok | Status::Inactive => diagnostic_level::OK,
         Status::Waiting | Status::Warn | Status::Squeal => diagnostic_level::WARN,
         Status::Fault | Status::NoData => diagnostic_level::ERROR,
     }

@@ -6,6 +6,7 @@ use std::fmt::Write;
 use serde::Serialize;
 
 use super::watch::{UnstableMode, fastest_modes};
+use crate::bus::lifecycle::State;
 use crate::msgs::{OperatingPoint, Prediction, level, listed};
 use crate::physics::{Ends, OperatingPoint as Point, StabilityMap};
 use crate::session::conditions;
@@ -24,6 +25,8 @@ listed! {
         Fault,
         /// Inputs were received and have stopped.
         NoData,
+        /// A managed node that is not active: it receives nothing.
+        Inactive,
     }
 }
 
@@ -52,15 +55,16 @@ impl Inputs {
 }
 
 impl Status {
-    /// The status for the latest prediction's `level`; `None` before the first prediction.
-    pub fn new(level: Option<u8>, inputs: Inputs) -> Self {
-        match (level, inputs) {
-            (None, _) | (_, Inputs { received: false, silent: true }) => Self::Waiting,
-            (_, Inputs { received: true, silent: true }) => Self::NoData,
-            (Some(level::OK), _) => Self::Ok,
-            (Some(level::WARN), _) => Self::Warn,
-            (Some(level::SQUEAL), _) => Self::Squeal,
-            (Some(_), _) => Self::Fault,
+    /// The status of a node in `state` for the latest prediction's `level`; `None` before the first prediction.
+    pub fn new(state: State, level: Option<u8>, inputs: Inputs) -> Self {
+        match (state, level, inputs) {
+            (State::Unconfigured | State::Inactive | State::Finalized, _, _) => Self::Inactive,
+            (State::Active, None, _) | (State::Active, _, Inputs { received: false, silent: true }) => Self::Waiting,
+            (State::Active, _, Inputs { received: true, silent: true }) => Self::NoData,
+            (State::Active, Some(level::OK), _) => Self::Ok,
+            (State::Active, Some(level::WARN), _) => Self::Warn,
+            (State::Active, Some(level::SQUEAL), _) => Self::Squeal,
+            (State::Active, Some(_), _) => Self::Fault,
         }
     }
 
@@ -73,13 +77,14 @@ impl Status {
             Self::Squeal => "SQUEAL",
             Self::Fault => "FAULT",
             Self::NoData => "NO DATA",
+            Self::Inactive => "INACTIVE",
         }
     }
 
     /// The level of messages with this status; `None` without data.
     pub fn level(self) -> Option<u8> {
         match self {
-            Self::Waiting | Self::NoData => None,
+            Self::Waiting | Self::NoData | Self::Inactive => None,
             Self::Ok => Some(level::OK),
             Self::Warn => Some(level::WARN),
             Self::Squeal => Some(level::SQUEAL),
@@ -91,7 +96,7 @@ impl Status {
     pub fn is_known(self) -> bool {
         match self {
             Self::Ok | Self::Warn | Self::Squeal => true,
-            Self::Waiting | Self::Fault | Self::NoData => false,
+            Self::Waiting | Self::Fault | Self::NoData | Self::Inactive => false,
         }
     }
 }
@@ -165,6 +170,11 @@ impl Assessment {
         Self { status: Status::Waiting, message, fastest: None, next: None }
     }
 
+    /// The assessment of a managed node that is not active.
+    pub fn inactive(state: State) -> Self {
+        Self { status: Status::Inactive, message: state.sentence().to_owned(), fastest: None, next: None }
+    }
+
     /// The assessment of `prediction`, made for `input` while `windows` were in force.
     pub fn new(
         status: Status,
@@ -180,6 +190,7 @@ impl Assessment {
         let fastest = fastest.filter(|_| status.is_known());
         let message = match status {
             Status::Waiting => return Self::waiting(),
+            Status::Inactive => return Self::inactive(State::Inactive),
             Status::NoData => "inputs have stopped".to_owned(),
             Status::Fault => prediction.reason.clone(),
             Status::Squeal => growing(fastest, prediction.unstable_modes),
@@ -255,13 +266,13 @@ mod tests {
     #[test]
     fn silence_is_not_a_fault_and_each_level_has_its_own_status() {
         let received = inputs(true, false);
-        let of = |level| Status::new(Some(level), received);
+        let of = |level| Status::new(State::Active, Some(level), received);
         let levels = [level::OK, level::WARN, level::SQUEAL, level::FAULT];
         assert_eq!(levels.map(of), [Status::Ok, Status::Warn, Status::Squeal, Status::Fault]);
-        assert_eq!(Status::new(None, Inputs::default()), Status::Waiting);
-        assert_eq!(Status::new(None, received), Status::Waiting, "received, not predicted yet");
-        assert_eq!(Status::new(Some(level::FAULT), inputs(false, true)), Status::Waiting);
-        assert_eq!(Status::new(Some(level::FAULT), inputs(true, true)), Status::NoData);
+        assert_eq!(Status::new(State::Active, None, Inputs::default()), Status::Waiting);
+        assert_eq!(Status::new(State::Active, None, received), Status::Waiting, "received, not predicted yet");
+        assert_eq!(Status::new(State::Active, Some(level::FAULT), inputs(false, true)), Status::Waiting);
+        assert_eq!(Status::new(State::Active, Some(level::FAULT), inputs(true, true)), Status::NoData);
     }
 
     #[test]
@@ -269,15 +280,19 @@ mod tests {
         let mut inputs = Inputs::default();
         inputs.silence();
         inputs.predicted();
-        assert_eq!(Status::new(Some(level::FAULT), inputs), Status::Waiting, "the silence at the start");
+        assert_eq!(Status::new(State::Active, Some(level::FAULT), inputs), Status::Waiting, "the silence at the start");
         inputs.came();
         inputs.predicted();
-        assert_eq!(Status::new(Some(level::OK), inputs), Status::Ok);
+        assert_eq!(Status::new(State::Active, Some(level::OK), inputs), Status::Ok);
         inputs.silence();
-        assert_eq!(Status::new(Some(level::FAULT), inputs), Status::NoData);
+        assert_eq!(Status::new(State::Active, Some(level::FAULT), inputs), Status::NoData);
         let mut cut_off = Inputs::default();
         cut_off.predicted();
-        assert_eq!(Status::new(Some(level::FAULT), cut_off), Status::Fault, "a fault whose input was not recorded");
+        assert_eq!(
+            Status::new(State::Active, Some(level::FAULT), cut_off),
+            Status::Fault,
+            "a fault whose input was not recorded"
+        );
     }
 
     fn squeal() -> Prediction {

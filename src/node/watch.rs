@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::sound_view::SoundView;
 use super::status::{Assessment, Inputs, Status};
+use crate::bus::lifecycle::State;
 use crate::msgs::{Heard, OperatingPoint, Prediction, Vibration, heard_state, level};
 use crate::physics::{Ends, NextWindow, StabilityMap};
 use crate::rig::Rig;
@@ -24,6 +25,8 @@ pub struct Snapshot {
     pub received: Option<Instant>,
     /// Whether inputs arrive.
     pub inputs: Inputs,
+    /// The lifecycle state of the node.
+    pub state: State,
     pub map: Option<Arc<StabilityMap>>,
     /// Window ends of the map at a load and speed other than the map's own.
     pub ends: Option<Arc<Ends>>,
@@ -62,8 +65,11 @@ impl TemperatureSeen {
 impl Snapshot {
     /// Status, message, fastest mode and next window of this state.
     pub fn assessment(&self) -> Assessment {
+        if self.state != State::Active {
+            return Assessment::inactive(self.state);
+        }
         let Some(prediction) = &self.prediction else { return Assessment::waiting() };
-        let status = Status::new(Some(prediction.level), self.inputs);
+        let status = Status::new(self.state, Some(prediction.level), self.inputs);
         let map = self.map.as_deref();
         let windows = map.map(|map| (map, self.ends.as_deref().unwrap_or(&map.ends)));
         let assessment = Assessment::new(status, prediction, self.input.as_ref(), windows);
@@ -148,7 +154,7 @@ impl Sample {
             normal_load_n: value(|input| input.normal_load_n),
             disc_speed_rad_s: value(|input| input.disc_speed_rad_s),
             friction_coefficient: value(|input| input.friction_coefficient),
-            status: Status::new(Some(prediction.level), inputs),
+            status: Status::new(State::Active, Some(prediction.level), inputs),
             unstable_modes: prediction.unstable_modes,
             max_growth_rate_per_s: prediction.max_growth_rate_per_s,
             critical_friction: prediction.critical_friction,
@@ -249,6 +255,15 @@ impl Watch {
             watched.snapshot.received = Some(Instant::now());
             watched.input = Some(input.clone());
             watched.is_new = true;
+        });
+    }
+
+    /// Takes note of the state of the node. What was predicted before is no longer shown.
+    pub fn state(&self, state: State) {
+        self.with(|Watched { snapshot, input, is_new, .. }| {
+            snapshot.state = state;
+            (snapshot.input, snapshot.prediction, snapshot.received) = (None, None, None);
+            (snapshot.inputs, *input, *is_new) = (Inputs::default(), None, false);
         });
     }
 

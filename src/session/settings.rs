@@ -71,12 +71,17 @@ settings! {
         "relative change of load or speed after which windows of instability no longer count";
 }
 
+/// The parameter of this name.
+pub fn find(name: &str) -> Option<&'static Parameter> {
+    PARAMETERS.iter().find(|parameter| parameter.name == name)
+}
+
 /// Looks up a parameter and checks `value` against its range.
 ///
 /// # Errors
 /// [`SettingError`] for an unknown name or a value outside the range.
 pub fn validate(name: &str, value: f64) -> Result<&'static Parameter, SettingError> {
-    let Some(parameter) = PARAMETERS.iter().find(|p| p.name == name) else {
+    let Some(parameter) = find(name) else {
         let known: Vec<_> = PARAMETERS.iter().map(|p| p.name).collect();
         return Err(SettingError::Unknown { name: name.to_owned(), known: known.join(", ") });
     };

@@ -12,6 +12,8 @@ use crate::text::terminal::{self, printable};
 const MOST_LINES: usize = 200;
 
 static WAITING: Mutex<Option<Waiting>> = Mutex::new(None);
+/// The lines since they were last taken; `None` until [`collect`] is called.
+static COLLECTED: Mutex<Option<Waiting>> = Mutex::new(None);
 
 #[derive(Default)]
 struct Waiting {
@@ -38,8 +40,22 @@ fn waiting() -> MutexGuard<'static, Option<Waiting>> {
     WAITING.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// Begins to collect lines for [`take`].
+pub fn collect() {
+    COLLECTED.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert_default();
+}
+
+/// The lines since the last call, oldest first; none before [`collect`].
+pub fn take() -> impl Iterator<Item = String> {
+    let mut collected = COLLECTED.lock().unwrap_or_else(PoisonError::into_inner);
+    collected.as_mut().map(std::mem::take).unwrap_or_default().into_lines()
+}
+
 /// Writes a line, or keeps it back while a [`Hold`] exists.
 pub fn line(text: fmt::Arguments<'_>) {
+    if let Some(collected) = COLLECTED.lock().unwrap_or_else(PoisonError::into_inner).as_mut() {
+        collected.push(printable(&text.to_string()).into_owned());
+    }
     match waiting().as_mut() {
         Some(waiting) => waiting.push(printable(&text.to_string()).into_owned()),
         None => terminal::note(text),

@@ -107,12 +107,13 @@ export const SITUATIONS = {
   worst: state(predicted(0.93, 5216)),
   fault: state({ ...blank(3, FAULT), status: "fault", message: FAULT, load: -5, speed: 13.04, mu: 0.42 }),
   waiting: state({ age_s: null, rate_hz: 0, map: 0, events: 0, status: "waiting", message: "no input was received yet", counters: { solved: 0, charted: 0, reused: 0, faults: 1, passed_over: 0, ros2_falls: 0 }, spread: null, trend_per_s: null, fastest: null, next: null }),
+  inactive: state({ age_s: null, rate_hz: 0, map: 0, events: 0, status: "inactive", message: "inactive: it waits to be activated over ROS 2", counters: { solved: 0, charted: 0, reused: 0, faults: 1, passed_over: 0, ros2_falls: 0 }, spread: null, trend_per_s: null, fastest: null, next: null }),
   no_data: state({ ...blank(3, "no input for 1 s"), age_s: 5.4, rate_hz: 0, status: "no_data", message: "operating points came and stopped" }),
 };
 
 /** Five minutes that end with the situation, friction rising and falling before. */
 function history(situation) {
-  if (situation === "waiting") return { bin_s: BIN_S, bins: [] };
+  if (["waiting", "inactive"].includes(situation)) return { bin_s: BIN_S, bins: [] };
   const last = Math.floor(NOW / BIN_S);
   const ends = SITUATIONS[situation].mu ?? 0.6;
   const bins = [];
@@ -154,7 +155,7 @@ export function serve(assets, situation, more = {}) {
     "/about.json": () => ({ ...about, ...more }),
     "/state.json": () => SITUATIONS[situation],
     "/history.json": () => history(situation),
-    "/events.json": () => (situation === "waiting" ? [] : events()),
+    "/events.json": () => (["waiting", "inactive"].includes(situation) ? [] : events()),
     "/squeals-in-sound.json": () => [],
     "/comparison.json": () => null,
     "/sound.json": () => ({ channels: [], scores: [] }),

@@ -21,7 +21,7 @@ const readAt = async (page, ...keys) => {
   return { mu: Number(await page.locator("#map-plots").getAttribute("aria-valuenow")), text: await page.locator("#map-plots").getAttribute("aria-valuetext") };
 };
 
-const WORDS = { ok: "OK", warn: "WARN", squeal: "SQUEAL", fault: "FAULT", waiting: "WAITING", no_data: "NO DATA" };
+const WORDS = { ok: "OK", warn: "WARN", squeal: "SQUEAL", fault: "FAULT", waiting: "WAITING", no_data: "NO DATA", inactive: "INACTIVE" };
 
 // Every status at a glance, from a telephone to a wall, light and dark.
 for (const [status, word] of Object.entries(WORDS)) {

@@ -454,6 +454,35 @@ fn best_effort_and_reliable_publishers_are_received_once() {
 }
 
 #[test]
+fn a_user_chooses_the_quality_of_service_of_a_topic() {
+    let domain = Domain::claim();
+    let start = |policy: &str| {
+        let parameter = format!("qos_overrides./rig/operating_point.subscription.reliability:={policy}");
+        let (args, _) = RosArgs::split(["--ros-args", "-p", &parameter].map(str::to_owned)).expect("well formed");
+        let options = Ros2Options { args: args.renamed(policy), ..ros_options(&domain) };
+        let (points, received) = unbounded();
+        (Ros2::start(&options, Parameters::none(), into(points), |_| ()).expect("node"), received)
+    };
+    let (reliable, from_reliable) = start("reliable");
+    let (best_effort, from_best_effort) = start("best_effort");
+    // Each has one subscription instead of two.
+    let source = Ros2Source::start(&ros_options(&domain), |_| ()).expect("source");
+    wait_until("discovery", || source.readers() == READERS);
+    wait_until("the source", || [&reliable, &best_effort].iter().all(|ros| ros.operating_point_writers() == 1));
+    source.publish(&point(7)).expect("published");
+    assert_eq!((next(&from_reliable).message.seq, next(&from_best_effort).message.seq), (7, 7));
+    let (mut node, _runtime) = foreign_node(&domain, "driver");
+    let profile = ros2_client::QosProfile::publisher_default().reliability(ros2_client::qos::Reliability::BestEffort);
+    let name = ros2_client::Name::new("/rig", "operating_point").expect("name");
+    let kind = ros2_client::MessageTypeName::new("squealcast_msgs", "OperatingPoint");
+    let topic = node.create_topic(&name, kind, &profile).expect("topic");
+    let _driver = node.create_publisher::<OperatingPoint>(&topic, None).expect("publisher");
+    wait_until("the sensor's driver is refused", || reliable.counts().incompatible == 1);
+    wait_until("the sensor's driver is known", || best_effort.operating_point_writers() == 2);
+    assert_eq!(best_effort.counts().incompatible, 0);
+}
+
+#[test]
 fn peers_with_incompatible_quality_of_service_are_counted_while_they_are_there() {
     use ros2_client::{MessageTypeName, Name, QosProfile};
     let domain = Domain::claim();
@@ -540,8 +569,9 @@ fn a_late_ros2_reader_gets_the_rig() {
 #[test]
 fn ros2_parameters_are_judged() {
     use ros2_client::rcl_interfaces::{
-        GetParametersRequest, GetParametersResponse, ListParametersRequest, ListParametersResponse,
-        SetParametersRequest, SetParametersResponse,
+        DescribeParametersRequest, DescribeParametersResponse, GetParametersRequest, GetParametersResponse,
+        ListParametersRequest, ListParametersResponse, SetParametersAtomicallyResponse, SetParametersRequest,
+        SetParametersResponse,
     };
     use ros2_client::{
         Context, Name, NodeName, NodeOptions, Parameter, ParameterValue, QosProfile, ServiceMapping, ServiceTypeName,
@@ -553,6 +583,7 @@ fn ros2_parameters_are_judged() {
     let parameters = Parameters {
         values: vec![("warn_margin".to_owned(), 0.05), ("dead_band".to_owned(), 0.0)],
         validate: Box::new(|name, value| if value < 0.0 { Err(format!("{name}: {value} is below 0")) } else { Ok(()) }),
+        describe: |name| (name == "warn_margin").then_some(("what it is", [0.0, 1.0])),
         accepted: Box::new(move |name, value| collecting.lock().expect("whole").push((name.to_owned(), value))),
     };
     let _ros = Ros2::start(&options, parameters, |_| (), |_| ()).expect("node");
@@ -629,6 +660,33 @@ fn ros2_parameters_are_judged() {
         GetParametersResponse
     );
     assert_eq!(got.values[0].double_value, 0.1);
+    let described: DescribeParametersResponse = call!(
+        "DescribeParameters",
+        "describe_parameters",
+        DescribeParametersRequest { names: vec!["warn_margin".to_owned(), "use_sim_time".to_owned()] },
+        DescribeParametersResponse
+    );
+    let [margin, sim_time] = &described.values[..] else { panic!("{described:?}") };
+    let range = &margin.floating_point_range[0];
+    assert_eq!((&*margin.description, range.from_value, range.to_value), ("what it is", 0.0, 1.0));
+    assert!(sim_time.read_only && !margin.read_only, "{described:?}");
+    let of = |name: &str, value| Parameter { name: name.to_owned(), value }.into();
+    let set_together: SetParametersAtomicallyResponse = call!(
+        "SetParametersAtomically",
+        "set_parameters_atomically",
+        SetParametersRequest {
+            parameter: vec![
+                of("warn_margin", ParameterValue::Double(0.7)),
+                of("use_sim_time", ParameterValue::Boolean(true)),
+            ]
+        },
+        SetParametersAtomicallyResponse
+    );
+    assert_eq!(
+        (set_together.result.successful, &*set_together.result.reason),
+        (false, "use_sim_time is not supported: times are those of this machine"),
+        "neither is set"
+    );
     let mut accepted = accepted.lock().expect("whole");
     accepted.dedup();
     assert_eq!(*accepted, [("warn_margin".to_owned(), 0.1)], "initial and refused values are not passed on");
@@ -639,7 +697,7 @@ fn a_refused_initial_value_is_an_error() {
     let parameters = Parameters {
         values: vec![("warn_margin".to_owned(), -1.0)],
         validate: Box::new(|_, _| Err("below 0".to_owned())),
-        accepted: Box::new(|_, _| ()),
+        ..Parameters::none()
     };
     let domain = Domain::claim();
     let error = Ros2::start(&ros_options(&domain), parameters, |_| (), |_| ()).err().expect("refused").to_string();

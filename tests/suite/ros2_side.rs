@@ -12,6 +12,7 @@ use crate::bus::{self, into, wait_until};
 use crate::forger::{ALL_FORGED, Forged, Forger, mutate, random};
 use crate::program::{self, command, text};
 use crossbeam_channel::{Receiver, Sender, unbounded};
+use squealcast::bus::lifecycle::State;
 use squealcast::bus::received::Received;
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::process::{Ros2Process, Sinks};
@@ -560,10 +561,15 @@ fn the_ros2_side_costs_little_time() {
         temperature: Box::new(|_| ()),
         waveform: Box::new(|_| ()),
         parameter: Box::new(|_, _| ()),
+        lifecycle: Box::new(|_| ()),
         fell: Box::new(|why| panic!("{why}")),
     };
     let program = env!("CARGO_BIN_EXE_squealcast").into();
-    assert!(apart.set(Ros2Process::start_program(program, &outside, vec![], sinks).expect("started")).is_ok());
+    assert!(
+        apart
+            .set(Ros2Process::start_program(program, &outside, vec![], State::Active, sinks).expect("started"))
+            .is_ok()
+    );
 
     let mut askers = [inside, outside].map(|options| {
         let (sender, received) = unbounded();

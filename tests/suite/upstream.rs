@@ -5,7 +5,7 @@ use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
 use crate::domain::Domain;
-use ros2_client::{Context, Name, Node, NodeName, NodeOptions, QosProfile, ServiceMapping, ServiceTypeName};
+use ros2_client::{Context, Node, NodeName, NodeOptions};
 use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options};
@@ -84,39 +84,6 @@ fn types_are_announced_without_their_hash() {
     assert!(
         !String::from_utf8_lossy(&prediction.user_data).contains("typehash="),
         "cured upstream: the limit of type hashes in launch/ROS2.md can go"
-    );
-}
-
-#[test]
-fn parameters_are_not_described() {
-    use ros2_client::rcl_interfaces::{DescribeParametersRequest, DescribeParametersResponse};
-    let domain = Domain::claim();
-    let _ros = node(&domain);
-    let (_context, mut node) = onlooker(&domain);
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().expect("runtime");
-    runtime.spawn(node.spinner().expect("spinner").spin());
-    let profile = QosProfile::publisher_default();
-    let client = node
-        .create_client::<_, DescribeParametersResponse>(
-            ServiceMapping::Enhanced,
-            &Name::new("/squealcast", "describe_parameters").expect("name"),
-            &ServiceTypeName::new("rcl_interfaces", "DescribeParameters"),
-            profile.clone(),
-            profile,
-        )
-        .expect("client");
-    let described: DescribeParametersResponse = awaited("an answer", || {
-        let asked = async {
-            client.wait_for_service(&node).await;
-            client.async_call_service(DescribeParametersRequest { names: vec!["warn_margin".to_owned()] }).await
-        };
-        let answer = runtime.block_on(async { tokio::time::timeout(Duration::from_secs(1), asked).await });
-        answer.ok().map(|answer| answer.expect("answered"))
-    });
-    let text = format!("{described:?}");
-    assert!(
-        text.contains("not implemented"),
-        "cured upstream: give parameters the descriptions and ranges of settings.rs, and say so in launch/ROS2.md: {text}"
     );
 }
 

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use super::process::{Health, Ros2Process, Sinks};
 use super::{Parameters, Ros2, Ros2Error, Ros2Options, Ros2Source};
+use crate::bus::lifecycle::State;
 use crate::bus::{Bus, BusError, Connection, Outgoing, Report, Sink};
 use crate::msgs::schema::Topic;
 
@@ -18,16 +19,17 @@ pub struct Ros2NodeConnection {
 }
 
 impl Ros2NodeConnection {
-    /// Starts the ROS 2 side with these initial `parameters` and passes what it receives to `sink`.
+    /// Starts the ROS 2 side with these initial `parameters`, in this `state`, and passes what it receives to `sink`.
     ///
     /// # Errors
     /// As [`Ros2Process::start`].
     pub fn start(
         options: &Ros2Options,
         parameters: Vec<(String, f64)>,
+        state: State,
         sink: &Arc<dyn Sink>,
     ) -> Result<Self, Ros2Error> {
-        let [inputs, vibrations, temperatures, waveforms, changes] = std::array::from_fn(|_| sink.clone());
+        let [inputs, vibrations, temperatures, waveforms, changes, states] = std::array::from_fn(|_| sink.clone());
         let sinks = Sinks {
             // The thread that receives from the child process serves all topics: it must not be held up.
             input: Box::new(move |received| {
@@ -51,10 +53,11 @@ impl Ros2NodeConnection {
                 }
             }),
             parameter: Box::new(move |name, value| changes.parameter(name, value)),
+            lifecycle: Box::new(move |state| states.lifecycle(state)),
             fell: Box::new(|why| note!("the ROS 2 side ended and is restarted: {why}")),
         };
         Ok(Self {
-            process: Ros2Process::start(options, parameters, sinks)?,
+            process: Ros2Process::start(options, parameters, state, sinks)?,
             readers: Readers::default(),
             encodings_skipped: 0,
             health_before: Health::default(),
@@ -81,6 +84,7 @@ impl Connection for Ros2NodeConnection {
             Outgoing::Sensitivity(message) => self.process.publish_sensitivity(message)?,
             Outgoing::Diagnostics(message) => self.process.publish_diagnostics(message)?,
             Outgoing::Heard(message) => self.process.publish_heard(message)?,
+            Outgoing::Log(severity, text) => self.process.log(severity, text)?,
             // Published by the rig.
             Outgoing::OperatingPoint(_) | Outgoing::Vibration(_) | Outgoing::Waveform(_) | Outgoing::Temperature(_) => {
             }
@@ -167,7 +171,8 @@ impl Connection for Ros2Source {
             | Outgoing::RigInfo(_)
             | Outgoing::Sensitivity(_)
             | Outgoing::Diagnostics(_)
-            | Outgoing::Heard(_) => {}
+            | Outgoing::Heard(_)
+            | Outgoing::Log(..) => {}
         }
         Ok(())
     }
@@ -226,6 +231,7 @@ impl Connection for Ros2ReplayConnection {
             Outgoing::Waveform(message) => self.rig.publish_waveform(message)?,
             Outgoing::Temperature(message) => self.rig.publish_temperature(message)?,
             Outgoing::Heard(message) => self.node.publish_heard(message)?,
+            Outgoing::Log(severity, text) => self.node.log(severity, text)?,
         }
         Ok(())
     }

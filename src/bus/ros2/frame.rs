@@ -10,6 +10,8 @@ use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use super::Ros2Options;
+use crate::bus::lifecycle::State;
+use crate::bus::log::Severity;
 use crate::bus::received::Counts;
 use crate::msgs::{
     self, CdrError, DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent,
@@ -34,6 +36,8 @@ pub(super) enum ToSide<'a> {
     Sensitivity(Cow<'a, Sensitivity>),
     Diagnostics(Cow<'a, DiagnosticArray>),
     Heard(Cow<'a, Heard>),
+    /// A line for `/rosout`.
+    Log(Severity, Cow<'a, str>),
 }
 
 /// How the ROS 2 side joins the network.
@@ -42,6 +46,7 @@ pub(super) struct Start {
     pub options: Ros2Options,
     /// Parameters and their present values.
     pub parameters: Vec<(String, f64)>,
+    pub state: State,
 }
 
 /// What the ROS 2 side sends to its node.
@@ -72,6 +77,8 @@ pub(super) enum FromSide {
         name: String,
         value: f64,
     },
+    /// A peer brought the node into this state.
+    Lifecycle(State),
     /// Sent regularly: its absence shows that the ROS 2 side hangs.
     Status(Status),
 }

@@ -1,12 +1,17 @@
 //! One ROS 2 node with its subscriptions, on its own thread.
 
+use std::collections::HashSet;
 use std::net::Ipv4Addr;
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 
-use ros2_client::{Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher};
-use rustdds::policy::{History, Reliability, ResourceLimits};
+use ros2_client::{
+    Context, Log, Message, MessageTypeName, Name, Node, NodeName, Publisher, QosProfile, Server, ServiceMapping,
+    ServiceTypeName,
+};
+use rustdds::policy::{History, Lifespan, Reliability, ResourceLimits};
 use rustdds::{DomainParticipantBuilder, Duration, QosPolicies, QosPolicyBuilder, Topic, TopicKind};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -18,7 +23,9 @@ use super::super::received::{Counters, Counts, Gaps, Received};
 use super::loopback::keep_to_loopback;
 use super::qos_conflicts::QosConflicts;
 use super::subscriptions::{Refused, Subscriptions};
-use super::{Ros2Error, Ros2Options, received};
+use super::{Parameters, ROSOUT, Ros2Error, Ros2Options, parameters, received};
+use crate::bus::log::Severity;
+use crate::bus::qos_overrides::{Chosen, QosOverrides, Role};
 use crate::msgs::topic;
 
 /// Samples that may wait for the thread that reads a subscription; RustDDS acknowledges samples beyond it and drops
@@ -32,7 +39,25 @@ pub(super) const MAX_BLOCKS_WAITING: i32 = 1024;
 /// readers.
 pub(super) const MAX_UNANSWERED: i32 = 1 << 15;
 
-/// The future that reads one subscription on the node's thread.
+/// Lines of `/rosout` that are kept for later readers, and for how long, as in every ROS 2 node.
+const LOG_DEPTH: i32 = 1000;
+const LOG_LIFESPAN: Duration = Duration::from_secs(10);
+/// Requests of a service that may wait for its answer.
+const REQUESTS_WAITING: i32 = 1000;
+/// Pause after a request that could not be read.
+const AFTER_FAILURE: std::time::Duration = std::time::Duration::from_millis(50);
+
+/// A node that its services share with its [`Link`].
+#[derive(Clone)]
+pub(super) struct SharedNode(Arc<Mutex<Node>>);
+
+impl SharedNode {
+    pub(super) fn lock(&self) -> MutexGuard<'_, Node> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The future that reads one subscription, or answers a service, on the node's thread.
 pub(super) type Hearing = Pin<Box<dyn Future<Output = ()> + Send>>;
 
 /// A node, and the thread that serves its parameters, reads its main topic with messages `M` and any other
@@ -42,17 +67,26 @@ pub(super) struct Link<M> {
     name: NodeName,
     subscriptions: Option<Arc<Subscriptions<M>>>,
     conflicts: QosConflicts,
-    node: Node,
+    overrides: QosOverrides,
+    parameter_services: Option<parameters::Services>,
+    node: SharedNode,
     context: Context,
     counters: Arc<Counters>,
     running: Option<(oneshot::Sender<()>, JoinHandle<()>)>,
 }
 
 impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
-    /// Joins the network with a node.
-    pub(super) fn join(options: &Ros2Options, default_name: &str, node: NodeOptions) -> Result<Self, Ros2Error> {
+    /// Joins the network with a node. Changes of its `parameters` are passed on once `started` is set.
+    pub(super) fn join(
+        options: &Ros2Options,
+        default_name: &str,
+        parameters: Parameters,
+        started: Arc<AtomicBool>,
+    ) -> Result<Self, Ros2Error> {
         let base_name = options.args.node_name(default_name);
         let namespace = options.args.namespace(&base_name, "/");
+        let (overrides, _) = options.args.qos_overrides(&namespace, &base_name)?;
+        let (node, parameter_services) = parameters.declare(started, &overrides);
         let full_name = format!("{}/{base_name}", namespace.trim_end_matches('/'));
         let failed = |reason: String| Ros2Error::Node { name: full_name.clone(), reason };
 
@@ -77,9 +111,11 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         Ok(Self {
             options: options.clone(),
             name,
-            conflicts: QosConflicts::new(context.domain_participant()),
+            conflicts: QosConflicts::new(&context),
+            overrides,
+            parameter_services: Some(parameter_services),
             context,
-            node,
+            node: SharedNode(Arc::new(Mutex::new(node))),
             subscriptions: None,
             counters: Arc::new(Counters::default()),
             running: None,
@@ -99,14 +135,68 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
             ResourceLimits { max_samples: max_unanswered, max_instances: 1, max_samples_per_instance: max_unanswered };
         // Late subscribers get the latest message only.
         let depth = if durability == Durability::TransientLocal { 1 } else { topic::DEPTH };
-        let qos = qos(durability, RELIABLE, depth).resource_limits(limits).build();
+        let chosen = self.overrides.of(Role::Publisher, &self.full_name(name));
+        let reliability = if chosen.best_effort == Some(true) { Reliability::BestEffort } else { RELIABLE };
+        let qos = qos(chosen, durability, reliability, depth).resource_limits(limits).build();
         let predicts = name == topic::PREDICTION;
         let (topic, name) = self.topic(name, &kind, &qos)?;
         self.conflicts.published(&topic, &name);
         if predicts {
             self.conflicts.predictions(&topic, &name);
         }
-        self.node.create_publisher(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
+        self.node().create_publisher(&topic, None).map_err(|e| Ros2Error::Topic { name, reason: e.to_string() })
+    }
+
+    /// The publisher of log lines; `None` if the user has switched it off.
+    pub(super) fn rosout(&mut self) -> Result<Option<Publisher<Log>>, Ros2Error> {
+        if self.options.args.log_level().is_none() {
+            return Ok(None);
+        }
+        let limits =
+            ResourceLimits { max_samples: MAX_UNANSWERED, max_instances: 1, max_samples_per_instance: MAX_UNANSWERED };
+        let qos = qos(Chosen::default(), Durability::TransientLocal, RELIABLE, LOG_DEPTH)
+            .lifespan(Lifespan { duration: LOG_LIFESPAN })
+            .resource_limits(limits)
+            .build();
+        let (topic, name) = self.topic(ROSOUT, &MessageTypeName::new("rcl_interfaces", "Log"), &qos)?;
+        let failed = |e: ros2_client::CreateError| Ros2Error::Topic { name, reason: e.to_string() };
+        self.node().create_publisher(&topic, None).map(Some).map_err(failed)
+    }
+
+    /// Adds a service of the node. Its requests are answered while the future runs.
+    pub(super) fn service<Q, A>(
+        &mut self,
+        name: &str,
+        kind: &ServiceTypeName,
+        mut answer: impl FnMut(Q) -> A + Send + 'static,
+    ) -> Result<Hearing, Ros2Error>
+    where
+        Q: Message + Clone + Send + Sync + 'static,
+        A: Message + Send + Sync + 'static,
+    {
+        let full_name = self.name.fully_qualified_name();
+        let failed = |reason: String| Ros2Error::Topic { name: format!("{full_name}/{name}"), reason };
+        let service = Name::new(&full_name, name).map_err(|e| failed(e.to_string()))?;
+        let depth = usize::try_from(REQUESTS_WAITING).unwrap_or(1);
+        let profile = QosProfile::publisher_default().history(ros2_client::qos::History::KeepLast { depth });
+        let server: Server<Q, A> = self
+            .node()
+            .create_server(ServiceMapping::Enhanced, &service, kind, profile.clone(), profile)
+            .map_err(|e| failed(e.to_string()))?;
+        Ok(Box::pin(async move {
+            loop {
+                match server.async_receive_request().await {
+                    // The client repeats its request if no answer comes.
+                    Ok((id, request)) => drop(server.async_send_response(id, answer(request)).await),
+                    Err(_) => tokio::time::sleep(AFTER_FAILURE).await,
+                }
+            }
+        }))
+    }
+
+    /// The node, for the services.
+    pub(super) fn shared_node(&self) -> SharedNode {
+        self.node.clone()
     }
 
     /// Subscribes and starts the thread, which also reads the subscriptions in `aside`.
@@ -119,18 +209,29 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         aside: Option<Hearing>,
     ) -> Result<(), Ros2Error> {
         let subscriptions = Arc::new(self.subscribe::<M>(topic, &kind, MAX_WAITING)?);
+        let parameters = self.parameter_services.take().map(|services| services.add(self)).transpose()?;
         let failed = |reason: String| Ros2Error::Topic { name: topic.to_owned(), reason };
-        let spinner = self.node.spinner().map_err(|e| failed(e.to_string()))?;
+        let spinner = self.node().spinner().map_err(|e| failed(e.to_string()))?;
+        let namesakes = self.node().status_receiver();
 
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let (stop, stopped) = oneshot::channel();
         self.subscriptions = Some(Arc::clone(&subscriptions));
         let counters = Arc::clone(&self.counters);
         let conflicts = self.conflicts.clone();
+        let full_name = self.name.fully_qualified_name();
         let thread = thread::Builder::new().name(format!("ros2 {}", self.name.base_name())).spawn(move || {
             runtime.block_on(async {
-                if let Some(hearing) = aside {
+                for hearing in aside.into_iter().chain(parameters) {
                     tokio::spawn(hearing);
+                }
+                if let Some(namesakes) = namesakes {
+                    let (conflicts, mut known) = (conflicts.clone(), HashSet::new());
+                    tokio::spawn(async move {
+                        while let Ok(event) = namesakes.recv().await {
+                            conflicts.namesakes(&event, &full_name, &mut known);
+                        }
+                    });
                 }
                 let spin = async {
                     if spinner.spin().await.is_err() {
@@ -173,17 +274,33 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         kind: &MessageTypeName,
         max_waiting: i32,
     ) -> Result<Subscriptions<N>, Ros2Error> {
-        let requested = qos(Durability::Volatile, RELIABLE, max_waiting).build();
+        let chosen = self.overrides.of(Role::Subscription, &self.full_name(topic));
+        let requested = qos(chosen, Durability::Volatile, RELIABLE, max_waiting).build();
         let (reliable, name) = self.topic(topic, kind, &requested)?;
-        let least = qos(Durability::Volatile, Reliability::BestEffort, max_waiting).build();
+        let least = qos(chosen, Durability::Volatile, Reliability::BestEffort, max_waiting).build();
         let (best_effort, _) = self.topic(topic, kind, &least)?;
-        self.conflicts.subscribed(&best_effort, &name);
+        let wants = |best_effort: bool| chosen.best_effort.is_none_or(|only| only == best_effort);
+        self.conflicts.subscribed(if wants(true) { &best_effort } else { &reliable }, &name);
         let failed =
             |error: ros2_client::CreateError| Ros2Error::Topic { name: name.clone(), reason: error.to_string() };
+        let mut node = self.node.lock();
         // The reliable one first: it then knows every publisher that the other one knows.
-        let reliable = self.node.create_subscription(&reliable, None).map_err(failed)?;
-        let best_effort = self.node.create_subscription(&best_effort, None).map_err(failed)?;
-        Ok(Subscriptions::new((reliable, requested), best_effort, self.context.domain_participant()))
+        let reliable = wants(false).then(|| node.create_subscription(&reliable, None)).transpose().map_err(failed)?;
+        let best_effort =
+            wants(true).then(|| node.create_subscription(&best_effort, None)).transpose().map_err(failed)?;
+        drop(node);
+        Ok(Subscriptions::new(reliable, requested, best_effort, self.context.domain_participant()))
+    }
+
+    /// The absolute name of a topic after remapping. Log lines are one topic for all namespaces.
+    fn full_name(&self, topic: &'static str) -> String {
+        let relative = if topic == ROSOUT { topic } else { topic::relative(topic) };
+        self.options.args.topic(relative, self.name.namespace(), self.name.base_name())
+    }
+
+    /// Whether the user wants lines of this severity on `/rosout`.
+    pub(super) fn logs(&self, severity: Severity) -> bool {
+        self.options.args.log_level().is_some_and(|least| severity >= least)
     }
 
     /// The remapped topic, and its name.
@@ -193,7 +310,7 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
         kind: &MessageTypeName,
         qos: &QosPolicies,
     ) -> Result<(Topic, String), Ros2Error> {
-        let full = self.options.args.topic(topic::relative(name), self.name.namespace(), self.name.base_name());
+        let full = self.full_name(name);
         let bad_name =
             |error: ros2_client::names::NameError| Ros2Error::Name { name: full.clone(), reason: error.to_string() };
         let name = Name::parse(&full).map_err(bad_name)?;
@@ -210,13 +327,13 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
     }
 
     pub(super) fn writers(&self) -> usize {
-        self.subscriptions.as_ref().map_or(0, |subscriptions| subscriptions.publishers(&self.node))
+        self.subscriptions.as_ref().map_or(0, |subscriptions| subscriptions.publishers(&self.node.lock()))
     }
 }
 
 impl<M> Link<M> {
-    pub(super) fn node(&self) -> &Node {
-        &self.node
+    pub(super) fn node(&self) -> MutexGuard<'_, Node> {
+        self.node.lock()
     }
 }
 
@@ -262,6 +379,16 @@ async fn hear<M: DeserializeOwned + 'static>(
 /// Reliable, and publishing never blocks.
 const RELIABLE: Reliability = Reliability::Reliable { max_blocking_time: Duration::ZERO };
 
-fn qos(durability: Durability, reliability: Reliability, depth: i32) -> QosPolicyBuilder {
-    QosPolicyBuilder::new().durability(durability).reliability(reliability).history(History::KeepLast { depth })
+/// The given policies, except those that the user has chosen. Reliability is up to the caller.
+fn qos(chosen: Chosen, durability: Durability, reliability: Reliability, depth: i32) -> QosPolicyBuilder {
+    let durability = match chosen.transient_local {
+        Some(true) => Durability::TransientLocal,
+        Some(false) => Durability::Volatile,
+        None => durability,
+    };
+    let history = match chosen.keep_all {
+        Some(true) => History::KeepAll,
+        Some(false) | None => History::KeepLast { depth: chosen.depth.unwrap_or(depth) },
+    };
+    QosPolicyBuilder::new().durability(durability).reliability(reliability).history(history)
 }

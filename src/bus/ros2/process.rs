@@ -18,8 +18,10 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, bounded, select};
 
 use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide, encode};
-use super::{NOTE, Ros2Error, Ros2Options};
+use super::{NOTE, ROSOUT, Ros2Error, Ros2Options};
 use crate::bus::Bus;
+use crate::bus::lifecycle::State;
+use crate::bus::log::Severity;
 use crate::bus::received::{Counts, Received};
 use crate::msgs::{
     DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Temperature, Vibration,
@@ -62,6 +64,8 @@ pub struct Sinks {
     pub waveform: Box<dyn FnMut(Received<Waveform>) + Send>,
     /// A peer set a parameter.
     pub parameter: ParameterSink,
+    /// A peer brought the node into this state.
+    pub lifecycle: Box<dyn FnMut(State) + Send>,
     /// The ROS 2 side failed, and why; it is being restarted.
     pub fell: Box<dyn FnMut(&str) + Send>,
 }
@@ -124,8 +128,13 @@ impl Ros2Process {
     ///
     /// # Errors
     /// As [`super::Ros2::start`]; the process cannot be started.
-    pub fn start(options: &Ros2Options, parameters: Vec<(String, f64)>, sinks: Sinks) -> Result<Self, Ros2Error> {
-        Self::start_program(THIS_PROGRAM.into(), options, parameters, sinks)
+    pub fn start(
+        options: &Ros2Options,
+        parameters: Vec<(String, f64)>,
+        state: State,
+        sinks: Sinks,
+    ) -> Result<Self, Ros2Error> {
+        Self::start_program(THIS_PROGRAM.into(), options, parameters, state, sinks)
     }
 
     /// As [`Self::start`], with `program` as the executable that has the [`COMMAND`].
@@ -136,11 +145,12 @@ impl Ros2Process {
         program: PathBuf,
         options: &Ros2Options,
         parameters: Vec<(String, f64)>,
+        state: State,
         sinks: Sinks,
     ) -> Result<Self, Ros2Error> {
         let (queue, queued) = bounded(QUEUE);
         let shared = Arc::new(Shared::default());
-        let start = Start { options: options.clone(), parameters };
+        let start = Start { options: options.clone(), parameters, state };
         let (joined, waiting) = bounded(1);
         let mut supervisor = Supervisor { program, start, sinks, queued, shared: shared.clone(), joined: Some(joined) };
         let supervisor = thread::Builder::new().name("ros2 side".to_owned()).spawn(move || supervisor.run())?;
@@ -210,6 +220,14 @@ impl Ros2Process {
     /// [`Ros2Error::Publish`].
     pub fn publish_heard(&self, heard: &Heard) -> Result<(), Ros2Error> {
         self.send(topic::HEARD, &ToSide::Heard(Cow::Borrowed(heard)))
+    }
+
+    /// Writes a line to `/rosout`.
+    ///
+    /// # Errors
+    /// [`Ros2Error::Publish`].
+    pub fn log(&self, severity: Severity, text: &str) -> Result<(), Ros2Error> {
+        self.send(ROSOUT, &ToSide::Log(severity, Cow::Borrowed(text)))
     }
 
     /// Number of readers of the predictions, including killed ones whose lease has not expired.
@@ -422,6 +440,10 @@ impl Supervisor {
                     parameter.1 = value;
                 }
                 (self.sinks.parameter)(&name, value);
+            }
+            FromSide::Lifecycle(state) => {
+                self.start.state = state;
+                (self.sinks.lifecycle)(state);
             }
             FromSide::Status(status) => {
                 let mut seen = self.shared.seen();

@@ -1,9 +1,10 @@
 //! Finds peers that DDS does not connect because their quality of service is incompatible, and peers that publish
-//! predictions on the topic of this node. DDS reports neither.
+//! predictions on the topic of this node, or have its name. DDS reports none of these.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::time::Duration;
 
+use ros2_client::{Context, Gid, NodeEvent};
 use rustdds::qos::{HasQoSPolicy, QosPolicies};
 use rustdds::{DomainParticipant, GUID, RTPSEntity, Topic};
 
@@ -34,6 +35,7 @@ impl Endpoint {
 #[derive(Clone)]
 pub(super) struct QosConflicts {
     participant: DomainParticipant,
+    own: Gid,
     published: Vec<Endpoint>,
     subscribed: Vec<Endpoint>,
     /// The topic of predictions: its name and its DDS name.
@@ -41,8 +43,14 @@ pub(super) struct QosConflicts {
 }
 
 impl QosConflicts {
-    pub(super) fn new(participant: DomainParticipant) -> Self {
-        Self { participant, published: Vec::new(), subscribed: Vec::new(), predictions: None }
+    pub(super) fn new(context: &Context) -> Self {
+        Self {
+            participant: context.domain_participant(),
+            own: context.participant_entities_info().gid(),
+            published: Vec::new(),
+            subscribed: Vec::new(),
+            predictions: None,
+        }
     }
 
     /// Adds a topic that the node publishes.
@@ -79,6 +87,18 @@ impl QosConflicts {
                 note!("{NOTE}{what}");
             }
             known = found;
+        }
+    }
+
+    /// Reports the nodes of another participant that have the `name` of this one. `known` are those reported before.
+    pub(super) fn namesakes(&self, event: &NodeEvent, name: &str, known: &mut HashSet<Gid>) {
+        let NodeEvent::ParticipantEntities(info) = event else { return };
+        let is_namesake = info.nodes().iter().any(|node| node.fully_qualified_name() == name);
+        if is_namesake && info.gid() != self.own && known.len() < MAX_DESCRIBED && known.insert(info.gid()) {
+            note!(
+                "{NOTE}another node is named {name} too, tools cannot tell them apart; -r __node:=NAME or \
+                 -r __ns:=/NAME gives this one another name"
+            );
         }
     }
 

@@ -18,7 +18,7 @@ use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal,
 use serde::Serialize;
 
 use super::frame::{Frames, FromSide, MAX_TO_SIDE, Next, Start, Status, ToSide, encode};
-use super::{Beside, Parameters, Ros2, Ros2Error};
+use super::{Beside, Describe, Parameters, Ros2, Ros2Error};
 use crate::bus::received::Received;
 use crate::msgs::{MAX_WAVEFORM_SAMPLES, Prediction};
 use crate::system::memory;
@@ -54,11 +54,15 @@ const HELD_BACK_AT_ONCE: usize = 4;
 /// Number of checks without a beat of the receiving thread after which this process gives up: 5 s.
 const MAX_LOOKS_WITHOUT_BEAT: u32 = 250;
 
-/// Serves the node at the other end of standard input until it closes that socket. `validate` checks parameter values.
+/// Checks the value of a parameter; the error text is sent to the peer.
+type Validate = fn(&str, f64) -> Result<(), String>;
+
+/// Serves the node at the other end of standard input until it closes that socket. `validate` checks the values of
+/// parameters, `describe` says what they are.
 ///
 /// # Errors
 /// Standard input is not a socket of a node, or the limits cannot be set.
-pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Error> {
+pub fn serve(validate: Validate, describe: Describe) -> Result<(), Ros2Error> {
     let socket = UnixStream::from(io::stdin().as_fd().try_clone_to_owned()?);
     if socket.peer_addr().is_err() {
         return Err(Ros2Error::Side("standard input is no socket of a node: this command is for `run`".to_owned()));
@@ -84,7 +88,7 @@ pub fn serve(validate: fn(&str, f64) -> Result<(), String>) -> Result<(), Ros2Er
             Next::End => return Ok(()),
         }
     };
-    match join(start, validate, &node) {
+    match join(start, validate, describe, &node) {
         Ok(ros2) => {
             node.send(&FromSide::Joined(ros2.full_name()));
             socket.set_read_timeout(Some(LOOK_EVERY))?;
@@ -120,10 +124,11 @@ fn contain() -> io::Result<()> {
     Ok(())
 }
 
-fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNode) -> Result<Ros2, Ros2Error> {
-    let [inputs, vibrations, temperatures, waveforms, parameters] = std::array::from_fn(|_| node.clone());
+fn join(start: Start, validate: Validate, describe: Describe, node: &ToNode) -> Result<Ros2, Ros2Error> {
+    let [inputs, vibrations, temperatures, waveforms, parameters, states] = std::array::from_fn(|_| node.clone());
     let parameters = Parameters {
         values: start.parameters,
+        describe,
         validate: Box::new(validate),
         accepted: Box::new(move |name, value| {
             parameters.send(&FromSide::Parameter { name: name.to_owned(), value });
@@ -142,6 +147,8 @@ fn join(start: Start, validate: fn(&str, f64) -> Result<(), String>, node: &ToNo
             waveform: Box::new(move |Received { at, message, .. }| {
                 waveforms.send_block(&FromSide::Waveform { at, message });
             }),
+            state: start.state,
+            changed: Box::new(move |state| states.send(&FromSide::Lifecycle(state))),
         }),
     )
 }
@@ -274,6 +281,7 @@ impl Side {
             ToSide::Sensitivity(message) => self.ros2.publish_sensitivity(&message),
             ToSide::Diagnostics(message) => self.ros2.publish_diagnostics(&message),
             ToSide::Heard(message) => self.ros2.publish_heard(&message),
+            ToSide::Log(severity, text) => self.ros2.log(severity, &text),
         };
         self.count_refusal(published);
     }

@@ -16,8 +16,9 @@ const MAX_PUBLISHERS: usize = 256;
 /// publishers too, immediately and out of order after a loss. They are dropped here, because the reliable subscription
 /// delivers them.
 pub(super) struct Subscriptions<M> {
-    reliable: Subscription<M>,
-    best_effort: Subscription<Tried<M>>,
+    /// At least one of the two; the user may have chosen a single one.
+    reliable: Option<Subscription<M>>,
+    best_effort: Option<Subscription<Tried<M>>>,
     /// The quality of service that the reliable subscription requests.
     requested: QosPolicies,
     participant: DomainParticipant,
@@ -28,8 +29,9 @@ pub(super) type Refused = HashMap<Gid, bool>;
 
 impl<M: DeserializeOwned + 'static> Subscriptions<M> {
     pub(super) fn new(
-        (reliable, requested): (Subscription<M>, QosPolicies),
-        best_effort: Subscription<Tried<M>>,
+        reliable: Option<Subscription<M>>,
+        requested: QosPolicies,
+        best_effort: Option<Subscription<Tried<M>>>,
         participant: DomainParticipant,
     ) -> Self {
         Self { reliable, best_effort, requested, participant }
@@ -44,8 +46,8 @@ impl<M: DeserializeOwned + 'static> Subscriptions<M> {
         loop {
             tokio::select! {
                 biased;
-                taken = self.reliable.async_take() => return taken,
-                taken = self.best_effort.async_take() => {
+                taken = take(self.reliable.as_ref()) => return taken,
+                taken = take(self.best_effort.as_ref()) => {
                     let (Tried(message), info) = taken?;
                     if self.is_refused(info.publisher_gid(), refused) {
                         return message.map(|message| (message, info)).ok_or(ReadError::Malformed);
@@ -57,10 +59,18 @@ impl<M: DeserializeOwned + 'static> Subscriptions<M> {
 
     /// Number of known publishers. The best-effort subscription matches all of them.
     pub(super) fn publishers(&self, node: &Node) -> usize {
-        self.best_effort.get_publisher_count(node)
+        match (&self.best_effort, &self.reliable) {
+            (Some(subscription), _) => subscription.get_publisher_count(node),
+            (None, Some(subscription)) => subscription.get_publisher_count(node),
+            (None, None) => 0,
+        }
     }
 
+    /// Whether the reliable subscription does not deliver the messages of `publisher`.
     fn is_refused(&self, publisher: Gid, refused: &mut Refused) -> bool {
+        if self.reliable.is_none() {
+            return true;
+        }
         if let Some(&refused) = refused.get(&publisher) {
             return refused;
         }
@@ -76,6 +86,16 @@ impl<M: DeserializeOwned + 'static> Subscriptions<M> {
         }
         refused.insert(publisher, is_refused);
         is_refused
+    }
+}
+
+/// The next message of a subscription; never, if there is none.
+async fn take<M: DeserializeOwned + 'static>(
+    subscription: Option<&Subscription<M>>,
+) -> Result<(M, MessageInfo), ReadError> {
+    match subscription {
+        Some(subscription) => subscription.async_take().await,
+        None => std::future::pending().await,
     }
 }
 

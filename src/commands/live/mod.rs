@@ -146,7 +146,7 @@ fn log(around: &Frame, watch: &Watch, stopped: &AtomicBool) {
         let said = snapshot.assessment();
         let again = match said.status {
             // Logged once, unless the status changes in between.
-            Status::Waiting | Status::NoData => Duration::MAX,
+            Status::Waiting | Status::NoData | Status::Inactive => Duration::MAX,
             Status::Ok | Status::Warn | Status::Squeal | Status::Fault => LOG_EVERY,
         };
         let due = last.is_none_or(|(status, at)| status != said.status || at.elapsed() >= again);

@@ -145,7 +145,7 @@ fn colour(status: Status) -> Color {
         Status::Warn => Color::Yellow,
         Status::Squeal => Color::Red,
         Status::Fault => Color::Magenta,
-        Status::Waiting | Status::NoData => Color::Gray,
+        Status::Waiting | Status::NoData | Status::Inactive => Color::Gray,
     }
 }
 
@@ -258,6 +258,7 @@ pub mod tests {
     use ratatui::buffer::Buffer;
 
     use super::*;
+    use crate::bus::lifecycle::State;
     use crate::msgs::{Header, OperatingPoint, Prediction, Time, level};
     use crate::node::Watch;
     use crate::node::status::InputSources;
@@ -315,15 +316,20 @@ pub mod tests {
         };
         match status {
             Status::Waiting => watch.silence(),
-            Status::Ok | Status::Warn | Status::Squeal | Status::Fault | Status::NoData => watch.input(&input),
+            Status::Ok | Status::Warn | Status::Squeal | Status::Fault | Status::NoData | Status::Inactive => {
+                watch.input(&input);
+            }
         }
         watch.prediction(&match status {
             Status::Waiting => fault("stale: no input for 1 s"),
-            Status::Ok | Status::NoData => prediction(level::OK, 0.2, ""),
+            Status::Ok | Status::NoData | Status::Inactive => prediction(level::OK, 0.2, ""),
             Status::Warn => prediction(level::WARN, 0.0312, "friction margin 0.031200 below 0.05"),
             Status::Squeal => prediction(level::SQUEAL, -0.0557, "mode 15 at 3114.6 Hz: damping ratio -0.0325"),
             Status::Fault => fault("normal_load_n is -5, expected 0 to 1000000"),
         });
+        if status == Status::Inactive {
+            watch.state(State::Inactive);
+        }
         if status == Status::NoData {
             watch.silence();
             watch.prediction(&fault("stale: no input for 1 s"));

@@ -2,7 +2,9 @@
 
 import { Decimals, NONE, asserts, fixed, known, leastGrowth, put, signed } from "./format.js";
 
-const WORDS = { ok: "OK", warn: "WARN", squeal: "SQUEAL", fault: "FAULT", waiting: "WAITING", no_data: "NO DATA" };
+const WORDS = { ok: "OK", warn: "WARN", squeal: "SQUEAL", fault: "FAULT", waiting: "WAITING", no_data: "NO DATA", inactive: "INACTIVE" };
+/** The statuses in which nothing is received. */
+const SILENT = ["waiting", "no_data", "inactive"];
 const at = (id) => document.getElementById(id);
 
 /** Where the node expects its inputs, and how to simulate them. */
@@ -33,7 +35,7 @@ export class Status {
   #show(status, message) {
     at("status").dataset.level = status;
     document.documentElement.dataset.level = status;
-    at("status-shape").setAttribute("href", `#shape-${["waiting", "no_data"].includes(status) ? "none" : status}`);
+    at("status-shape").setAttribute("href", `#shape-${SILENT.includes(status) ? "none" : status}`);
     const word = WORDS[status] ?? "CONNECTING";
     at("level").textContent = word;
     document.title = `${word} · ${this.rig} · squealcast`;
@@ -114,7 +116,7 @@ export class Status {
     const answered = asserts(state) && (fastest || next);
     at("answer-facts").hidden = !answered;
     at("answer-text").hidden = Boolean(answered);
-    const silent = ["waiting", "no_data"].includes(status);
+    const silent = SILENT.includes(status);
     put(at("answer-title"), status === "squeal" ? "Squeals now" : silent ? "Inputs" : "Squeals next");
     if (!answered) {
       const stable = state.map ? `Nothing up to μ ${fixed(this.muMax, 2)}.` : "Not known yet: the stability map is being made.";

@@ -6,6 +6,7 @@
 
 mod bad_link;
 mod exchange;
+mod managed;
 mod operation;
 mod sound;
 
