@@ -13,6 +13,8 @@ use crate::reduction::{Counted, FullSolver, OperatingBox, ParametricBasis, Param
 pub const TOLERANCE: f64 = 1e-6;
 /// Operating points for estimating the error, in addition to corners and centre, for each varying condition.
 const TRAINING: usize = 8;
+/// Points at which a smaller basis must hold the roots of the sampled vectors, for each of those.
+const CUTTING: usize = 8;
 /// Held-out operating points for each varying condition.
 const HELD_OUT: usize = 3;
 /// As many times more of both if contact pairs open and close: the contact then changes faster with load and friction
@@ -106,6 +108,7 @@ pub fn basis_of(
         counted: Counted { band_rad_s: TAU * band_hz, growth_floor_per_s: -DECAY_PER_S },
         tolerance,
         training: TRAINING * points,
+        cutting: CUTTING * TRAINING * points,
         held_out: HELD_OUT * points,
         most_samples: MOST_SAMPLES,
         most_vectors: MOST_VECTORS,

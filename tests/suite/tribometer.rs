@@ -156,3 +156,31 @@ fn the_load_on_a_lining_decides_whether_it_squeals() {
     };
     assert_eq!(["200", "500", "1000"].map(squeals), [false, true, false]);
 }
+
+/// A basis over load and friction coefficient holds its tolerance at points that `reduce` did not see, also where the pad is near
+/// divergence (from 0.495 at 2000 N) or beyond. The law is a power law rounded over 2 µm.
+#[test]
+fn a_basis_over_contact_states_holds_its_tolerance_near_divergence() {
+    let temp = tempfile::tempdir().unwrap();
+    let folder = temp.path().join("tribometer");
+    run(["tribometer", "--lining", "--dof", "5000", "-o", &text(&folder)]).exits(0);
+    let path = folder.join("tribometer.toml");
+    let mut full: toml::Table = toml::from_str(&std::fs::read_to_string(&path).unwrap()).unwrap();
+    let state = full["contact_state"].as_table_mut().unwrap();
+    for key in ["pressure_pa", "area_m2"] {
+        state.remove(key).unwrap();
+    }
+    state["law"] = "power".into();
+    for (key, value) in [("exponent", 2.0), ("reference_m", 5e-6), ("roughness_m", 2e-6)] {
+        state.insert(key.to_owned(), value.into());
+    }
+    full["contact_patch"][0]["stiffness_n_per_m"] = 1e5.into();
+    std::fs::write(&path, toml::to_string(&full).unwrap()).unwrap();
+    let (full, rig) = (text(&path), text(&temp.path().join("rig.toml")));
+    let range = "mu=0:0.6,load=50:2000,speed=13";
+    run(["reduce", &full, "--range", range, "--points", "0", "-o", &rig]).exits(0);
+    assert!(Rig::load(&rig).unwrap().model.dimension() <= 60);
+    run(["verify", &rig, "--against", &full, "--points", "24", "--no-windows", "--tolerance", "1e-6"])
+        .exits(0)
+        .says("the same pairs closed");
+}

@@ -70,6 +70,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         counted: Counted { band_rad_s, growth_floor_per_s: -20.0 },
         tolerance: 1e-6,
         training: 10,
+        cutting: 40,
         held_out: 4,
         most_samples: 20,
         most_vectors: 70,

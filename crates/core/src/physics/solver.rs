@@ -109,12 +109,24 @@ impl Solver {
     /// [`SolveError::Model`] if the model cannot be evaluated at `p`; [`SolveError::NoConvergence`];
     /// [`SolveError::Trace`] and [`SolveError::Residual`] if the result fails a check.
     pub fn solve(&mut self, model: &Model, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, SolveError> {
-        let damped = model.is_damped(p);
-        let here = model.at(p)?;
+        self.solve_in(model, &model.at(p)?, vectors)
+    }
+
+    /// The spectrum of `model` in the situation `here`, of this model or of another one with the same statics.
+    ///
+    /// # Errors
+    /// Those of [`Self::solve`].
+    pub(crate) fn solve_in(
+        &mut self,
+        model: &Model,
+        here: &Situation,
+        vectors: Vectors,
+    ) -> Result<Spectrum, SolveError> {
+        let damped = model.is_damped(&here.point);
         match &model.division {
-            None => self.solve_coupled(model, &here, vectors, damped),
+            None => self.solve_coupled(model, here, vectors, damped),
             Some(division) => {
-                let coupled = self.solve_coupled(&division.coupled, &here, vectors, damped)?;
+                let coupled = self.solve_coupled(&division.coupled, here, vectors, damped)?;
                 division.complete(model, coupled, vectors)
             }
         }

@@ -4,6 +4,9 @@ use faer::c64;
 
 /// Largest distance of paired roots, relative to `|λ|`.
 const SAME: f64 = 1e-2;
+/// Growth rate above which a static root counts, relative to the end of the band: slower ones are hardly told from
+/// rigid-body motion.
+const STATIC: f64 = 1e-3;
 
 /// Region of the complex plane in which roots are compared.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -15,9 +18,10 @@ pub struct Counted {
 }
 
 impl Counted {
-    /// Whether a root oscillates within the band and its growth rate is above the floor.
+    /// Whether a root oscillates within the band and its growth rate is above the floor, or is static and grows.
     pub fn counts(&self, lambda: c64) -> bool {
-        lambda.im > 0.0 && lambda.im <= self.band_rad_s && lambda.re > self.growth_floor_per_s
+        let oscillates = lambda.im > 0.0 && lambda.im <= self.band_rad_s && lambda.re > self.growth_floor_per_s;
+        oscillates || lambda.im == 0.0 && lambda.re > STATIC * self.band_rad_s
     }
 }
 
@@ -57,8 +61,8 @@ pub(super) fn pair_off(mut near: Vec<(f64, usize, usize)>, full: usize) -> Vec<O
 
 /// Pairs roots one to one, nearest first.
 ///
-/// `full`, `reduced`: all roots with `ω > 0`. Full roots should extend slightly beyond the band, so that a root near
-/// its end finds its partner on the other side.
+/// `full`, `reduced`: all roots with `ω > 0`, and static ones that grow. Full roots should extend slightly beyond the band,
+/// so that a root near its end finds its partner on the other side.
 pub fn match_roots(full: &[c64], reduced: &[c64], counted: Counted) -> RootMatch {
     let distance = |i: usize, j: usize| (full[i] - reduced[j]).norm() / full[i].norm();
     let near = (0..full.len())
@@ -82,6 +86,17 @@ pub fn match_roots(full: &[c64], reduced: &[c64], counted: Counted) -> RootMatch
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_static_root_counts_if_it_grows() {
+        let counted = Counted { band_rad_s: 1e4, growth_floor_per_s: -20.0 };
+        let static_root = |growth: f64| c64::new(growth, 0.0);
+        assert!(counted.counts(static_root(100.0)));
+        assert!(!counted.counts(static_root(1.0)) && !counted.counts(static_root(-1.0)));
+        let found = match_roots(&[static_root(100.0)], &[static_root(100.1)], counted);
+        assert!((found.worst() - 1e-3).abs() < 1e-12);
+        assert_eq!(match_roots(&[static_root(100.0)], &[], counted).missed, [static_root(100.0)]);
+    }
 
     #[test]
     fn errors_missed_and_invented_roots_are_counted_separately() {

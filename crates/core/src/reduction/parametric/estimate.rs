@@ -56,10 +56,14 @@ impl Building<'_, '_> {
         Ok(worst)
     }
 
+    /// Indices of the counted roots of a spectrum.
+    pub fn counted(&self, spectrum: &Spectrum) -> Vec<usize> {
+        (0..spectrum.roots.len()).filter(|&k| self.request.counted.counts(spectrum.roots[k].lambda)).collect()
+    }
+
     /// Error estimate of every counted reduced root.
     fn estimates(&self, inverse: &Inverse<'_>, projected: &Projected, spectrum: &Spectrum) -> Estimates {
-        let counts = |k: &usize| self.request.counted.counts(spectrum.roots[*k].lambda);
-        let wanted: Vec<usize> = (0..spectrum.mode_count).filter(counts).collect();
+        let wanted = self.counted(spectrum);
         let norms = [&spectrum.shapes, &spectrum.left].map(|shapes| -> Vec<f64> {
             let left = std::ptr::eq(shapes, &spectrum.left);
             let chunks = wanted.chunks(ROOTS_TOGETHER);
@@ -67,9 +71,7 @@ impl Building<'_, '_> {
         });
         let estimate = |(j, &k): (usize, &usize)| {
             let lambda = spectrum.roots[k].lambda;
-            // Left vectors are normalised to `yᴴ Q' x = 1` for a damped spectrum; for an undamped one `yᴴ Q' x = 2λ`.
-            let slope = if spectrum.undamped { 2.0 * lambda.norm() } else { 1.0 };
-            (lambda, norms[0][j] * norms[1][j] / (slope * lambda.norm()))
+            (lambda, norms[0][j] * norms[1][j] / (slope(spectrum, k).norm() * lambda.norm()))
         };
         wanted.iter().enumerate().map(estimate).collect()
     }
@@ -110,6 +112,40 @@ impl Building<'_, '_> {
         let size = |square: f64| if square.is_nan() { f64::INFINITY } else { square.max(0.0).sqrt() };
         (0..roots.len()).map(|j| size(square(2 * j) + square(2 * j + 1))).collect()
     }
+}
+
+/// How much a root changes with the matrices.
+pub struct Condition {
+    /// `‖y‖_M ‖x‖_M / (|yᴴ Q' x| |λ|)`, s²: `|Δλ|/|λ|` is at most this times the norm of the change of `Q`. It is `1/(2|λ|²)`
+    /// for a real mode and unbounded where two roots merge.
+    pub relative: f64,
+    lambda: c64,
+    lengths: [f64; 2],
+}
+
+impl Condition {
+    /// `lengths`: `‖x‖_M` and `‖y‖_M`; `slope`: `yᴴ Q' x`.
+    pub fn new(lambda: c64, lengths: [f64; 2], slope: c64) -> Self {
+        Self { relative: lengths[0] * lengths[1] / (slope.norm() * lambda.norm()), lambda, lengths }
+    }
+
+    /// Of a root of a reduced model, whose mass matrix is the identity.
+    pub fn of(spectrum: &Spectrum, root: usize) -> Self {
+        let lengths = [&spectrum.shapes, &spectrum.left].map(|shapes| shapes.col(root).norm_l2());
+        Self::new(spectrum.roots[root].lambda, lengths, slope(spectrum, root))
+    }
+
+    /// Factors on the right and the left vector with which a component `d` omitted from both moves the root by about `dᵀ S d`
+    /// times `|λ|`. They are bounded where roots merge.
+    pub fn scales(&self) -> [f64; 2] {
+        let scale = self.relative.sqrt().min(10.0 / self.lambda.norm());
+        self.lengths.map(|length| scale / length)
+    }
+}
+
+/// `yᴴ Q' x`: left vectors are normalised to 1 for a damped spectrum and to `2λ` for an undamped one.
+fn slope(spectrum: &Spectrum, root: usize) -> c64 {
+    if spectrum.undamped { spectrum.roots[root].lambda * 2.0 } else { c64::ONE }
 }
 
 fn failed(reason: String) -> ReductionError {

@@ -17,6 +17,9 @@ pub struct ParametricRequest {
     /// Number of training points, at which the error is estimated, in addition to the corners and the middle of the
     /// box.
     pub training: usize,
+    /// Number of further points at which a smaller basis must hold the roots of the sampled vectors. No solve of the full
+    /// model is needed there.
+    pub cutting: usize,
     /// Number of held-out points for validation.
     pub held_out: usize,
     /// Largest number of sampled points.
@@ -67,7 +70,7 @@ pub enum ParametricStep {
         /// Number of vectors of the span.
         vectors: usize,
     },
-    /// A basis of `vectors` leading vectors has the error `worst` at the training points.
+    /// A basis of `vectors` leading vectors has the error `worst` at the training and cutting points.
     Cut {
         /// Number of vectors kept.
         vectors: usize,

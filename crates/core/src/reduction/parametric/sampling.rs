@@ -8,6 +8,7 @@ use super::super::full_model::{FullModel, Projected};
 use super::super::matching::Counted;
 use super::super::pencil::Pencil;
 use super::super::{FullSolver, FullSpectrum, FullVectors, ReductionError};
+use super::estimate::Condition;
 use super::metric::Metric;
 use super::request::{ParametricRequest, ParametricStep};
 use crate::physics::{Model, OperatingPoint, SolveError, Solver, Spectrum, Vectors};
@@ -46,12 +47,7 @@ pub struct Building<'a, 'm> {
     pub most_roots: usize,
     /// `S`-orthonormal vectors, `n×r`.
     pub span: Mat<f64>,
-    /// Coefficients in `span` of the vectors of each sampled point, one block per point. Rows of vectors that joined
-    /// the span later are absent and count as 0.
-    pub snapshots: Vec<Mat<f64>>,
     pub sampled: Vec<OperatingPoint>,
-    /// All oscillating roots in the band at the sampled points.
-    pub known: Vec<(OperatingPoint, Vec<c64>)>,
     pub true_over_estimate: f64,
 }
 
@@ -117,7 +113,6 @@ impl Building<'_, '_> {
             self.true_over_estimate = self.true_over_estimate.max(ratio);
         }
         self.sampled.push(point);
-        self.known.push((point, roots.into_iter().filter(|lambda| lambda.im > 0.0).collect()));
         progress(ParametricStep::Sampled {
             roots: counting.len(),
             vectors: self.span.ncols(),
@@ -126,8 +121,7 @@ impl Building<'_, '_> {
         Ok(())
     }
 
-    /// Real and imaginary parts of right and left vectors, `n×(4·chosen)`. They are scaled so that a component `d`
-    /// omitted from both moves the root by about `dᵀ S d` times `|λ|`.
+    /// Real and imaginary parts of right and left vectors with their [`Condition::scales`], `n×(4·chosen)`.
     fn columns(&self, spectrum: &FullSpectrum, chosen: &[usize]) -> Mat<f64> {
         let n = self.full.dimension();
         let mut columns = Mat::<f64>::zeros(n, 4 * chosen.len());
@@ -148,35 +142,26 @@ impl Building<'_, '_> {
                 (0..n).map(|i| (at(&of_root, i, side).conj() * at(&of_mass, i, side)).re).sum::<f64>().sqrt()
             };
             let lengths = [length(0), length(1)];
-            // `|y|_M |x|_M / |yᴴ Q' x|` is `1/(2|λ|)` for a real mode and unbounded where two roots merge, hence the
-            // cap.
-            let condition = (lengths[0] * lengths[1] / (slope.norm() * lambda.norm())).sqrt().min(10.0 / lambda.norm());
-            for (side, length) in lengths.into_iter().enumerate() {
-                let scaled = faer::Scale(condition / length) * of_root.subcols(2 * side, 2);
+            for (side, scale) in Condition::new(lambda, lengths, slope).scales().into_iter().enumerate() {
+                let scaled = faer::Scale(scale) * of_root.subcols(2 * side, 2);
                 columns.subcols_mut(4 * k + 2 * side, 2).copy_from(scaled);
             }
         }
         columns
     }
 
-    /// Extends the span by the components of `columns` outside it, and stores the coefficients of `columns`.
+    /// Extends the span by the components of `columns` outside it.
     fn extend(&mut self, columns: Mat<f64>) -> Result<(), ReductionError> {
-        let held = self.span.ncols();
-        let mut coefficients = Mat::<f64>::zeros(held, columns.ncols());
         let mut rest = columns;
         for _ in 0..2 {
             let step = self.span.transpose() * self.metric.times(rest.as_ref());
             rest -= &self.span * &step;
-            coefficients += step;
         }
-        let weighted = self.metric.times(rest.as_ref());
-        let gram = rest.transpose() * &weighted;
-        let gram = Mat::from_fn(gram.nrows(), gram.ncols(), |i, j| 0.5 * (gram[(i, j)] + gram[(j, i)]));
+        let gram = self.metric.gram(&rest);
         let (squares, vectors) = symmetric_eigen("parametric basis", gram.as_ref())?;
         let least = (NEGLIGIBLE * self.request.tolerance.sqrt()).max(ROUNDED);
         let kept: Vec<usize> = (0..squares.len()).rev().filter(|&k| squares[k] > least * least).collect();
         if kept.is_empty() {
-            self.snapshots.push(coefficients);
             return Ok(());
         }
         let turn = Mat::from_fn(vectors.nrows(), kept.len(), |i, k| vectors[(i, kept[k])] / squares[kept[k]].sqrt());
@@ -189,12 +174,6 @@ impl Building<'_, '_> {
             let gram = self.metric.gram(&added);
             super::super::whiten("parametric basis", gram.as_ref())?.right(&mut added);
         }
-        let more = added.transpose() * &weighted;
-        let all = Mat::from_fn(held + kept.len(), coefficients.ncols(), |i, j| {
-            if i < held { coefficients[(i, j)] } else { more[(i - held, j)] }
-        });
-        self.snapshots.push(all);
-        drop(weighted);
         let before = std::mem::replace(&mut self.span, Mat::new());
         self.span = hstack(before.as_ref(), added.as_ref());
         Ok(())
@@ -232,14 +211,39 @@ impl Building<'_, '_> {
             self.sample(point, Some(&estimates), progress)?;
         }
     }
+
+    /// The `count` of `points` at which a counted root of the `wide` model changes most, relative to itself, with the
+    /// matrices: where two roots merge, and where a frequency goes to zero.
+    pub fn most_sensitive(
+        &self,
+        wide: &Projected,
+        points: &[OperatingPoint],
+        count: usize,
+    ) -> Result<Vec<OperatingPoint>, ReductionError> {
+        let model = self.model(wide)?;
+        let mut solver = Solver::new(model.dimension());
+        let mut ranked = vec![];
+        for point in points {
+            let spectrum = solver.solve(&model, point, Vectors::Both).map_err(solve_failed)?;
+            let conditions = self.counted(&spectrum).into_iter().map(|root| Condition::of(&spectrum, root).relative);
+            ranked.push((conditions.fold(0.0, f64::max), *point));
+        }
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        Ok(ranked.into_iter().take(count).map(|(_, point)| point).collect())
+    }
 }
 
-/// The roots with `ω > 0`.
-pub fn oscillating(spectrum: &Spectrum) -> Vec<c64> {
-    spectrum.modes().iter().map(|root| root.lambda).collect()
+/// The roots with `ω > 0`, and static ones that grow.
+pub fn comparable(roots: impl Iterator<Item = c64>) -> Vec<c64> {
+    roots.filter(|lambda| lambda.im > 0.0 || lambda.im == 0.0 && lambda.re > 0.0).collect()
 }
 
-fn solve_failed(source: SolveError) -> ReductionError {
+/// Those of a reduced model. Of an undamped one, a growing static root stands for a decaying one too.
+pub fn comparable_of(spectrum: &Spectrum) -> Vec<c64> {
+    comparable(spectrum.roots.iter().map(|root| root.lambda))
+}
+
+pub fn solve_failed(source: SolveError) -> ReductionError {
     ReductionError::Solve { what: "parametric basis".to_owned(), source: Box::new(source) }
 }
 

@@ -7,60 +7,70 @@ use super::super::ReductionError;
 use super::super::dense::symmetric_eigen;
 use super::super::full_model::Projected;
 use super::super::matching::match_roots;
+use super::estimate::Condition;
 use super::request::ParametricStep;
-use super::sampling::{Building, oscillating};
-use crate::physics::{OperatingPoint, Vectors};
+use super::sampling::{Building, comparable_of, solve_failed};
+use crate::physics::{OperatingPoint, Situation, Solver, Vectors};
+
+/// Fraction of the tolerance by which the roots may differ from those of the wide model.
+const SHARE: f64 = 0.5;
+/// Number of times that roots gain weight before more vectors are taken.
+const MOST_WEIGHTINGS: usize = 3;
+
+/// What a smaller basis must hold at one operating point.
+struct Target {
+    here: Situation,
+    /// Roots of the wide model that may count.
+    roots: Vec<c64>,
+    /// The counted ones, each with its weight.
+    counted: Vec<(c64, f64)>,
+    /// Real and imaginary parts of their right and left vectors with their [`Condition::scales`], in the span: four columns each.
+    vectors: Mat<f64>,
+}
 
 impl Building<'_, '_> {
-    /// Projects the model on the fewest leading singular vectors of the snapshots that hold the tolerance at all
-    /// training points; the number is found by bisection.
+    /// Projects the model on the fewest vectors that hold its roots at all `points`; the number is found by bisection.
     pub fn cut(
         &self,
         wide: &Projected,
-        training: &[OperatingPoint],
+        points: &[OperatingPoint],
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<Projected, ReductionError> {
-        let model = self.model(wide)?;
-        let mut references = self.known.clone();
-        for point in training.iter().filter(|point| !self.sampled.contains(point)) {
-            references.push((*point, oscillating(&self.solve(&model, point, Vectors::None)?)));
-        }
         let size = self.span.ncols();
-        let mut covariance = Mat::<f64>::zeros(size, size);
-        for block in &self.snapshots {
-            let all = Mat::from_fn(size, block.ncols(), |i, j| if i < block.nrows() { block[(i, j)] } else { 0.0 });
-            covariance += &all * all.transpose();
-        }
-        let covariance = Mat::from_fn(size, size, |i, j| covariance[(i.max(j), i.min(j))]);
-        let (_, vectors) = symmetric_eigen("parametric basis", covariance.as_ref())?;
-        // Change of coordinates from the span to `wide.basis`.
+        // Change of coordinates from `wide.basis` to the span.
         let turn = self.span.transpose() * self.metric.times(wide.basis.as_ref());
-        let mut leading = Mat::from_fn(size, size, |i, k| vectors[(i, size - 1 - k)]);
-        turn.partial_piv_lu().solve_in_place(leading.as_mut());
+        let mut targets = self.targets(wide, points, &turn)?;
+        let back = turn.partial_piv_lu();
+        let most_counted = targets.iter().map(|target| target.counted.len()).max().unwrap_or(0);
         let mut best_allowed = f64::INFINITY;
+        let limit = SHARE * self.request.tolerance;
         let mut attempt = |count: usize| -> Result<(Projected, f64), ReductionError> {
-            let smaller = wide.restricted(leading.subcols(0, count))?;
-            let model = self.model(&smaller)?;
-            let mut worst = 0.0_f64;
-            for (point, roots) in &references {
-                let reduced = oscillating(&self.solve(&model, point, Vectors::None)?);
-                worst = worst.max(match_roots(roots, &reduced, self.request.counted).worst());
-                if worst == f64::INFINITY {
+            let mut best: Option<(Projected, f64)> = None;
+            for target in &mut targets {
+                target.counted.iter_mut().for_each(|(_, weight)| *weight = 1.0);
+            }
+            for _ in 0..=MOST_WEIGHTINGS {
+                let mut leading = leading(size, count, &targets)?;
+                back.solve_in_place(leading.as_mut());
+                let smaller = wide.restricted(leading.as_ref())?;
+                let worst = self.weigh(&smaller, &mut targets, limit)?;
+                if best.as_ref().is_none_or(|(_, before)| worst < *before) {
+                    best = Some((smaller, worst));
+                }
+                if worst <= limit || worst == f64::INFINITY {
                     break;
                 }
             }
+            let (smaller, worst) = best.expect("at least one weighting");
             progress(ParametricStep::Cut { vectors: count, worst });
             if count <= self.request.most_vectors {
                 best_allowed = best_allowed.min(worst);
             }
             Ok((smaller, worst))
         };
-        let limit = 0.5 * self.request.tolerance;
         let (mut enough, mut found) = (size, None);
-        let counted = self.request.counted;
-        let counting = |roots: &Vec<c64>| roots.iter().filter(|lambda| counted.counts(**lambda)).count();
         // A basis needs at least as many vectors as counted roots.
-        let mut few = self.known.iter().map(|(_, roots)| counting(roots)).max().unwrap_or(0).min(size - 1);
+        let mut few = most_counted.min(size - 1);
         while enough > few + 1 {
             let middle = (enough + few) / 2;
             let (smaller, worst) = attempt(middle)?;
@@ -87,4 +97,70 @@ impl Building<'_, '_> {
         }
         Ok(chosen)
     }
+
+    /// Solves the wide model at `points`; `turn` is the change of its coordinates to the span.
+    fn targets(
+        &self,
+        wide: &Projected,
+        points: &[OperatingPoint],
+        turn: &Mat<f64>,
+    ) -> Result<Vec<Target>, ReductionError> {
+        let model = self.model(wide)?;
+        let mut solver = Solver::new(model.dimension());
+        let target = |point: &OperatingPoint| {
+            let spectrum = solver.solve(&model, point, Vectors::Both).map_err(solve_failed)?;
+            let chosen = self.counted(&spectrum);
+            let mut vectors = Mat::zeros(model.dimension(), 4 * chosen.len());
+            for (k, &root) in chosen.iter().enumerate() {
+                let scales = Condition::of(&spectrum, root).scales();
+                let [right, left] = [&spectrum.shapes, &spectrum.left].map(|shapes| shapes.col(root));
+                for i in 0..model.dimension() {
+                    for (side, value) in [right[i], left[i]].into_iter().enumerate() {
+                        vectors[(i, 4 * k + 2 * side)] = scales[side] * value.re;
+                        vectors[(i, 4 * k + 2 * side + 1)] = scales[side] * value.im;
+                    }
+                }
+            }
+            Ok(Target {
+                here: spectrum.situation(),
+                roots: comparable_of(&spectrum),
+                counted: chosen.iter().map(|&k| (spectrum.roots[k].lambda, 1.0)).collect(),
+                vectors: turn * vectors,
+            })
+        };
+        points.iter().map(target).collect()
+    }
+
+    /// Largest error of a root of `smaller` at the targets. Every root whose error exceeds `limit` gains weight.
+    fn weigh(&self, smaller: &Projected, targets: &mut [Target], limit: f64) -> Result<f64, ReductionError> {
+        let model = self.model(smaller)?;
+        let mut solver = Solver::new(model.dimension());
+        let mut worst = 0.0_f64;
+        for target in targets {
+            let reduced = solver.solve_in(&model, &target.here, Vectors::None).map_err(solve_failed)?;
+            let comparison = match_roots(&target.roots, &comparable_of(&reduced), self.request.counted);
+            worst = worst.max(comparison.worst());
+            if worst == f64::INFINITY {
+                break;
+            }
+            for (lambda, error) in comparison.errors {
+                let of_root = target.counted.iter_mut().filter(|(of, _)| *of == lambda);
+                of_root.for_each(|(_, weight)| *weight *= (error / limit).max(1.0));
+            }
+        }
+        Ok(worst)
+    }
+}
+
+/// The `count` leading left singular vectors of the weighted vectors of all targets, `size×count`.
+fn leading(size: usize, count: usize, targets: &[Target]) -> Result<Mat<f64>, ReductionError> {
+    let mut covariance = Mat::<f64>::zeros(size, size);
+    for target in targets {
+        let weighted =
+            Mat::from_fn(size, target.vectors.ncols(), |i, j| target.counted[j / 4].1 * target.vectors[(i, j)]);
+        covariance += &weighted * target.vectors.transpose();
+    }
+    let covariance = Mat::from_fn(size, size, |i, j| covariance[(i.max(j), i.min(j))]);
+    let (_, vectors) = symmetric_eigen("parametric basis", covariance.as_ref())?;
+    Ok(Mat::from_fn(size, count, |i, k| vectors[(i, size - 1 - k)]))
 }
