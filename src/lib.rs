@@ -26,6 +26,7 @@ pub mod display;
 pub mod export;
 pub mod figures;
 pub mod files;
+pub mod foxglove;
 pub mod full_model;
 pub mod import;
 pub mod node;

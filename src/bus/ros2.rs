@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use ros2_client::{Log, MessageTypeName, Publisher};
+use ros2_client::{Log, MessageTypeName, ParameterValue, Publisher};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -39,8 +39,8 @@ use super::received::{Counters, Counts, Received};
 use super::ros_args::{RosArgs, RosArgsError};
 use crate::msgs::schema::Topic;
 use crate::msgs::{
-    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Temperature, Vibration,
-    Waveform, topic,
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, SessionEventKind,
+    Temperature, Vibration, Waveform, topic,
 };
 
 /// Name of the node before remapping.
@@ -145,6 +145,8 @@ pub struct Ros2 {
     /// Counts of the blocks of samples.
     waveform_counters: Arc<Counters>,
     beats: Arc<AtomicU64>,
+    /// Whether changes of parameters are passed on.
+    started: Arc<AtomicBool>,
     link: Link<OperatingPoint>,
 }
 
@@ -221,6 +223,7 @@ impl Ros2 {
             rosout,
             waveform_counters,
             beats,
+            started,
             link,
         })
     }
@@ -265,6 +268,22 @@ impl Ros2 {
     /// [`Ros2Error::Publish`].
     pub fn publish_session_event(&self, event: &SessionEvent) -> Result<(), Ros2Error> {
         publish(&self.session_event, topic::SESSION_EVENT, event)
+    }
+
+    /// Takes over a parameter that was set elsewhere, without passing it on.
+    pub fn take_setting(&self, event: &SessionEvent) {
+        if SessionEventKind::of(event) != Some(SessionEventKind::Parameter) {
+            return;
+        }
+        let value = ParameterValue::Double(event.value);
+        // Peers set parameters under this lock too.
+        let node = self.link.node();
+        if node.get_parameter(&event.name).is_some_and(|present| present != value) {
+            self.started.store(false, Ordering::Release);
+            // The session has validated it.
+            let _ = node.set_parameter(&event.name, value);
+            self.started.store(true, Ordering::Release);
+        }
     }
 
     /// Publishes sensitivities.

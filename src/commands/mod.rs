@@ -9,6 +9,7 @@ mod critical;
 mod demo;
 mod display;
 mod format;
+mod foxglove;
 mod full;
 mod hear;
 mod identify;

@@ -1,3 +1,4 @@
+use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -8,10 +9,12 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 
 use super::buses::BusOptions;
+use super::foxglove::{FoxgloveOption, announce};
 use super::player::Player;
 use super::recordings::{Recordings, without_predictions};
 use super::{Outcome, failure, live, not_negative, positive, print, signals};
 use crate::bus::ros_args::RosArgs;
+use crate::foxglove::Playback;
 use crate::msgs::schema::Topic;
 use crate::msgs::{SessionEventKind, Time};
 use crate::node::Watch;
@@ -56,6 +59,8 @@ pub struct Options {
     /// Topics to play [default: all of the node's]
     #[arg(long, value_name = "TOPIC", num_args = 1.., value_parser = topics())]
     topics: Vec<String>,
+    #[command(flatten)]
+    foxglove: FoxgloveOption,
     /// Print log lines instead of a live table, even on a terminal
     #[arg(long)]
     plain: bool,
@@ -73,7 +78,11 @@ fn topics() -> PossibleValuesParser {
 
 impl Options {
     pub fn run(self, ros_args: RosArgs) -> anyhow::Result<Outcome> {
-        if self.verify { self.verify_all() } else { self.play(ros_args) }
+        match self.foxglove.foxglove {
+            _ if self.verify => self.verify_all(),
+            Some(address) => self.serve(address),
+            None => self.play(ros_args),
+        }
     }
 
     /// Verifies all recordings; one that cannot be verified does not prevent the others.
@@ -127,6 +136,19 @@ impl Options {
         let agrees = found.agrees() && sound.is_none_or(|sound| sound.agrees());
         let lost = recording.damage().iter().chain(&found.damage).any(|damage| damage.damage.loses_data);
         Ok(if agrees && !lost { Outcome::Done } else { Outcome::Differences })
+    }
+
+    /// Plays for Foxglove alone, as its playback bar says.
+    fn serve(&self, address: SocketAddr) -> anyhow::Result<Outcome> {
+        let (path, recording) = self.recordings.only()?;
+        let name = format!("squealcast {}", path.file_name().unwrap_or_default().display());
+        let playback = Playback::start(address, &name, &recording)?;
+        let stopped = Arc::new(AtomicBool::new(false));
+        let stop = stopped.clone();
+        signals::on_stop(move || stop.store(true, Ordering::Relaxed))?;
+        announce(address, playback.port());
+        playback.run(&recording, &stopped);
+        Ok(Outcome::Done)
     }
 
     fn play(&self, ros_args: RosArgs) -> anyhow::Result<Outcome> {

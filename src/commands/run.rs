@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::buses::{BusOptions, NodeStart};
 use super::display::{DisplayOptions, ThresholdOption};
+use super::foxglove::{FoxgloveOption, announce};
 use super::hear::DetectionArgs;
 use super::{Outcome, live, signals};
 use crate::bus::Sink;
@@ -13,6 +14,7 @@ use crate::bus::lifecycle;
 use crate::bus::ros_args::RosArgs;
 use crate::display::server::{About, Server};
 use crate::files::chart_file::ChartFile;
+use crate::foxglove::LiveView;
 use crate::node::status::InputSources;
 use crate::node::{Inlet, Node, Outputs, SoundOptions, Watch};
 use crate::offline::verify_sound::settings_metadata;
@@ -52,6 +54,8 @@ pub struct NodeOptions {
     /// Print log lines instead of a live table, even on a terminal
     #[arg(long)]
     plain: bool,
+    #[command(flatten)]
+    foxglove: FoxgloveOption,
     #[command(flatten)]
     display: DisplayOptions,
     #[command(flatten)]
@@ -125,6 +129,12 @@ pub fn serve(
     // Before the recording begins: if the address is taken, no recording is left behind.
     let display = options.display.of_node(rig, &watch, about)?;
     let sink: Arc<dyn Sink> = Arc::new(sink);
+    let foxglove = options.foxglove.foxglove.map(|address| {
+        let view = LiveView::start(address, &format!("squealcast {}", rig.name), settings, sink.clone())?;
+        announce(address, view.port());
+        anyhow::Ok(view)
+    });
+    let foxglove = foxglove.transpose()?;
     let mut joined = buses.join_as_node(&parameters, state, &sink)?;
     for warning in joined.iter_mut().flat_map(|bus| bus.report().warnings) {
         note!("warning: {warning}");
@@ -133,8 +143,13 @@ pub fn serve(
     // The last step that can fail, so that a failed start leaves no recording.
     let recorder =
         options.record.as_ref().map(|directory| start_recorder(rig, directory, options.sound.options())).transpose()?;
-    let outputs =
-        Outputs { buses: joined, recorder: recorder.as_ref().map(Recorder::handle), node_name, ..Outputs::default() };
+    let outputs = Outputs {
+        buses: joined,
+        recorder: recorder.as_ref().map(Recorder::handle),
+        node_name,
+        foxglove,
+        ..Outputs::default()
+    };
     let shown = live::show(frame(rig, sources, display.as_ref(), inlet.clone()), watch.clone(), options.plain);
     if !options.no_chart {
         let kept = || ChartFile::locate(&rig.name, rig.path.as_deref(), &rig.content_hash);

@@ -3,6 +3,7 @@
 use crate::bus::log::Severity;
 use crate::bus::ros2::NODE_NAME;
 use crate::bus::{Bus, Connection, Outgoing, Report};
+use crate::foxglove::LiveView;
 use crate::msgs::schema::Topic;
 use crate::msgs::{DiagnosticArray, Heard, Prediction, RigInfo, Sensitivity, SessionEvent};
 use crate::recording::message::{Message, Payload};
@@ -16,6 +17,8 @@ pub struct Outputs {
     pub buses: Vec<Box<dyn Connection>>,
     pub recorder: Option<RecorderHandle>,
     pub node_name: NodeName,
+    /// The server for Foxglove, which shows what is recorded.
+    pub foxglove: Option<LiveView>,
     /// Messages that could not be published, and the latest reason since the last report.
     pub failures: u64,
     pub last_failure: Option<String>,
@@ -50,9 +53,12 @@ pub(super) fn record(recorder: &RecorderHandle, at: Reading, payload: Payload) {
 }
 
 impl Outputs {
-    /// Records a message that was received or made at `at`. Its log time is the monotonic one, its publish time the
+    /// Records and shows a message that was received or made at `at`. Its log time is the monotonic one, its publish time the
     /// wall clock.
     pub fn record(&self, at: Reading, payload: Payload) {
+        if let Some(foxglove) = &self.foxglove {
+            foxglove.show(at, &payload);
+        }
         if let Some(recorder) = &self.recorder {
             record(recorder, at, payload);
         }
@@ -72,8 +78,12 @@ impl Outputs {
         self.publish(Outgoing::Prediction(prediction));
     }
 
+    fn is_shown(&self, topic: Topic) -> bool {
+        self.foxglove.as_ref().is_some_and(|foxglove| foxglove.is_wanted(topic))
+    }
+
     pub fn record_prediction(&self, prediction: &Prediction) {
-        if self.recorder.is_some() {
+        if self.recorder.is_some() || self.is_shown(Topic::Prediction) {
             self.record(Reading::now(), Payload::Prediction(prediction.clone()));
         }
     }
@@ -88,9 +98,11 @@ impl Outputs {
         self.record(Reading::now(), Payload::RigInfo(info));
     }
 
-    /// Whether sensitivities have a reader or are recorded.
+    /// Whether sensitivities have a reader, or are recorded or shown.
     pub fn want_sensitivities(&self) -> bool {
-        self.recorder.is_some() || self.buses.iter().any(|bus| bus.readers(Topic::Sensitivity) > 0)
+        self.recorder.is_some()
+            || self.is_shown(Topic::Sensitivity)
+            || self.buses.iter().any(|bus| bus.readers(Topic::Sensitivity) > 0)
     }
 
     pub fn sensitivity(&mut self, sensitivity: Sensitivity) {

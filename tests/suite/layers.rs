@@ -31,6 +31,7 @@ const PROGRAM: &[&str] = &[
     "simulator",
     "recording",
     "bus",
+    "foxglove",
     "import",
     "node",
     "offline",

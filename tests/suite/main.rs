@@ -17,6 +17,7 @@ mod domain;
 mod examples;
 mod file_systems;
 mod forger;
+mod foxglove;
 mod full_model;
 mod full_scipy;
 mod identify;

@@ -207,7 +207,7 @@ fn late_reader_of_the_rig(domain: u16, check: impl FnOnce(&dyn Fn() -> Option<Ri
 }
 
 /// The processes started by one.
-fn children(parent: u32) -> Vec<u32> {
+pub fn children(parent: u32) -> Vec<u32> {
     let processes =
         fs::read_dir("/proc").expect("/proc").filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
     processes
@@ -221,7 +221,7 @@ fn status(id: u32, key: &str) -> Option<u64> {
     text.lines().find_map(|line| line.strip_prefix(key))?.split_whitespace().next()?.parse().ok()
 }
 
-fn resident_bytes(id: u32) -> u64 {
+pub fn resident_bytes(id: u32) -> u64 {
     1024 * status(id, "VmRSS:").expect("it runs")
 }
 
@@ -343,14 +343,14 @@ fn parameters_outlive_the_ros2_side() {
 }
 
 /// Asks a node for its parameters.
-struct ParameterClient {
+pub struct ParameterClient {
     node: Mutex<ros2_client::Node>,
     runtime: tokio::runtime::Runtime,
     _context: ros2_client::Context,
 }
 
 impl ParameterClient {
-    fn join(domain: u16) -> Self {
+    pub fn join(domain: u16) -> Self {
         use ros2_client::{Context, NodeName, NodeOptions};
         let participant =
             rustdds::DomainParticipantBuilder::new(domain).with_only_networks([Ipv4Addr::LOCALHOST]).build();
@@ -372,7 +372,7 @@ impl ParameterClient {
         if result.successful { Ok(()) } else { Err(result.reason.clone()) }
     }
 
-    fn get(&self, name: &str) -> f64 {
+    pub fn get(&self, name: &str) -> f64 {
         use ros2_client::rcl_interfaces::{GetParametersRequest, GetParametersResponse};
         let request = GetParametersRequest { names: vec![name.to_owned()] };
         let answer: GetParametersResponse = self.call("GetParameters", "get_parameters", request);

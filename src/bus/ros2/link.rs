@@ -44,6 +44,9 @@ const LOG_DEPTH: i32 = 1000;
 const LOG_LIFESPAN: Duration = Duration::from_secs(10);
 /// Requests of a service that may wait for its answer.
 const REQUESTS_WAITING: i32 = 1000;
+/// Largest answer of a service that arrives, bytes of CDR: RustDDS sends an answer that does not fit into one datagram in a
+/// malformed form.
+pub(super) const MAX_ANSWER: usize = 1200;
 /// Pause after a request that could not be read.
 const AFTER_FAILURE: std::time::Duration = std::time::Duration::from_millis(50);
 

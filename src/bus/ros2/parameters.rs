@@ -14,7 +14,7 @@ use ros2_client::{NodeOptions, Parameter, ParameterValue, ServiceTypeName};
 use serde::de::DeserializeOwned;
 
 use super::Ros2Error;
-use super::link::{Hearing, Link, SharedNode};
+use super::link::{Hearing, Link, MAX_ANSWER, SharedNode};
 use crate::bus::qos_overrides::QosOverrides;
 use crate::bus::ros_args::USE_SIM_TIME;
 
@@ -141,7 +141,7 @@ impl Services {
             move |asked: DescribeParametersRequest| {
                 let node = node.lock();
                 let values = asked.names.into_iter().map(|name| services.descriptor(&node, name)).collect();
-                DescribeParametersResponse { values }
+                short_enough(DescribeParametersResponse { values })
             }
         })?;
         let set = link.service("set_parameters", &kind("SetParameters"), {
@@ -211,6 +211,14 @@ fn undeclared(name: &str) -> String {
     format!("there is no parameter {name}")
 }
 
+/// The answer without descriptions, if it is too long with them.
+fn short_enough(mut answer: DescribeParametersResponse) -> DescribeParametersResponse {
+    if crate::msgs::to_cdr(&answer).is_ok_and(|cdr| cdr.len() > MAX_ANSWER) {
+        answer.values.iter_mut().for_each(|value| value.description.clear());
+    }
+    answer
+}
+
 /// `use_sim_time` stays false.
 fn sim_time(value: &ParameterValue) -> Result<(), String> {
     match value {
@@ -244,6 +252,26 @@ fn listed(names: Vec<String>, prefixes: &[String], depth: u64) -> ListParameters
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn descriptions_are_left_out_of_an_answer_that_would_be_too_long() {
+        let value = |k: usize| ParameterDescriptor {
+            name: format!("parameter_{k}"),
+            r#type: ParameterType::DOUBLE,
+            description: "what it is, in a sentence of some length that says it all".to_owned(),
+            additional_constraints: String::new(),
+            read_only: false,
+            dynamic_typing: false,
+            integer_range: vec![],
+            floating_point_range: vec![FloatingPointRange { from_value: 0.0, to_value: 1.0, step: 0.0 }],
+        };
+        for (count, described) in [(1, true), (6, true), (10, false)] {
+            let answer = short_enough(DescribeParametersResponse { values: (0..count).map(value).collect() });
+            assert_eq!(answer.values.iter().all(|value| value.description.is_empty()), !described, "{count}");
+            let bytes = crate::msgs::to_cdr(&answer).expect("encoded").len();
+            assert!(bytes <= MAX_ANSWER, "{count}: {bytes}");
+        }
+    }
 
     #[test]
     fn names_are_listed_by_prefix_and_depth() {

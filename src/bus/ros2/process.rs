@@ -3,6 +3,7 @@
 //! The node never waits for it: messages to publish go into a bounded queue.
 
 use std::borrow::Cow;
+use std::collections::HashMap;
 use std::io::{BufRead, BufReader, BufWriter, Read, Write};
 use std::net::Shutdown;
 use std::os::fd::OwnedFd;
@@ -24,8 +25,8 @@ use crate::bus::lifecycle::State;
 use crate::bus::log::Severity;
 use crate::bus::received::{Counts, Received};
 use crate::msgs::{
-    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, Temperature, Vibration,
-    Waveform, topic,
+    DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, SessionEventKind,
+    Temperature, Vibration, Waveform, topic,
 };
 
 /// The command that runs the ROS 2 side of a node.
@@ -109,6 +110,8 @@ struct Seen {
     waveform_counts_before: Counts,
     refused_before: u64,
     full_name: String,
+    /// The parameters that the session has taken.
+    parameters: HashMap<String, f64>,
     /// The rig message, sent to every new process for its late subscribers.
     rig: Option<Vec<u8>>,
 }
@@ -195,6 +198,9 @@ impl Ros2Process {
     /// # Errors
     /// [`Ros2Error::Publish`].
     pub fn publish_session_event(&self, event: &SessionEvent) -> Result<(), Ros2Error> {
+        if SessionEventKind::of(event) == Some(SessionEventKind::Parameter) {
+            self.shared.seen().parameters.insert(event.name.clone(), event.value);
+        }
         self.send(topic::SESSION_EVENT, &ToSide::SessionEvent(Cow::Borrowed(event)))
     }
 
@@ -375,6 +381,9 @@ impl Supervisor {
     /// Exchanges frames with a ROS 2 side; `None` if it closed its socket.
     fn converse(&mut self, socket: &UnixStream) -> std::io::Result<Option<End>> {
         socket.set_read_timeout(Some(READ_TIMEOUT))?;
+        for (name, value) in &mut self.start.parameters {
+            *value = self.shared.seen().parameters.get(name).copied().unwrap_or(*value);
+        }
         let start = encode(&ToSide::Start(self.start.clone())).map_err(std::io::Error::other)?;
         let first: Vec<Vec<u8>> = std::iter::once(start).chain(self.shared.seen().rig.clone()).collect();
         let (writing, queued) = (socket.try_clone()?, self.queued.clone());

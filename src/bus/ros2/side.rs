@@ -277,7 +277,10 @@ impl Side {
             ToSide::Start(_) => Ok(()),
             ToSide::Prediction(message) => self.publish_prediction(message.into_owned()),
             ToSide::Rig(message) => self.ros2.publish_rig(&message),
-            ToSide::SessionEvent(message) => self.ros2.publish_session_event(&message),
+            ToSide::SessionEvent(message) => {
+                self.ros2.take_setting(&message);
+                self.ros2.publish_session_event(&message)
+            }
             ToSide::Sensitivity(message) => self.ros2.publish_sensitivity(&message),
             ToSide::Diagnostics(message) => self.ros2.publish_diagnostics(&message),
             ToSide::Heard(message) => self.ros2.publish_heard(&message),

@@ -15,7 +15,7 @@ use tempfile::TempDir;
 
 /// Two network namespaces with a link between them that loses 5 % of the frames, delays them by 50 ms and lets them overtake
 /// each other. It goes when its standard input closes.
-struct BadLink {
+pub struct BadLink {
     process: Killed,
     near: String,
     far: String,
@@ -23,7 +23,7 @@ struct BadLink {
 
 impl BadLink {
     /// `None`, with a note, if this process may not create them; with `SQUEALCAST_PEERS` set that is a failure.
-    fn make(python: &Path) -> Option<Self> {
+    pub fn make(python: &Path) -> Option<Self> {
         let apart = Command::new("unshare").args(["--net", "true"]).stderr(Stdio::null()).status();
         if !Path::new("/dev/net/tun").exists() || !apart.is_ok_and(|status| status.success()) {
             let why = "no network namespaces, or no /dev/net/tun: it takes root, and a machine that has them";
@@ -37,6 +37,11 @@ impl BadLink {
         BufReader::new(process.0.stdout.as_mut().expect("piped")).read_line(&mut line).expect("read");
         let ends: Value = serde_json::from_str(&line).expect("its two ends");
         Some(Self { process, near: ends["near"].to_string(), far: ends["far"].to_string() })
+    }
+
+    /// A program at the end away from the node.
+    pub fn at_far(&self, program: &Path) -> Command {
+        Self::at(&self.far, program)
     }
 
     /// A program at one end.
@@ -54,13 +59,8 @@ impl Drop for BadLink {
     }
 }
 
-/// rclpy with a deep queue at 500 Hz over a bad link: reliable means that nothing is lost, however late it comes.
-fn nothing_is_lost_over_a_bad_link(ros: &str) {
-    const COUNT: u64 = 10_000;
-    let (Some(ros_python), Some(python)) = (peer_program_in(ros, "ros-python"), peer_program("python")) else { return };
-    let Some(link) = BadLink::make(&python) else { return };
-    let _alone = alone();
-    say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
+/// A node at the near end that records.
+pub fn node_at(link: &BadLink, more: &[&str]) -> Node {
     let folder = TempDir::new().expect("a folder");
     // No other process is in these namespaces, except through shared memory.
     let (domain, prefix) = names();
@@ -72,8 +72,19 @@ fn nothing_is_lost_over_a_bad_link(ros: &str) {
         "--domain".to_owned(),
         domain.id.to_string(),
     ]);
+    arguments.extend(more.iter().map(|&argument| argument.to_owned()));
     let process = start(Path::new("nsenter"), &arguments, folder.path());
-    let mut node = Node { process, domain, prefix, folder };
+    Node { process, domain, prefix, folder }
+}
+
+/// rclpy with a deep queue at 500 Hz over a bad link: reliable means that nothing is lost, however late it comes.
+fn nothing_is_lost_over_a_bad_link(ros: &str) {
+    const COUNT: u64 = 10_000;
+    let (Some(ros_python), Some(python)) = (peer_program_in(ros, "ros-python"), peer_program("python")) else { return };
+    let Some(link) = BadLink::make(&python) else { return };
+    let _alone = alone();
+    say_versions(&ros_python, &["ros-rclpy", "ros-rmw-fastrtps-cpp"]);
+    let mut node = node_at(&link, &[]);
     // A second subscriber at the node's end, which receives the same inputs.
     let script = manifest_dir().join("tests/peers/patient_listener.py");
     let listener = BadLink::at(&link.near, &ros_python)

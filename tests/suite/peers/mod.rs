@@ -5,6 +5,7 @@
 //! `SQUEALCAST_SHARED` names another folder with the real brake's matrices than `../shared`.
 
 mod bad_link;
+mod crowd;
 mod exchange;
 mod managed;
 mod operation;

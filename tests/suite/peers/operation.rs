@@ -179,3 +179,12 @@ fn the_real_brake_runs_live() {
     say(&format!("{} inputs passed over, recorded and counted", sent - answered));
     verify(&node.recording());
 }
+
+/// What `bloom` and `colcon` read of the message package: package.xml, changelog, licences and the list of messages.
+#[test]
+fn the_message_package_is_ready_for_release() {
+    let Some(ros_python) = peer_program("ros-python") else { return };
+    let found = peer(&ros_python, "message_package.py", &[&manifest_dir().display().to_string()]);
+    assert_eq!(found["problems"], serde_json::json!([]), "{found}");
+    say(&format!("{} {}: {} messages", found["name"], found["version"], found["messages"]));
+}
