@@ -108,6 +108,16 @@ impl RosArgs {
         Ok(())
     }
 
+    /// These arguments, which override `others`.
+    pub fn over(mut self, others: Self) -> Self {
+        // The first rule that applies counts, and the last value of a parameter.
+        self.rules.extend(others.rules);
+        self.sources.splice(0..0, others.sources);
+        self.log_level = self.log_level.or(others.log_level);
+        self.without_rosout |= others.without_rosout;
+        self
+    }
+
     /// The same arguments with the node renamed to `name`, overriding its `__node` rules.
     pub fn renamed(mut self, name: &str) -> Self {
         self.rules.retain(|rule| !matches!(rule.from.as_str(), "__node" | "__name"));

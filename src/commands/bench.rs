@@ -11,8 +11,14 @@ use crate::proof::stress;
 use crate::study::bench::lapack::Lapack;
 use crate::study::bench::{HeldOut, Kind, Offline, Plan, Route, measure};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast bench --modes 80 --conditions 100 --svg front.svg  error against run time
+  squealcast bench --stress                                     the extreme cases";
+
 /// Measure run time and error of every route to a prediction, on synthetic rigs
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Numbers of modes; 490 takes minutes longer
     #[arg(long, value_name = "N,N", value_delimiter = ',', default_value = "20,80,160,490", value_parser = clap::value_parser!(u16).range(4..=2000))]

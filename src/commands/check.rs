@@ -4,8 +4,14 @@ use super::{Outcome, RigName, print};
 use crate::full_model::FullModelFile;
 use crate::rig::{Rig, RigError};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast check my-rig.toml  what a rig file contains
+  squealcast check tribometer   an embedded rig";
+
 /// Validate a rig file or a full model and describe its content
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, full model, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]

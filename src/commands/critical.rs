@@ -11,8 +11,14 @@ use crate::physics::{End, MapOptions, Solver, StabilityMap, Window};
 use crate::rig::Rig;
 use crate::session::map_options;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast critical tribometer                     every window of instability
+  squealcast critical my-rig.toml --load 800 --json  at another load, as JSON";
+
 /// Find every window of instability in the friction coefficient, its ends to within 1e-10
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]

@@ -15,10 +15,15 @@ use crate::rig::{EMBEDDED, Rig};
 use crate::simulator::{Profile, Simulator};
 use crate::system::clock;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast demo                                   a simulated session, with a page and a table
+  squealcast demo nine-dof-case-2 --no-ros --plain  another rig, on shared memory only, as a log";
+
 /// Run the node with a simulated rig, to try it out: modes that are predicted to be unstable sound, and the node hears
 /// them. It takes no other inputs and is visible on this machine only
 #[derive(Debug, Args)]
-#[command(after_help = super::ROS_ARGS_HELP)]
+#[command(after_help = super::with_ros_args(EXAMPLES))]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(default_value = EMBEDDED[0].name, value_parser = super::RigName, hide_possible_values = true)]
@@ -71,6 +76,6 @@ impl Options {
             }
         };
         let inputs = Inputs::Simulator(Box::new(simulate));
-        serve(&rig, &self.buses.for_demo(), &self.shown, ros_args, inputs)
+        serve(&rig, &self.buses.for_demo(), &self.shown, ros_args, inputs, None)
     }
 }

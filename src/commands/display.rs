@@ -26,7 +26,7 @@ pub struct DisplayOptions {
     #[arg(long, conflicts_with = "display")]
     no_display: bool,
     /// Let --display name an address that other machines can reach; everybody there can see the page
-    #[arg(long, requires = "display")]
+    #[arg(long)]
     display_anywhere: bool,
 }
 

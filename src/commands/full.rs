@@ -14,13 +14,19 @@ use crate::full_model::verification::DEFAULT_BAND_HZ;
 use crate::physics::OperatingPoint;
 use crate::reduction::{FullSpectrum, FullVectors};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast full model/tribometer.toml --mu 0.7 --band-hz 3000  the roots up to 3 kHz";
+
 /// Find the complex eigenvalues of a full model under one set of conditions
 ///
 /// Finds every root of the band within discs around shifts on the imaginary axis, each with its residual; with
 /// `[contact_state]` about the state of steady sliding there.
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Full model (TOML)
+    #[arg(value_name = "FULL.toml")]
     full: PathBuf,
     #[command(flatten)]
     conditions: Conditions,

@@ -16,11 +16,11 @@ use crate::text::terminal::printable;
 
 const EXAMPLES: &str = "\
 Examples:
-  squealcast hear test.wav --sensitivity '0.05 FS/Pa'             full scale is 20 Pa
-  squealcast hear test.wav --calibration calibrator.wav           a calibrator of 94 dB, recorded likewise
-  squealcast hear test.wav --unit Pa --band-hz 2000:16000         samples in Pa, band 2 to 16 kHz
-  squealcast hear pad.wav --unit g --channel 2 --threshold-db 130 an accelerometer, 130 dB re 1 µm/s²
-  squealcast hear test.wav --unit Pa --against sessions/test      hits, misses and false alarms of predictions";
+  squealcast hear test.wav --sensitivity '0.05 FS/Pa'              full scale is 20 Pa
+  squealcast hear test.wav --calibration calibrator.wav            94 dB, recorded likewise
+  squealcast hear test.wav --unit Pa --band-hz 2000:16000          samples in Pa, 2 to 16 kHz
+  squealcast hear pad.wav --unit g --channel 2 --threshold-db 130  an accelerometer, dB re 1 µm/s²
+  squealcast hear test.wav --unit Pa --against sessions/test       hits, misses and false alarms";
 
 /// Find squeal in a file of samples: onset, end, frequency, level and growth rate of every tone that is loud enough. The
 /// defaults are those of SAE J2521: at least 70 dB(A) between 1.25 and 16 kHz

@@ -16,8 +16,13 @@ use crate::rig::{Rig, RigFile};
 /// The stiffness counts as poorly determined if the error stays within twice its minimum over more than this factor.
 const WELL_DETERMINED: f64 = 2.0;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast identify my-rig.toml --targets measured.csv -o fitted.toml  fit the contact stiffness";
+
 /// Find the contact stiffness that fits measured or computed natural frequencies at rest
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]

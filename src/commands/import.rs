@@ -7,8 +7,14 @@ use super::{Outcome, finite, positive};
 use crate::import::tribometer_log::{Field, LogOptions, TribometerLog};
 use crate::import::{ReadLog, import_with_sound, read_log};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast import test.csv -o test.mcap                               a log with named columns
+  squealcast import test.csv -o test.mcap --column normal_load_n=Kraft  another column";
+
 /// Convert a tribometer log, and samples taken beside it, to a recording
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Delimited text with named columns, units in their names
     session: PathBuf,

@@ -15,8 +15,14 @@ use crate::session::map_options;
 /// Largest number of operating points of a map.
 const MOST_POINTS: usize = 1_000_000;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast map tribometer --svg map.svg                            over friction and load
+  squealcast map tribometer --x speed=1:60 --y mu=0:1 --csv map.csv  over speed and friction";
+
 /// Map the largest growth rate over two conditions, with the edges of the windows of instability
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]

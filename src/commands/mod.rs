@@ -5,6 +5,7 @@ mod bench;
 mod buses;
 mod check;
 mod completions;
+mod config;
 mod critical;
 mod demo;
 mod display;
@@ -15,6 +16,8 @@ mod hear;
 mod identify;
 mod import;
 mod live;
+mod log;
+mod man;
 mod map;
 mod memory;
 mod on_basis;
@@ -24,6 +27,7 @@ mod predict_log;
 mod recordings;
 mod recover;
 mod reduce;
+mod reload;
 mod replay;
 mod report;
 mod reproduce;
@@ -31,6 +35,7 @@ mod rigs;
 mod ros2_side;
 mod run;
 mod score;
+mod service;
 mod signals;
 mod simulate;
 mod simulated_modes;
@@ -54,14 +59,20 @@ use crate::files::whole_file::write_whole;
 use crate::physics::OperatingPoint;
 use crate::rig::{EMBEDDED, Limits, Rig};
 use crate::text::terminal::printable;
+use config::Given;
 
-/// Shown below the help of commands that join ROS 2.
+/// Shown below the options of commands that join ROS 2.
 const ROS_ARGS_HELP: &str = "\
 ROS 2 arguments follow --ros-args:
   -r, --remap FROM:=TO         Remap a topic, the node (__node) or its namespace (__ns)
   -p, --param NAME:=VALUE      Set a parameter
       --params-file FILE       Read parameters from a YAML file
       --log-level LEVEL        Set the level of the log";
+
+/// The help of a command that joins ROS 2, above its examples.
+fn with_ros_args(examples: &str) -> String {
+    format!("{ROS_ARGS_HELP}\n\n{examples}")
+}
 
 const EXAMPLES: &str = "\
 Examples:
@@ -106,6 +117,7 @@ enum Command {
     Verify(verify::Options),
     Reproduce(reproduce::Options),
     Completions(completions::Options),
+    Man(man::Options),
     #[command(name = crate::bus::ros2::process::COMMAND, hide = true)]
     Ros2Side(ros2_side::Options),
 }
@@ -121,20 +133,30 @@ pub enum Outcome {
 
 /// Runs the command line of this process. Exit codes: 0 done, 1 failure, 2 usage, 3 differences or data loss.
 pub fn main() -> ExitCode {
-    let (ros_args, args) = match RosArgs::split(std::env::args()) {
+    // Ends the process if it was started for that.
+    completions::complete();
+    let (ros_args, arguments) = match RosArgs::split(std::env::args()) {
         Ok(split) => split,
         Err(error) => {
             note!("error: {error}");
             return ExitCode::from(2);
         }
     };
-    let cli = Cli::parse_from(args); // exits with code 2 on wrong usage
+    let given = Given { arguments, ros_args };
+    // Exits with code 2 on wrong usage.
+    let (cli, ros_args, config) = match given.parse() {
+        Ok(parsed) => parsed,
+        Err(error) => {
+            note!("error: {error}");
+            return ExitCode::from(2);
+        }
+    };
     if let Err(error) = signals::survive_file_size_limit() {
         note!("a file that grows beyond its limit will end this: {error}");
     }
     let result = match cli.command {
         Command::Demo(options) => options.run(ros_args),
-        Command::Run(options) => options.run(ros_args),
+        Command::Run(options) => options.run(ros_args, config.map(|config| (given, config))),
         Command::Simulate(options) => options.run(ros_args),
         Command::Replay(options) => options.run(ros_args),
         Command::View(options) => options.run(),
@@ -158,6 +180,7 @@ pub fn main() -> ExitCode {
         Command::Verify(options) => options.run(),
         Command::Reproduce(options) => options.run(),
         Command::Completions(options) => options.run(),
+        Command::Man(options) => options.run(),
         Command::Ros2Side(options) => options.run(),
     };
     match result {
@@ -312,4 +335,47 @@ fn write_file(path: &std::path::Path, bytes: &[u8]) -> anyhow::Result<()> {
         return print_bytes(bytes);
     }
     Ok(write_whole(path, |out| out.write_all(bytes))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    /// The words of a command line; quotes hold some together.
+    fn words(line: &str) -> Vec<String> {
+        let parts = line.split('\'').enumerate();
+        parts
+            .flat_map(|(k, part)| if k % 2 == 1 { vec![part] } else { part.split_whitespace().collect() })
+            .map(str::to_owned)
+            .collect()
+    }
+
+    /// Every command, those added later included, ends its help with examples of itself that its options allow.
+    #[test]
+    fn the_help_of_every_command_ends_with_valid_examples() {
+        let mut cli = Cli::command();
+        cli.build();
+        let commands = cli.get_subcommands().filter(|command| !command.is_hide_set() && command.get_name() != "help");
+        for command in commands {
+            let name = command.get_name();
+            let help = command.clone().render_help().to_string();
+            let (_, examples) =
+                help.split_once("\nExamples:\n").unwrap_or_else(|| panic!("{name}: no examples\n{help}"));
+            assert!(!examples.trim().is_empty(), "{name}");
+            for line in examples.lines() {
+                assert!(line.chars().count() < 99, "{name}: longer than a line of help: {line:?}");
+                let line = line.trim_start();
+                let (example, said) = line.split_once("  ").unwrap_or_else(|| panic!("{name}: {line:?} says nothing"));
+                assert!(
+                    example.starts_with(&format!("squealcast {name}")) && !said.trim().is_empty(),
+                    "{name}: {line:?}"
+                );
+                let shell = example.split(" > ").next().unwrap_or_default();
+                let (_, arguments) = RosArgs::split(words(shell)).unwrap_or_else(|error| panic!("{example}: {error}"));
+                Cli::try_parse_from(arguments).unwrap_or_else(|error| panic!("{example}: {error}"));
+            }
+        }
+    }
 }

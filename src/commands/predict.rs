@@ -7,8 +7,14 @@ use crate::contact::SteadyState;
 use crate::physics::Mode;
 use crate::rig::Rig;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast predict nine-dof-case-2 --mu 0.4                  at one friction coefficient
+  squealcast predict my-rig.toml --load 800 --speed 20 --json  at other conditions, as JSON";
+
 /// Predict the vibration modes of a rig under one set of conditions
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]

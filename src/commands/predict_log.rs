@@ -23,10 +23,16 @@ use crate::session::computed::session_chart;
 use crate::session::conditions;
 use crate::sound::search::end_ns;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast predict-log recordings/ramp --rig nine-dof -o predicted               with another rig
+  squealcast predict-log test.csv --rig my-rig.toml -o predicted --sound test.wav  a log and sound";
+
 /// Predict recorded conditions as fast as possible, from recordings with operating points and from tribometer logs. For
 /// each, a recording with predictions is written, with the rig's own settings and the original stamps. Sound and
 /// acceleration, recorded or in files beside the log, are searched for squeal, which is compared with the predictions
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,

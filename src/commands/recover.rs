@@ -5,10 +5,16 @@ use clap::Args;
 use super::{Outcome, print};
 use crate::recording::recover::{self, Recovery, recover};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast recover sessions  what an interruption left in a folder";
+
 /// Repair an interrupted recording
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// A file, or a directory of recordings
+    #[arg(value_name = "RECORDING")]
     path: PathBuf,
 }
 

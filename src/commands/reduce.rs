@@ -26,6 +26,11 @@ type FilesOf<'a> = dyn Fn(Option<&Certificate>) -> Result<Vec<RigFile>, ExportEr
 /// Default cut-off of the modes kept, relative to the band, if `--cutoff-hz` has no value.
 const CUTOFF: f64 = 2.5;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast reduce model/tribometer.toml -o rig.toml                on a basis of its vectors
+  squealcast reduce model/tribometer.toml --modes 80+80 -o rig.toml  on modes of the parts";
+
 /// Reduce a full model to a rig file the node can run
 ///
 /// By default the basis consists of the full model's own vectors over a range of conditions: every root in the band
@@ -34,8 +39,10 @@ const CUTOFF: f64 = 2.5;
 /// compared with the full model at held-out operating points, and the rig file contains the result. The arrays are
 /// written to the folder of the rig file under names with their hash, and the rig file last.
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Full model
+    #[arg(value_name = "FULL.toml")]
     full: PathBuf,
     /// Largest relative error of a root on the basis within the range [default: 1e-6]
     #[arg(long, value_name = "ERROR", value_parser = positive, conflicts_with = "of_modes")]

@@ -25,9 +25,14 @@ use crate::recording::pace::{Due, Pacer, Pacing};
 use crate::recording::reader::{Recorded, Recording};
 use crate::rig::{Rig, RigFile};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast replay recordings/ramp --rate 2  play it at double speed
+  squealcast replay sessions --verify         predict all recordings again and compare";
+
 /// Play a recording on live buses, or predict recordings again and compare
 #[derive(Debug, Args)]
-#[command(after_help = super::ROS_ARGS_HELP)]
+#[command(after_help = super::with_ros_args(EXAMPLES))]
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,
@@ -162,7 +167,8 @@ impl Options {
         self.wait(recording, &player, &stopped);
         let watch = Watch::default();
         let played = Arc::new(AtomicU64::new(0));
-        let shown = live::show(frame(&path, recording, &played, &stopped), watch.clone(), self.plain);
+        let form = if self.plain { live::Form::Lines } else { live::Form::Table };
+        let shown = live::show(frame(&path, recording, &played, &stopped), watch.clone(), form);
         let done = self.play_rounds(recording, first.log_time_ns, &mut player, &watch, &played, &stopped);
         shown.stop();
         done?;

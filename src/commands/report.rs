@@ -10,8 +10,13 @@ use super::recordings::Recordings;
 use super::{Outcome, print, view, write_file};
 use crate::display::report::{Origin, report};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast report recordings/ramp -o report  one self-contained HTML file and a CSV file";
+
 /// Write a report of each recording: one self-contained HTML file, and the events as CSV
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,

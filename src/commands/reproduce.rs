@@ -15,11 +15,16 @@ use crate::full_model::FullModelFile;
 use crate::reduction::Wanted;
 use crate::study::reproduce::{Item, MODES, PartModes, Step, Study, index, nine_dof};
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast reproduce -o paper  tables, figures and a page";
+
 /// Reproduce the paper's tables and figures: CSV, SVG and one page that compares them with the paper's numbers
 ///
 /// The results of its nine-degree-of-freedom models take a second. Those of its tribometer, with a full model of this
 /// project, take some minutes. The full model is written to the folder too.
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Degrees of freedom of the tribometer, at least; the paper's model has 904968
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = clap::value_parser!(u32).range(5_000..=4_000_000))]

@@ -3,8 +3,13 @@ use clap::Args;
 use super::{Outcome, print};
 use crate::rig::EMBEDDED;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast rigs  names and descriptions";
+
 /// List the embedded rigs
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {}
 
 impl Options {

@@ -1,4 +1,5 @@
 //! SIGINT, SIGTERM and SIGHUP end a command cleanly. Further signals within 2 s are ignored; any later one ends it at once.
+//! A node with a configuration file reads it again at SIGHUP instead.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -22,30 +23,63 @@ pub fn wait_until(moment: Instant, stopped: &AtomicBool) {
     }
 }
 
-/// Calls `stop` once at the first signal. Further signals within [`SAME_REQUEST`] are ignored; any later one ends the
-/// process. SIGHUP is ignored if it was ignored when the process started (`nohup`).
+/// What SIGHUP does.
+pub enum Hangup {
+    /// It ends the program, as SIGTERM does: its terminal was closed.
+    Stops,
+    /// It calls this function, every time.
+    Calls(Box<dyn FnMut() + Send>),
+}
+
+/// As [`on_signals`], where SIGHUP ends the program.
 ///
 /// # Errors
 /// Signal handlers cannot be installed.
 pub fn on_stop(stop: impl FnOnce() + Send + 'static) -> anyhow::Result<()> {
+    on_signals(Hangup::Stops, stop)
+}
+
+/// Calls `stop` once at the first signal that ends the program. Further ones within [`SAME_REQUEST`] are ignored; any
+/// later one ends the process. SIGHUP is ignored if it was ignored when the process started (`nohup`).
+///
+/// # Errors
+/// Signal handlers cannot be installed.
+pub fn on_signals(hangup: Hangup, stop: impl FnOnce() + Send + 'static) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .build()
         .context("cannot start the signal listener")?;
-    let mut kinds = vec![SignalKind::interrupt(), SignalKind::terminate()];
+    let mut stopping = vec![SignalKind::interrupt(), SignalKind::terminate()];
+    let (mut calling, mut call) = (vec![], None);
     if !ignored_from_the_beginning(SignalKind::hangup()) {
-        kinds.push(SignalKind::hangup());
+        match hangup {
+            Hangup::Stops => stopping.push(SignalKind::hangup()),
+            Hangup::Calls(function) => {
+                calling.push(SignalKind::hangup());
+                call = Some(function);
+            }
+        }
     }
-    let mut signals: Vec<Signal> =
-        runtime.block_on(async { kinds.into_iter().map(signal).collect::<Result<_, _>>() })?;
+    let listen = |kinds: Vec<SignalKind>| kinds.into_iter().map(signal).collect::<Result<Vec<Signal>, _>>();
+    let (mut stops, mut calls) =
+        runtime.block_on(async { Ok::<_, std::io::Error>((listen(stopping)?, listen(calling)?)) })?;
     std::thread::spawn(move || {
         runtime.block_on(async {
-            any(&mut signals).await;
+            loop {
+                tokio::select! {
+                    () = any(&mut stops) => break,
+                    () = any(&mut calls) => {
+                        if let Some(call) = &mut call {
+                            call();
+                        }
+                    }
+                }
+            }
             stop();
             let first = Instant::now();
             let mut said = false;
             loop {
-                any(&mut signals).await;
+                any(&mut stops).await;
                 if first.elapsed() >= SAME_REQUEST {
                     std::process::exit(130);
                 }
@@ -58,7 +92,7 @@ pub fn on_stop(stop: impl FnOnce() + Send + 'static) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Waits for any of several signals.
+/// Waits for any of several signals; forever if there are none.
 async fn any(signals: &mut [Signal]) {
     std::future::poll_fn(|context| {
         // All are polled, so that each of them can wake this future.

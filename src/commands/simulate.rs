@@ -17,12 +17,17 @@ use crate::rig::Rig;
 use crate::simulator::{self, Peak, Profile, Simulator, Tone};
 use crate::system::clock;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast simulate --rate 200                           conditions for a node on this machine
+  squealcast simulate --record simulated --rig tribometer  a recorded session, as fast as possible";
+
 /// Publish simulated conditions, or record a simulated session
 #[derive(Debug, Args)]
-#[command(after_help = super::ROS_ARGS_HELP)]
+#[command(after_help = super::with_ros_args(EXAMPLES))]
 pub struct Options {
     /// Profile of load, speed and friction coefficient, TOML [default: the paper's test, then a ramp from 0 to 1]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "PROFILE.toml")]
     profile: Option<PathBuf>,
     /// Seed of the noise
     #[arg(long, value_name = "N", default_value_t = 1)]

@@ -10,8 +10,14 @@ use crate::analysis::sweep::{Sweep, sweep};
 use crate::figures::plot;
 use crate::rig::Rig;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast sweep tribometer --csv modes.csv --svg modes.svg  over friction, as table and figure
+  squealcast sweep tribometer --mu 0.7 --load 50:2000:50       over the load";
+
 /// Sweep friction coefficient, load, speed or temperature, following modes through crossings and merging points
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]

@@ -8,11 +8,16 @@ use crate::export::{Besides, write_full_model};
 use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::files::whole_file::remove_begun;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast tribometer -o model  matrices, decks and the file that names them";
+
 /// Write the reference tribometer as a full finite-element model
 ///
 /// A pad-on-disc rig of the paper's kind with dimensions of this project, not the paper's mesh: matrices (Matrix Market),
 /// `tribometer.toml` that names them, a CalculiX deck of each part, and the mesh as VTK.
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Degrees of freedom, at least; the 294 contact pairs are the same at any size
     #[arg(long, value_name = "N", default_value_t = 20_000, value_parser = clap::value_parser!(u32).range(5_000..=4_000_000))]

@@ -15,18 +15,23 @@ const TOLERANCE: f64 = 0.01;
 /// Default difference up to which window ends of rig and full model agree.
 const FRICTION_TOLERANCE: f64 = 0.003;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast verify rig.toml --against model/tribometer.toml  at ten held-out operating points";
+
 /// Compare a reduced rig with its full model
 ///
 /// Compares frequencies and growth rates at operating points drawn from the rig's chart range, and windows of
 /// instability at its reference and at the corners of that range. Exit code 3 if an unstable mode is missed or
 /// invented, or if an error exceeds the tolerance.
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
     /// Full model (TOML) to compare with
-    #[arg(long, value_name = "FULL")]
+    #[arg(long, value_name = "FULL.toml")]
     against: PathBuf,
     /// Held-out operating points
     #[arg(long, value_name = "N", default_value_t = 10)]

@@ -17,8 +17,14 @@ use crate::msgs::schema::Topic;
 use crate::recording::reader::Recording;
 use crate::rig::Rig;
 
+const EXAMPLES: &str = "\
+Examples:
+  squealcast view recordings/ramp  the page of one recording
+  squealcast view sessions         of all recordings in a folder";
+
 /// Show recordings on the page, with a time line. Of several, the page shows the last by name and lets you choose
 #[derive(Debug, Args)]
+#[command(after_help = EXAMPLES)]
 pub struct Options {
     #[command(flatten)]
     recordings: Recordings,

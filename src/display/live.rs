@@ -9,6 +9,7 @@ use super::curves::Curves;
 use super::events::{Events, seconds};
 use super::heard::SquealsInSound;
 use super::history::History;
+use super::metrics;
 use super::running_score::RunningScore;
 use super::server::{About, Source};
 use super::shape::shape;
@@ -137,7 +138,7 @@ impl Followed {
             prediction: snapshot.prediction.as_ref().map(|p| Shown::new(snapshot.input.as_ref(), p)),
             spread: spread(&self.history, time_s),
             trend_per_s: trend_per_s(&self.history, time_s),
-            warn_margin: snapshot.warn_margin,
+            warn_margin: snapshot.settings.map(|settings| settings.warn_margin),
             temperature: snapshot.temperature.map(|seen| TemperatureShown {
                 celsius: seen.celsius,
                 of_rig: snapshot.rig.as_deref().unwrap_or(rig).temperature_c(),
@@ -201,6 +202,10 @@ impl Source for Live {
             let whole = shown.get(channel)?;
             picture(whole, whole, 0.0)
         })
+    }
+
+    fn metrics(&self) -> Option<String> {
+        Some(metrics::text(&self.about, &self.watch.snapshot()))
     }
 
     fn map(&self, number: u64) -> Option<Arc<str>> {

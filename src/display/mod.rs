@@ -16,6 +16,7 @@ pub mod events;
 pub mod heard;
 pub mod history;
 pub mod live;
+mod metrics;
 pub mod recorded;
 pub mod report;
 mod running_score;

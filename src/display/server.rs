@@ -30,6 +30,7 @@ use super::comparison::Comparison;
 use super::connections::{self, Bounds};
 use super::events::{Events, PageColumn, page_columns};
 use super::heard::SquealsInSound;
+use super::metrics;
 use super::shelf::Shelf;
 use super::sound_page::{SoundShown, SpectrogramPicture};
 use crate::node::status::InputSources;
@@ -62,6 +63,10 @@ pub trait Source: Send + Sync + 'static {
     /// The measured vibration compared with the predictions; `None` without measurements, or while a session is
     /// running.
     fn comparison(&self) -> Option<Comparison> {
+        None
+    }
+    /// State and counters as Prometheus text; `None` for a recording.
+    fn metrics(&self) -> Option<String> {
         None
     }
     /// The curves of a stability map.
@@ -215,6 +220,7 @@ async fn serve(listener: TcpListener, address: SocketAddr, pages: Pages) {
         .route("/map.json", get(map))
         .route("/shape.json", get(shape))
         .route("/contact.json", get(contact))
+        .route("/metrics", get(metrics_text))
         .route_layer(from_fn_with_state(app.clone(), choose))
         // Neither needs a recording to be open.
         .route("/recordings.json", get(recordings))
@@ -483,6 +489,14 @@ async fn contact(Extension(source): Extension<Arc<dyn Source>>, Query(asked): Qu
     aside(move || match source.contact(asked.at) {
         Ok(contact) => json(contact),
         Err(reason) => (StatusCode::NOT_FOUND, reason).into_response(),
+    })
+    .await
+}
+
+async fn metrics_text(Extension(source): Extension<Arc<dyn Source>>) -> Response {
+    aside(move || match source.metrics() {
+        Some(text) => ([(header::CONTENT_TYPE, metrics::MEDIA_TYPE)], text).into_response(),
+        None => (StatusCode::NOT_FOUND, "a recording has no metrics").into_response(),
     })
     .await
 }

@@ -7,7 +7,7 @@
 //!
 //! | file | size limit | memory of its reader, at most |
 //! |---|---|---|
-//! | rig file, full model, profile (TOML) | [`TOML`] | about 100 times the file; 80 levels of nesting |
+//! | rig file, full model, profile, configuration (TOML) | [`TOML`] | about 100 times the file; 80 levels of nesting |
 //! | ROS parameter file (YAML) | [`PARAMETERS`] | 64 levels of nesting, no aliases |
 //! | modes and residuals of a rig (`.npz`) | [`RIG_PART`] | max(64 MiB, 100 times the file), up to 1 GiB |
 //! | modes of a rig (`.unv`, `.uff`) | [`RIG_PART`] | about 10 times the file; lines of 64 KiB |
@@ -27,7 +27,7 @@ use std::io::{self, Read};
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::Path;
 
-/// Rig files, full models and profiles.
+/// Rig files, full models, profiles and configuration files.
 pub const TOML: u64 = 1 << 20;
 /// ROS parameter files.
 pub const PARAMETERS: u64 = 1 << 20;

@@ -398,7 +398,11 @@ impl Worker {
         self.outputs.heard(heard);
     }
 
+    /// Changes a setting. One that has this value already is no event.
     fn parameter(&mut self, name: String, value: f64) {
+        if self.session.settings().values().any(|setting| setting == (name.as_str(), value)) {
+            return;
+        }
         self.record_and_step(Event::Parameter { name, value }, now_header());
         self.watch.settings(self.session.settings());
     }
@@ -558,7 +562,7 @@ impl Worker {
         self.statistics.unheard = self.lifecycle.unheard();
         self.statistics.temperature_timeout_s = self.session.settings().temperature_timeout_s;
         let array = self.statistics.report(now_header(), &self.rig, counters, queued, pending, sound, outputs);
-        self.watch.counters(counters, self.statistics.passed_over, self.statistics.restarts);
+        self.watch.diagnostics(&array, counters, self.statistics.passed_over, self.statistics.restarts);
         self.watch.recording_problem(self.outputs.recorder.as_ref().and_then(|recorder| recorder.status().problem()));
         self.log.write(&array, &mut self.outputs);
         self.outputs.diagnostics(array);
@@ -691,7 +695,7 @@ mod tests {
         node.worker.prediction_times.note(Duration::from_millis(10));
         node.run(Outputs::default());
         let seen = watch.snapshot();
-        assert_eq!(seen.warn_margin, Some(0.3), "of the settings, not of the rig");
+        assert_eq!(seen.settings.map(|settings| settings.warn_margin), Some(0.3), "of the settings, not of the rig");
         assert_eq!(seen.prediction.expect("one").input_seq, COUNT - 1);
         assert_eq!((seen.counters.solved, seen.passed_over), (1, COUNT - 1));
     }

@@ -8,7 +8,7 @@ use serde::Serialize;
 use super::sound_view::SoundView;
 use super::status::{Assessment, Inputs, Status};
 use crate::bus::lifecycle::State;
-use crate::msgs::{Heard, OperatingPoint, Prediction, Vibration, heard_state, level};
+use crate::msgs::{DiagnosticArray, Heard, OperatingPoint, Prediction, Vibration, heard_state, level};
 use crate::physics::{Ends, NextWindow, StabilityMap};
 use crate::rig::Rig;
 use crate::session::settings::Settings;
@@ -30,8 +30,12 @@ pub struct Snapshot {
     pub map: Option<Arc<StabilityMap>>,
     /// Window ends of the map at a load and speed other than the map's own.
     pub ends: Option<Arc<Ends>>,
-    /// The margin below which the node warns at present; `None` before it started.
-    pub warn_margin: Option<f64>,
+    /// The settings in force; `None` before the node started.
+    pub settings: Option<Settings>,
+    /// The latest diagnostics, and their number so far. The node's thread makes them, one a second, so it hangs if they
+    /// stop.
+    pub diagnostics: Option<Arc<DiagnosticArray>>,
+    pub reports: u64,
     /// The rig at its present temperature; `None` while that is the reference.
     pub rig: Option<Arc<Rig>>,
     /// The latest temperature of the contact.
@@ -338,7 +342,7 @@ impl Watch {
     pub(super) fn settings(&self, settings: &Settings) {
         let timeout = Duration::try_from_secs_f64(settings.temperature_timeout_s).unwrap_or(Duration::MAX);
         self.with(|Watched { snapshot, temperature_timeout, .. }| {
-            snapshot.warn_margin = Some(settings.warn_margin);
+            snapshot.settings = Some(*settings);
             *temperature_timeout = timeout;
             if let Some(temperature) = &mut snapshot.temperature {
                 temperature.timeout = timeout;
@@ -350,9 +354,19 @@ impl Watch {
         self.with(|watched| watched.snapshot.recording_problem = problem);
     }
 
-    pub(super) fn counters(&self, counters: Counters, passed_over: u64, bus_restarts: u64) {
+    /// Takes note of the diagnostics, and of counters they contain.
+    pub(super) fn diagnostics(
+        &self,
+        diagnostics: &DiagnosticArray,
+        counters: Counters,
+        passed_over: u64,
+        bus_restarts: u64,
+    ) {
+        let diagnostics = Some(Arc::new(diagnostics.clone()));
         self.with(|Watched { snapshot, .. }| {
             (snapshot.counters, snapshot.passed_over, snapshot.bus_restarts) = (counters, passed_over, bus_restarts);
+            snapshot.diagnostics = diagnostics;
+            snapshot.reports += 1;
         });
     }
 }

@@ -4,12 +4,20 @@
 use std::collections::VecDeque;
 use std::fmt;
 use std::io::IsTerminal;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use crate::text::terminal::{self, printable};
 
 /// Number of lines kept back; beyond it the oldest are dropped, and their number is written.
 const MOST_LINES: usize = 200;
+
+/// What makes a line of a note, if it is not the note itself.
+static FORM: OnceLock<fn(&str) -> String> = OnceLock::new();
+
+/// Writes every note from now on as `form` makes it; only the first call has an effect.
+pub fn write_as(form: fn(&str) -> String) {
+    let _ = FORM.set(form);
+}
 
 static WAITING: Mutex<Option<Waiting>> = Mutex::new(None);
 /// The lines since they were last taken; `None` until [`collect`] is called.
@@ -56,6 +64,13 @@ pub fn line(text: fmt::Arguments<'_>) {
     if let Some(collected) = COLLECTED.lock().unwrap_or_else(PoisonError::into_inner).as_mut() {
         collected.push(printable(&text.to_string()).into_owned());
     }
+    match FORM.get() {
+        Some(form) => write(format_args!("{}", form(&text.to_string()))),
+        None => write(text),
+    }
+}
+
+fn write(text: fmt::Arguments<'_>) {
     match waiting().as_mut() {
         Some(waiting) => waiting.push(printable(&text.to_string()).into_owned()),
         None => terminal::note(text),

@@ -40,6 +40,7 @@ mod rig_files;
 mod rig_models;
 mod ros2_side;
 mod scipy;
+mod service;
 mod sessions;
 mod sound;
 mod sound_beside_logs;

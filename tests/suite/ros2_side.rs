@@ -362,7 +362,7 @@ impl ParameterClient {
         Self { node: Mutex::new(node), runtime, _context: context }
     }
 
-    fn set(&self, name: &str, value: f64) -> Result<(), String> {
+    pub fn set(&self, name: &str, value: f64) -> Result<(), String> {
         use ros2_client::rcl_interfaces::{SetParametersRequest, SetParametersResponse};
         use ros2_client::{Parameter, ParameterValue};
         let parameter = Parameter { name: name.to_owned(), value: ParameterValue::Double(value) };

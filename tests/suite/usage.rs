@@ -1,5 +1,8 @@
 //! First contact of a user: inputs outside the limits, lists and completions, standard output as a file, quiet runs.
 
+use std::path::Path;
+use std::process::Command;
+
 use crate::program::{self, folder, run, text, write};
 
 /// The rig accepts loads from 0 to 1e6 N and friction coefficients from 0 to 2.
@@ -41,22 +44,91 @@ fn check_prints_the_natural_frequencies_of_each_part() {
 }
 
 #[test]
-fn embedded_rigs_are_listed_and_completed() {
+fn embedded_rigs_are_listed() {
     let listed = run(["rigs"]).exits(0).stdout;
     let names: Vec<&str> = listed.lines().filter_map(|line| line.split_whitespace().next()).collect();
     assert!(names.contains(&"tribometer") && names.contains(&"nine-dof-case-2-4+2"), "{listed}");
-    // The generator for fish completes no arguments by position.
-    for shell in ["bash", "zsh"] {
-        let script = run(["completions", shell]).exits(0).stdout;
-        assert!(names.iter().all(|name| script.contains(name)), "{shell}");
+}
+
+/// What shells offer for a command line, by the script that this program prints for each.
+#[test]
+fn shells_complete_rigs_files_and_options() {
+    let folder = folder();
+    for name in ["my-rig.toml", "test.csv", "session.mcap"] {
+        write(folder.path(), name, "");
     }
-    // Where a rig is expected, zsh offers files as well: the list of rigs is in one function only.
-    let script = run(["completions", "zsh"]).exits(0).stdout;
-    assert_eq!(script.matches("((tribometer\\:").count(), 1, "{script}");
-    assert!(
-        script.contains("'files:rig file:_files'") && script.matches(":_squealcast_rigs'").count() >= 5,
-        "{script}"
-    );
+    std::fs::create_dir(folder.path().join("sessions")).unwrap();
+    let program = Path::new(env!("CARGO_BIN_EXE_squealcast"));
+    let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap_or_default());
+    let ask = |shell: &str, asks: &str| {
+        let script = write(folder.path(), &format!("script-{shell}"), &run(["completions", shell]).exits(0).stdout);
+        let mut command = Command::new(shell);
+        command.args(["-c", &asks.replace("SCRIPT", &script)]).current_dir(folder.path()).env("PATH", &path);
+        let answer = command.env("HOME", folder.path()).output().unwrap();
+        let text = String::from_utf8_lossy(&answer.stdout).into_owned();
+        assert!(answer.status.success(), "{shell}: {text}{}", String::from_utf8_lossy(&answer.stderr));
+        let mut offers: Vec<String> =
+            text.lines().filter_map(|line| Some(line.split('\t').next()?.trim().to_owned())).collect();
+        offers.sort_unstable();
+        offers
+    };
+    let bash = |line: &str| {
+        let words: Vec<&str> = line.split(' ').collect();
+        let last = words.last().unwrap();
+        ask(
+            "bash",
+            &format!(
+                "source SCRIPT; COMP_WORDS=({line}); COMP_WORDS[{0}]='{last}'; COMP_CWORD={0}; COMP_TYPE=9
+                _clap_complete_squealcast squealcast '{last}'; printf '%s\\n' \"${{COMPREPLY[@]}}\"",
+                words.len() - 1
+            ),
+        )
+    };
+    let fish = |line: &str| ask("fish", &format!("source SCRIPT; complete -C '{line}'"));
+    // The function that zsh calls, with the builtin that takes its offers replaced by one that prints them.
+    let zsh = |line: &str| {
+        let words = line.split(' ').count();
+        ask(
+            "zsh",
+            &format!(
+                "compdef() {{ }}
+                _describe() {{ for name in dirs other; do if [[ ${{@[(Ie)$name]}} -gt 0 ]]; then \
+                    for offer in ${{(P)name}}; do print -r -- ${{offer%%:*}}; done; fi; done }}
+                source SCRIPT; words=({line}); (( ${{#words}} < {words} )) && words+=(''); CURRENT={words}
+                _clap_dynamic_completer_squealcast"
+            ),
+        )
+    };
+    type Offers<'a> = &'a dyn Fn(&str) -> Vec<String>;
+    let shells: [(&str, Offers<'_>); 3] = [("bash", &bash), ("fish", &fish), ("zsh", &zsh)];
+    for (name, offers) in shells {
+        if Command::new(name).arg("--version").output().is_err() {
+            program::skipped(&format!("no {name}"));
+            continue;
+        }
+        let folder = if name == "zsh" { "sessions" } else { "sessions/" };
+        assert_eq!(offers("squealcast rec"), ["recover"], "{name}");
+        assert_eq!(offers("squealcast check tribometer-8"), ["tribometer-80+80"], "{name}");
+        assert_eq!(offers("squealcast run my"), ["my-rig.toml"], "{name}");
+        assert!(offers("squealcast run ").contains(&"nine-dof".to_owned()), "{name}");
+        assert_eq!(offers("squealcast report s"), ["session.mcap", folder], "{name}");
+        assert_eq!(offers("squealcast report --rig my"), ["my-rig.toml"], "{name}");
+        assert_eq!(offers("squealcast run --config "), ["my-rig.toml", folder], "{name}");
+        assert_eq!(offers("squealcast import t"), ["test.csv"], "{name}");
+        assert_eq!(offers("squealcast run --no-chart-"), ["--no-chart-cache"], "{name}");
+    }
+}
+
+#[test]
+fn every_command_has_a_manual_page_with_examples() {
+    let folder = folder();
+    run(["man", "-o", &text(folder.path())]).exits(0);
+    let pages = program::files_below(folder.path());
+    assert!(pages.len() > 25, "{pages:?}");
+    for page in pages {
+        let text = std::fs::read_to_string(&page).unwrap();
+        assert!(text.contains(".SH EXAMPLES") && text.starts_with(".ie"), "{}: {text}", page.display());
+    }
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! The view of `run`, `demo` and `replay`: a live table on a terminal, log lines otherwise.
 
-mod view;
+pub(super) mod view;
 
 use std::io::IsTerminal;
 use std::sync::Arc;
@@ -23,6 +23,16 @@ const EVERY: Duration = Duration::from_millis(100);
 const LOG_EVERY: Duration = Duration::from_secs(5);
 /// Number of rows that Page Up and Page Down scroll.
 const PAGE_ROWS: isize = 10;
+
+/// What is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Form {
+    /// A table on a terminal, log lines otherwise.
+    Table,
+    Lines,
+    /// Log lines in JSON.
+    Json,
+}
 
 /// Returns the items of the last line.
 pub type Foot = Box<dyn Fn(&Snapshot) -> Vec<String> + Send>;
@@ -62,12 +72,13 @@ impl Shown {
 
 /// Shows what `watch` contains until stopped. The keys q, Esc and Ctrl-C quit; arrow and page keys scroll. Log lines
 /// are written if the terminal cannot be used.
-pub fn show(around: Frame, watch: Watch, plain: bool) -> Shown {
+pub fn show(around: Frame, watch: Watch, form: Form) -> Shown {
     let stop = Arc::new(AtomicBool::new(false));
     let stopped = stop.clone();
-    let terminal = if plain || !std::io::stdout().is_terminal() { None } else { ratatui::try_init().ok() };
+    let is_table = form == Form::Table && std::io::stdout().is_terminal();
+    let terminal = if is_table { ratatui::try_init().ok() } else { None };
     let thread = std::thread::spawn(move || {
-        let Some(mut terminal) = terminal else { return log(&around, &watch, &stopped) };
+        let Some(mut terminal) = terminal else { return log(&around, &watch, form, &stopped) };
         let hold = Hold::begin();
         let mut first_row = 0;
         let goes_on = loop {
@@ -94,7 +105,7 @@ pub fn show(around: Frame, watch: Watch, plain: bool) -> Shown {
         ratatui::restore();
         drop(hold);
         if goes_on {
-            log(&around, &watch, &stopped);
+            log(&around, &watch, form, &stopped);
         }
     });
     Shown { stop, thread }
@@ -129,7 +140,7 @@ fn asked() -> std::io::Result<Asked> {
 }
 
 /// Writes a log line whenever the status changes, and at regular intervals.
-fn log(around: &Frame, watch: &Watch, stopped: &AtomicBool) {
+fn log(around: &Frame, watch: &Watch, form: Form, stopped: &AtomicBool) {
     let mut last: Option<(Status, Instant)> = None;
     let mut stopping = false;
     let mut problem = None;
@@ -153,7 +164,11 @@ fn log(around: &Frame, watch: &Watch, stopped: &AtomicBool) {
         if due {
             last = Some((said.status, Instant::now()));
             // A closed reader does not end the node.
-            let _ = super::print(&format!("{}\n", line(&said, &snapshot, around.inputs.as_ref())));
+            let line = match form {
+                Form::Json => super::log::status(&said, &snapshot),
+                Form::Table | Form::Lines => line(&said, &snapshot, around.inputs.as_ref()),
+            };
+            let _ = super::print(&format!("{line}\n"));
         }
     }
 }

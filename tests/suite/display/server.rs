@@ -1,11 +1,13 @@
 //! The server of the page, over plain sockets.
 
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
-use std::process::Command;
+use std::process::{Command, Stdio};
+
+use serde_json::{Value, json};
 
 use super::{Shown, alone};
-use crate::program::{PATIENCE, measuring};
+use crate::program::{self, PATIENCE, measuring};
 
 #[test]
 fn nothing_can_be_changed_and_no_other_site_gets_in() {
@@ -103,4 +105,59 @@ fn a_silent_connection_is_closed() {
     silent.set_read_timeout(Some(PATIENCE)).unwrap();
     assert_eq!(silent.read(&mut [0; 16]).expect("it is closed before this test has lost its patience"), 0);
     shown.stop();
+}
+
+/// The metrics of a node that predicts, hears and records, read by prometheus_client. Every value of the diagnostics has a
+/// type there: one that is not listed in `src/display/metrics.rs` is untyped.
+#[test]
+fn metrics_are_read_by_prometheus_client() {
+    let python = program::python();
+    if !program::python_has(&python, "prometheus_client") {
+        return;
+    }
+    let folder = program::folder();
+    let records = program::text(folder.path());
+    let shown = Shown::demo(&["--record", &records, "--set", "warn_margin=0.125"]);
+    let sample = |families: &Value, family: &str, labels: Value| -> f64 {
+        let samples = families[family]["samples"].as_array().unwrap_or_else(|| panic!("no {family}: {families}"));
+        let found =
+            samples.iter().find(|sample| sample[1] == labels).unwrap_or_else(|| panic!("{labels}: {samples:?}"));
+        found[2].as_f64().unwrap()
+    };
+    let mut families = Value::Null;
+    program::until("a prediction, sound and diagnostics", || {
+        let (status, head, text) = shown.get("/metrics");
+        assert!(status == 200 && head.contains("content-type: text/plain; version=0.0.4"), "{head}");
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/peers/read_metrics.py");
+        let mut reader =
+            Command::new(&python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+        reader.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+        let output = reader.wait_with_output().unwrap();
+        assert!(output.status.success(), "refused by prometheus_client:\n{text}");
+        families = serde_json::from_slice(&output.stdout).unwrap();
+        let has = |name: &str| families[format!("squealcast_{name}")].is_object();
+        has("samples") && has("recording_bytes") && has("growth_rate_per_second")
+    });
+    let untyped: Vec<&String> = families
+        .as_object()
+        .unwrap()
+        .iter()
+        .filter(|(_, family)| family["type"] == "unknown")
+        .map(|(name, _)| name)
+        .collect();
+    assert!(untyped.is_empty(), "not in KEYS of src/display/metrics.rs: {untyped:?}");
+    assert_eq!(families["squealcast_inputs"]["type"], "counter");
+    assert!(sample(&families, "squealcast_inputs", json!({"bus": "simulator"})) > 0.0);
+    assert_eq!(sample(&families, "squealcast_inputs", json!({"bus": "shm"})), 0.0);
+    assert!(sample(&families, "squealcast_recording_bytes", json!({})) > 1000.0);
+    assert!(sample(&families, "process_resident_memory_bytes", json!({})) > 1e6);
+    assert_eq!(sample(&families, "squealcast_setting", json!({"name": "warn_margin"})), 0.125);
+    let status: f64 =
+        families["squealcast_status"]["samples"].as_array().unwrap().iter().map(|s| s[2].as_f64().unwrap()).sum();
+    assert_eq!(status, 1.0, "one status is in force");
+    shown.stop();
+
+    let recording = Shown::start(&["view", concat!(env!("CARGO_MANIFEST_DIR"), "/recordings/ramp")]);
+    assert_eq!(recording.get("/metrics").0, 404, "a recording has none");
+    recording.stop();
 }
