@@ -117,10 +117,11 @@ export class Status {
     at("answer-facts").hidden = !answered;
     at("answer-text").hidden = Boolean(answered);
     const silent = SILENT.includes(status);
+    const listening = status === "inactive" ? this.listening.replace(/^Listens/, "Once active, listens") : this.listening;
     put(at("answer-title"), status === "squeal" ? "Squeals now" : silent ? "Inputs" : "Squeals next");
     if (!answered) {
       const stable = state.map ? `Nothing up to μ ${fixed(this.muMax, 2)}.` : "Not known yet: the stability map is being made.";
-      put(at("answer-text"), !fresh ? "" : asserts(state) ? stable : silent ? this.listening : "Not known: there is no prediction for this input.");
+      put(at("answer-text"), !fresh ? "" : asserts(state) ? stable : silent ? listening : "Not known: there is no prediction for this input.");
       return;
     }
     const ids = fastest ? [fastest.id] : next.ids;
