@@ -47,6 +47,9 @@ mod tribometer;
 mod verify;
 mod view;
 
+pub use reduce::reduce_quietly;
+pub use steps::Stopped;
+
 use std::io::Write;
 use std::process::ExitCode;
 

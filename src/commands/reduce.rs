@@ -1,14 +1,17 @@
 use std::f64::consts::TAU;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use anyhow::{Context, bail};
-use clap::Args;
+use clap::{Args, Parser};
 
 use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
 use super::steps::{ProgressOptions, Steps};
-use super::{Outcome, positive, print};
+use super::{Outcome, failure, positive, print};
 use crate::export::{
     ExportError, HASH_DIGITS, ModalSide, basis_rig, modal_rig, modal_sides, source_remarks, state_on_modes,
 };
@@ -93,6 +96,29 @@ fn mode_counts(text: &str) -> Result<ModeCounts, String> {
     counts.map(ModeCounts)
 }
 
+/// Tasks whose progress is shown: pad and disc.
+const TASKS: usize = 2;
+
+/// The arguments of the command for other programs.
+#[derive(Debug, Parser)]
+#[command(name = "squealcast reduce", no_binary_name = true)]
+struct Words {
+    #[command(flatten)]
+    options: Options,
+}
+
+/// Reduces as the command with these `words` does, without output and signal handlers. Returns the rig, and whether it was
+/// compared and agrees with the full model in modes and windows. Once `stopped` is set, the next step of the work unwinds
+/// with the payload [`Stopped`](super::Stopped); nothing is written then.
+///
+/// # Errors
+/// What the command prints.
+pub fn reduce_quietly(words: &[OsString], stopped: Arc<AtomicBool>) -> Result<(Rig, bool), String> {
+    let Words { options } = Words::try_parse_from(words).map_err(|error| error.to_string())?;
+    let reduced = options.reduce(Steps::until(stopped, TASKS));
+    reduced.map(|(rig, outcome)| (rig, outcome == Outcome::Done)).map_err(|error| failure(&error))
+}
+
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         on_stop(|| {
@@ -100,8 +126,15 @@ impl Options {
             note!("\nstopped: nothing was written");
             std::process::exit(130);
         })?;
+        let steps = self.progress.steps(TASKS);
+        let (rig, outcome) = self.reduce(steps)?;
+        print(&format!("{}\n", rig.describe()))?;
+        Ok(outcome)
+    }
+
+    /// Reduces the model and writes the files of the rig.
+    fn reduce(&self, mut steps: Steps) -> anyhow::Result<(Rig, Outcome)> {
         let file = self.output_file()?;
-        let mut steps = self.progress.steps(2);
         steps.say(&format!("reading {}", self.full.display()));
         let mut full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
@@ -186,7 +219,7 @@ impl Options {
         solver: Option<FullSolver<'_>>,
         method: String,
         files_of: &FilesOf<'_>,
-    ) -> anyhow::Result<Outcome> {
+    ) -> anyhow::Result<(Rig, Outcome)> {
         let make = |known: Option<&Certificate>| -> anyhow::Result<(Vec<RigFile>, Rig)> {
             let files = files_of(known)?;
             let rig = Rig::from_files(&files).context("the reduced model is not a valid rig")?;
@@ -228,9 +261,7 @@ impl Options {
         // The new rig file does not name these files. One that cannot be removed does no harm.
         replaced.into_iter().for_each(|path| drop(std::fs::remove_file(path)));
         steps.say(&format!("{} written", self.output.display()));
-        drop(steps);
-        print(&format!("{}\n", rig.describe()))?;
-        Ok(outcome)
+        Ok((rig, outcome))
     }
 
     /// Which modes to keep of each part.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, ensure};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 
@@ -23,7 +23,8 @@ use crate::offline::verify_sound::{SoundVerification, recorded_settings, verify_
 use crate::recording::message::Payload;
 use crate::recording::pace::{Due, Pacer, Pacing};
 use crate::recording::reader::{Recorded, Recording};
-use crate::rig::{Rig, RigFile};
+use crate::recording::recorded_rig;
+use crate::rig::Rig;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -307,23 +308,6 @@ fn frame(path: &Path, recording: &Recording, played: &Arc<AtomicU64>, stopped: &
         foot: Box::new(move |_| vec![format!("played {} messages", played.load(Ordering::Relaxed))]),
         quit: Box::new(move || stopped.store(true, Ordering::Relaxed)),
     }
-}
-
-/// The rig contained in a recording.
-pub fn recorded_rig(recording: &Recording) -> anyhow::Result<Rig> {
-    let hash = recording.session_metadata("rig_content_hash");
-    let hash = hash.context("the recording names no rig; name one with --rig")?;
-    let files: Vec<RigFile> = recording
-        .attachments()
-        .iter()
-        .map(|attachment| RigFile { name: attachment.name.clone(), bytes: attachment.data.clone() })
-        .collect();
-    ensure!(!files.is_empty(), "the recording contains no rig file; name one with --rig");
-    let rig = Rig::from_files(&files)?;
-    if rig.content_hash != hash {
-        bail!("the recorded rig has hash {}, expected {hash} of the metadata", rig.content_hash);
-    }
-    Ok(rig)
 }
 
 fn report_sound(found: &SoundVerification) -> String {

@@ -3,6 +3,9 @@
 
 use std::f64::consts::TAU;
 use std::io::{IsTerminal, Write};
+use std::panic::resume_unwind;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -51,20 +54,40 @@ struct Step {
     bar: ProgressBar,
 }
 
+/// The payload with which work that was stopped unwinds.
+#[derive(Clone, Copy, Debug)]
+pub struct Stopped;
+
 /// Progress of several simultaneous tasks.
 pub struct Steps {
     shown: Shown,
+    /// Once set, the next progress that is reported unwinds.
+    stopped: Option<Arc<AtomicBool>>,
     started_ns: u64,
     tasks: Vec<Option<Step>>,
 }
 
 impl Steps {
     fn new(shown: Shown, tasks: usize) -> Self {
-        Self { shown, started_ns: monotonic_ns(), tasks: (0..tasks).map(|_| None).collect() }
+        Self { shown, stopped: None, started_ns: monotonic_ns(), tasks: (0..tasks).map(|_| None).collect() }
+    }
+
+    /// Progress that is not shown; the work is unwound with [`Stopped`] once `stopped` is set.
+    pub fn until(stopped: Arc<AtomicBool>, tasks: usize) -> Self {
+        let mut steps = Self::new(Shown::Nothing, tasks);
+        steps.stopped = Some(stopped);
+        steps
+    }
+
+    fn unwind_if_stopped(&self) {
+        if self.stopped.as_ref().is_some_and(|stopped| stopped.load(Ordering::Relaxed)) {
+            resume_unwind(Box::new(Stopped));
+        }
     }
 
     /// Writes a permanent line. Errors are ignored, because nothing depends on it.
     pub fn say(&mut self, text: &str) {
+        self.unwind_if_stopped();
         let seconds = monotonic_ns().saturating_sub(self.started_ns) as f64 / 1e9;
         let memory = resident_bytes().map_or("      ?".to_owned(), |bytes| format!("{:7.2}", bytes as f64 / GIB));
         let line = format!("[{seconds:7.1} s {memory} GiB] {}", printable(text));
@@ -77,6 +100,7 @@ impl Steps {
 
     /// Reports that `task` has done `done` of `of` parts of the step `what`.
     pub fn at(&mut self, task: usize, what: &str, done: usize, of: usize) {
+        self.unwind_if_stopped();
         let part = |done: usize, of: usize| done * PLAIN_PARTS / of.max(1);
         if self.tasks[task].as_ref().is_some_and(|before| before.what != what || before.of != of) {
             self.done(task);

@@ -7,7 +7,6 @@ use crossbeam_channel::bounded;
 
 use super::display::{self, CriteriaOptions, DisplayOptions};
 use super::recordings::{Recordings, without_predictions};
-use super::replay::recorded_rig;
 use super::{Outcome, signals};
 use crate::display::comparison::Criteria;
 use crate::display::recorded::Recorded;
@@ -15,6 +14,7 @@ use crate::display::server::Pages;
 use crate::display::shelf::Shelf;
 use crate::msgs::schema::Topic;
 use crate::recording::reader::Recording;
+use crate::recording::recorded_rig;
 use crate::rig::Rig;
 
 const EXAMPLES: &str = "\
