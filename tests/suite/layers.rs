@@ -188,6 +188,45 @@ fn no_import_of_the_core_points_outward() {
     assert!(told.is_empty(), "{}", told.join("\n"));
 }
 
+/// Rooms of the program that the Python package uses: what computes, reads recordings, draws and speaks shared memory.
+const OF_PYTHON: &[&str] = &[
+    "analysis",
+    "bus",
+    "commands",
+    "display",
+    "figures",
+    "files",
+    "msgs",
+    "node",
+    "physics",
+    "recording",
+    "rig",
+    "session",
+];
+
+/// The package is a layer on the library, which knows nothing of Python.
+#[test]
+fn the_python_package_uses_the_library_and_not_the_other_way_round() {
+    let mut used = BTreeSet::new();
+    for source in sources(&root().join("crates/python/src")) {
+        let paths = source.text.split("squealcast::").skip(1);
+        let name = |rest: &str| rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>();
+        used.extend(paths.map(name).filter(|name| !name.is_empty()));
+    }
+    assert_eq!(used, OF_PYTHON.iter().map(|room| (*room).to_owned()).collect(), "rooms that crates/python uses");
+    for folder in ["src", "crates/core/src", "msgs/src"] {
+        let python: Vec<String> = sources(&root().join(folder))
+            .into_iter()
+            .filter(|source| source.text.contains("pyo3") || source.text.contains("numpy::"))
+            .map(|source| source.path)
+            .collect();
+        assert!(python.is_empty(), "{folder} knows Python: {python:?}");
+    }
+    for manifest in ["Cargo.toml", "crates/core/Cargo.toml", "msgs/Cargo.toml"] {
+        assert!(!fs::read_to_string(root().join(manifest)).unwrap().contains("pyo3"), "{manifest}");
+    }
+}
+
 /// The path of each import of a text as a list of names: `use a::{b, c::d};` gives `a::b` and `a::c::d`.
 fn imports(text: &str) -> Vec<Vec<String>> {
     let statements = text.split(';').filter_map(|statement| {
