@@ -35,7 +35,7 @@ bare_pythons() {
         if [ -n "$found" ]; then echo "$found"; else echo "no Python $version here" >&2; fi
     done
 }
-for python in ${BARE_PYTHONS:-$(bare_pythons)}; do
+for python in ${BARE_PYTHONS-$(bare_pythons)}; do
     echo "== $("$python" --version), bare: $python"
     bare=$(mktemp -d)
     "$python" -m venv "$bare"

@@ -107,10 +107,10 @@ def test_a_chart_is_kept_beside_the_rig_file(tmp_path):
     rig = squealcast.Rig.load(file)
     first = rig.chart(threads=2)
     assert first.path.parent == tmp_path and first.path.is_file() and first.path.suffix == ".chart"
-    began = time.monotonic()
+    stored = first.path.stat().st_mtime_ns
     again = rig.chart(threads=1)
     assert again.solves == first.solves and again.leaves == first.leaves
-    assert time.monotonic() - began < 5.0
+    assert first.path.stat().st_mtime_ns == stored, "it is read, not built again"
     mu = np.linspace(*rig.limits["mu"], 50)
     first, again = rig.predict(mu=mu, chart=first), rig.predict(mu=mu, chart=again)
     assert first.eigenvalue_per_s.tobytes() == again.eigenvalue_per_s.tobytes()
@@ -183,12 +183,10 @@ def test_control_c_ends_a_long_call():
     mu = np.random.default_rng(3).uniform(0.0, 1.0, 10_000_000)
     timer = threading.Timer(0.3, signal.raise_signal, [signal.SIGINT])
     timer.start()
-    began = time.monotonic()
+    # Solving them all would take hours.
     with pytest.raises(KeyboardInterrupt):
         rig.predict(mu=mu, modes=False)
     timer.join()
-    # Solving them all would take hours.
-    assert time.monotonic() - began < 120.0
 
 
 def test_pandas_tables():
