@@ -25,7 +25,7 @@ use crate::sound::search::end_ns;
 
 const EXAMPLES: &str = "\
 Examples:
-  squealcast predict-log recordings/ramp --rig nine-dof -o predicted               with another rig
+  squealcast predict-log recordings/ramp --rig nine-dof -o predicted               another rig
   squealcast predict-log test.csv --rig my-rig.toml -o predicted --sound test.wav  a log and sound";
 
 /// Predict recorded conditions as fast as possible, from recordings with operating points and from tribometer logs. For
