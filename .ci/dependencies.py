@@ -36,12 +36,14 @@ def is_allowed(expression, allowed):
 
 
 with open("deny.toml", "rb") as file:
-    allowed = set(tomllib.load(file)["licenses"]["allow"])
+    licenses = tomllib.load(file)["licenses"]
+    allowed = set(licenses["allow"])
+    exceptions = {entry["crate"]: set(entry["allow"]) for entry in licenses["exceptions"]}
 with open("Cargo.toml", "rb") as file:
     rust = tomllib.load(file)["workspace"]["package"]["rust-version"]
-metadata = json.loads(printed("metadata", "--format-version", "1"))
+metadata = json.loads(printed("metadata", "--all-features", "--format-version", "1"))
 # `cargo metadata` also lists optional crates that no feature selects; `cargo tree` does not.
-compiled = set(printed("tree", "--workspace", "--edges", "all", "--prefix", "none", "--format", "{p}").splitlines())
+compiled = set(printed("tree", "--workspace", "--all-features", "--edges", "all", "--prefix", "none", "--format", "{p}").splitlines())
 compiled = {tuple(line.replace(" v", " ", 1).split()[:2]) for line in compiled if line}
 packages = [package for package in metadata["packages"] if (package["name"], package["version"]) in compiled]
 
@@ -51,7 +53,7 @@ for package in packages:
     versions[package["name"]].append(package["version"])
     if package["id"] in metadata["workspace_members"]:
         continue
-    if not package["license"] or not is_allowed(package["license"], allowed):
+    if not package["license"] or not is_allowed(package["license"], allowed | exceptions.get(package["name"], set())):
         problems.append(f"{name}: licence {package['license']}, which deny.toml does not allow")
     if not (package["source"] or "").startswith("registry+"):
         problems.append(f"{name}: from {package['source']}, not from the crate registry")

@@ -1,7 +1,8 @@
 //! The messages of squealcast: what a rig sends to the node and what the node publishes.
 //!
 //! Every list is here once: the messages with their CDR encoding on ROS 2 and in recordings (this module), the topics
-//! with their MCAP schemas ([`schema`]), and the fixed-size forms in shared memory ([`shm`]). The `.msg` files of the ROS 2
+//! with their MCAP schemas ([`schema`]), their types as ROS 2 describes and hashes them ([`type_description`]), and the
+//! fixed-size forms in shared memory ([`shm`]). The `.msg` files of the ROS 2
 //! package `squealcast_msgs` are in the same folder; the structs match them field by field.
 //!
 //! A program that sends conditions over ROS 2 or writes them to a recording encodes an [`OperatingPoint`]:
@@ -28,6 +29,7 @@
 mod listed;
 pub mod schema;
 pub mod shm;
+pub mod type_description;
 
 pub use cdr_encoding::Error as CdrError;
 use serde::{Deserialize, Serialize};

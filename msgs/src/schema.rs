@@ -3,6 +3,7 @@
 //! As `ros2 bag record` writes it, a schema is the text of the `.msg` file followed by every message it refers to. Each
 //! of those is preceded by a line of 80 `=` and a line `MSG: package/Type`.
 
+use crate::type_description::TypeDescription;
 use crate::{listed, topic};
 
 listed! {
@@ -144,6 +145,23 @@ impl Topic {
             text.push_str(&format!("{:=<80}\nMSG: {name}\n{definition}", ""));
         }
         text
+    }
+
+    /// The description of the topic's type.
+    pub fn type_description(self) -> TypeDescription {
+        // A test describes them all.
+        TypeDescription::of_message(self.type_name(), self.definition(), self.dependencies()).expect("our definitions")
+    }
+
+    /// The hash of the topic's type (REP-2016), as ROS 2 announces it.
+    pub fn type_hash(self) -> String {
+        self.type_description().hash()
+    }
+
+    /// The definitions of the type and of all types it refers to, as `package/msg/Type` and the text of the `.msg` file.
+    pub fn definitions(self) -> Vec<(String, &'static str)> {
+        let others = self.dependencies().iter().map(|(name, text)| (name.replacen('/', "/msg/", 1), *text));
+        std::iter::once((self.type_name().to_owned(), self.definition())).chain(others).collect()
     }
 
     /// The quality of service of the publisher, in the form that channels and `metadata.yaml` require; the two must

@@ -1,4 +1,4 @@
-//! The buses a node receives conditions from and publishes predictions on: shared memory and ROS 2.
+//! The buses a node receives conditions from and publishes predictions on: shared memory, and ROS 2 over DDS and over Zenoh.
 //!
 //! [`Bus`] lists them. Each implements [`Connection`], which is all that the node and the commands know of a bus once it
 //! is joined; what a bus receives goes to a [`Sink`].
@@ -15,6 +15,8 @@ pub mod shm;
 mod shm_connection;
 mod shm_place;
 pub mod shm_waveform;
+mod type_descriptions;
+pub mod zenoh;
 
 pub use connection::{BusError, Connection, Outgoing, Report, Sink};
 pub use received::{Counts, Received};
@@ -27,8 +29,10 @@ listed! {
     pub enum Bus {
         /// Shared memory (iceoryx2). First, because its readers wait for a prediction.
         Shm,
-        /// ROS 2.
+        /// ROS 2 over DDS.
         Ros2,
+        /// ROS 2 over Zenoh.
+        Zenoh,
         /// No bus: the rig simulator of `demo`, in this process.
         Simulator,
     }
@@ -40,6 +44,7 @@ impl Bus {
         match self {
             Self::Shm => "shm",
             Self::Ros2 => "ros2",
+            Self::Zenoh => "zenoh",
             Self::Simulator => "simulator",
         }
     }

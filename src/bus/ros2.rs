@@ -12,6 +12,7 @@ mod frame;
 mod lifecycle;
 mod link;
 mod loopback;
+pub mod member;
 mod parameters;
 pub mod process;
 mod qos_conflicts;
@@ -23,7 +24,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use ros2_client::{Log, MessageTypeName, ParameterValue, Publisher};
+use ros2_client::{Log, Message, MessageTypeName, ParameterValue, Publisher, ServiceTypeName};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -31,12 +32,12 @@ pub use self::connection::{Ros2NodeConnection, Ros2ReplayConnection};
 pub use self::parameters::{Accepted, Describe, Parameters, Validate};
 
 use self::discovery::Discovery;
-use self::link::{Durability, Link, MAX_BLOCKS_WAITING, MAX_UNANSWERED, MAX_WAITING};
-use super::Bus;
+use self::link::{Durability, Link, MAX_ANSWER, MAX_BLOCKS_WAITING, MAX_UNANSWERED, MAX_WAITING};
 use super::lifecycle::State;
 use super::log::Severity;
 use super::received::{Counters, Counts, Received};
 use super::ros_args::{RosArgs, RosArgsError};
+use super::{Bus, type_descriptions};
 use crate::msgs::schema::Topic;
 use crate::msgs::{
     DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, SessionEventKind,
@@ -50,16 +51,47 @@ pub const SOURCE_NODE_NAME: &str = "rig";
 
 /// The topic of log lines, one for all namespaces.
 const ROSOUT: &str = "/rosout";
+/// Name of the node of a replay.
+pub(super) const REPLAY_NODE_NAME: &str = "squealcast_replay";
 
 /// Prefix of notes about ROS 2 on standard error.
-const NOTE: &str = "ROS 2: ";
+pub(super) const NOTE: &str = "ROS 2: ";
 
 /// The largest domain id whose ports are valid.
 const MAX_DOMAIN_ID: u16 = 232;
 
+/// What carries ROS 2.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Middleware {
+    /// DDS, in the form of RustDDS.
+    #[default]
+    Dds,
+    /// Zenoh, as rmw_zenoh uses it.
+    Zenoh,
+}
+
+impl Middleware {
+    /// The bus of messages received over it.
+    pub fn bus(self) -> Bus {
+        match self {
+            Self::Dds => Bus::Ros2,
+            Self::Zenoh => Bus::Zenoh,
+        }
+    }
+
+    /// What a node calls the process that contains it.
+    pub(super) fn side(self) -> &'static str {
+        match self {
+            Self::Dds => "the ROS 2 side",
+            Self::Zenoh => "the Zenoh side",
+        }
+    }
+}
+
 /// How to join the ROS 2 network.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Ros2Options {
+    pub middleware: Middleware,
     /// Domain id, 0 to 232. Peers of other domains are invisible.
     pub domain_id: u16,
     /// Announce on 127.0.0.1 only, and receive through the loopback interface only.
@@ -69,28 +101,43 @@ pub struct Ros2Options {
 }
 
 impl Ros2Options {
-    /// The given domain, else that of `ROS_DOMAIN_ID`, else 0. Restricted to loopback if requested here or by
+    /// Over DDS. The given domain, else that of `ROS_DOMAIN_ID`, else 0. Restricted to loopback if requested here or by
     /// `ROS_AUTOMATIC_DISCOVERY_RANGE` or `ROS_LOCALHOST_ONLY`.
     ///
     /// # Errors
     /// A domain that is not a number or exceeds 232; a variable whose value is invalid or not supported.
     pub fn new(domain_id: Option<u16>, loopback_only: bool, args: RosArgs) -> Result<Self, Ros2Error> {
-        let domain_id = match (domain_id, env::var("ROS_DOMAIN_ID")) {
-            (Some(domain_id), _) => domain_id,
-            (None, Ok(text)) if !text.trim().is_empty() => {
-                text.trim().parse().map_err(|_| Ros2Error::DomainId(text.clone()))?
-            }
-            _ => 0,
-        };
-        if domain_id > MAX_DOMAIN_ID {
-            return Err(Ros2Error::DomainId(domain_id.to_string()));
-        }
+        let domain_id = domain(domain_id)?;
         let discovery = Discovery::from_variables(|name| env::var(name).ok())?;
         for warning in &discovery.warnings {
             note!("{NOTE}{warning}");
         }
-        Ok(Self { domain_id, loopback_only: loopback_only || discovery.loopback_only, args })
+        let loopback_only = loopback_only || discovery.loopback_only;
+        Ok(Self { middleware: Middleware::Dds, domain_id, loopback_only, args })
     }
+
+    /// Over Zenoh. Who is found depends on the settings of the session, not on the variables of DDS.
+    ///
+    /// # Errors
+    /// A domain that is not a number or exceeds 232; a program built without Zenoh.
+    pub fn over_zenoh(domain_id: Option<u16>, loopback_only: bool, args: RosArgs) -> Result<Self, Ros2Error> {
+        if !super::zenoh::BUILT_IN {
+            return Err(Ros2Error::NoZenoh);
+        }
+        Ok(Self { middleware: Middleware::Zenoh, domain_id: domain(domain_id)?, loopback_only, args })
+    }
+}
+
+/// The given domain, else that of `ROS_DOMAIN_ID`, else 0.
+fn domain(given: Option<u16>) -> Result<u16, Ros2Error> {
+    let domain_id = match (given, env::var("ROS_DOMAIN_ID")) {
+        (Some(domain_id), _) => domain_id,
+        (None, Ok(text)) if !text.trim().is_empty() => {
+            text.trim().parse().map_err(|_| Ros2Error::DomainId(text.clone()))?
+        }
+        _ => 0,
+    };
+    if domain_id > MAX_DOMAIN_ID { Err(Ros2Error::DomainId(domain_id.to_string())) } else { Ok(domain_id) }
 }
 
 /// Why ROS 2 failed.
@@ -110,6 +157,10 @@ pub enum Ros2Error {
     Args(#[from] RosArgsError),
     #[error("ROS thread: {0}")]
     Thread(#[from] std::io::Error),
+    #[error("Zenoh: {0}")]
+    Zenoh(String),
+    #[error("this program was built without Zenoh: build it with --features zenoh")]
+    NoZenoh,
     #[error("not published on {topic}: {reason}")]
     Publish { topic: &'static str, reason: String },
     /// The error reported by the process of the ROS 2 side, or why that cannot be started.
@@ -199,6 +250,11 @@ impl Ros2 {
                 Ok::<_, Ros2Error>((temperature, waveform, lifecycle))
             })
             .transpose()?;
+        let (package, name) = type_descriptions::SERVICE_TYPE;
+        let kind = ServiceTypeName::new(package, name);
+        let types = link.service(type_descriptions::SERVICE, &kind, |request| {
+            type_descriptions::short_answer(&request, MAX_ANSWER)
+        })?;
         let beats = Arc::new(AtomicU64::new(0));
         let beating = beats.clone();
         let aside = Box::pin(async move {
@@ -207,7 +263,7 @@ impl Ros2 {
                     tokio::join!(temperature, waveform, lifecycle);
                 }
             };
-            tokio::join!(vibration, beside, beat(&beating));
+            tokio::join!(vibration, beside, types, beat(&beating));
         });
         link.listen(topic::OPERATING_POINT, ours("OperatingPoint"), |point| point.seq, sink, Some(aside))?;
         started.store(true, Ordering::Release);
@@ -480,6 +536,9 @@ impl Ros2Source {
     /// Leaves the network, as dropping does.
     pub fn stop(self) {}
 }
+
+impl Message for type_descriptions::Request {}
+impl Message for type_descriptions::Response {}
 
 fn prediction_publisher(
     link: &mut Link<OperatingPoint>,

@@ -3,13 +3,13 @@
 use std::sync::Arc;
 
 use anyhow::{Context, ensure};
-use clap::Args;
+use clap::{Args, ValueEnum};
 
 use crate::bus::lifecycle::State;
 use crate::bus::ros_args::RosArgs;
 use crate::bus::ros2::{NODE_NAME, Ros2Error, Ros2NodeConnection, Ros2Options, Ros2ReplayConnection, Ros2Source};
 use crate::bus::shm::ShmOptions;
-use crate::bus::{Bus, Connection, ShmConnection, Sink};
+use crate::bus::{Bus, Connection, ShmConnection, Sink, zenoh};
 use crate::msgs::shm::{Form, OperatingPointForm};
 use crate::msgs::topic;
 use crate::node::NodeName;
@@ -22,6 +22,9 @@ pub struct BusOptions {
     /// Do not join ROS 2
     #[arg(long)]
     no_ros: bool,
+    /// What carries ROS 2 [default: zenoh if RMW_IMPLEMENTATION is rmw_zenoh_cpp, else dds]
+    #[arg(long, value_name = "RMW", conflicts_with = "no_ros")]
+    rmw: Option<Rmw>,
     /// Do not join shared memory
     #[arg(long)]
     no_shm: bool,
@@ -34,6 +37,36 @@ pub struct BusOptions {
     /// Prefix of the names of the shared-memory services
     #[arg(long, value_name = "PREFIX", default_value = "")]
     shm_prefix: String,
+}
+
+/// What carries ROS 2
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Rmw {
+    /// DDS
+    Dds,
+    /// Zenoh, as rmw_zenoh_cpp
+    Zenoh,
+    /// Both at once
+    Both,
+}
+
+/// Names what carries ROS 2 in ROS 2 programs.
+const RMW_IMPLEMENTATION: &str = "RMW_IMPLEMENTATION";
+const RMW_ZENOH: &str = "rmw_zenoh_cpp";
+
+impl Rmw {
+    /// The one that the environment of a ROS 2 program demands.
+    fn of_environment() -> Self {
+        let wanted = std::env::var(RMW_IMPLEMENTATION).is_ok_and(|name| name == RMW_ZENOH);
+        match (wanted, zenoh::BUILT_IN) {
+            (true, true) => Self::Zenoh,
+            (true, false) => {
+                note!("ROS 2 over DDS in spite of {RMW_IMPLEMENTATION}={RMW_ZENOH}: built without Zenoh");
+                Self::Dds
+            }
+            (false, _) => Self::Dds,
+        }
+    }
 }
 
 impl BusOptions {
@@ -49,9 +82,18 @@ impl BusOptions {
     /// # Errors
     /// A ROS 2 domain or environment variable that is not valid.
     pub fn resolve(&self, args: RosArgs) -> Result<Buses, Ros2Error> {
-        let shm = || ShmOptions { service_prefix: self.shm_prefix.clone(), ..Default::default() };
-        let ros2 = || Ros2Options::new(self.domain, self.loopback, args);
-        Ok(Buses { shm: (!self.no_shm).then(shm), ros2: (!self.no_ros).then(ros2).transpose()?, options: self.clone() })
+        let shm = (!self.no_shm).then(|| ShmOptions { service_prefix: self.shm_prefix.clone(), ..Default::default() });
+        let (mut ros2, mut zenoh) = (None, None);
+        if !self.no_ros {
+            let rmw = self.rmw.unwrap_or_else(Rmw::of_environment);
+            if matches!(rmw, Rmw::Dds | Rmw::Both) {
+                ros2 = Some(Ros2Options::new(self.domain, self.loopback, args.clone())?);
+            }
+            if matches!(rmw, Rmw::Zenoh | Rmw::Both) {
+                zenoh = Some(Ros2Options::over_zenoh(self.domain, self.loopback, args)?);
+            }
+        }
+        Ok(Buses { shm, ros2, zenoh, options: self.clone() })
     }
 }
 
@@ -60,6 +102,7 @@ pub struct Buses {
     options: BusOptions,
     shm: Option<ShmOptions>,
     ros2: Option<Ros2Options>,
+    zenoh: Option<Ros2Options>,
 }
 
 /// How a node starts on its buses.
@@ -73,16 +116,22 @@ pub struct NodeStart {
 /// What tells a user how to do without a bus that cannot be joined.
 const SHM_FAILED: &str = "shared memory; --no-shm stays off it";
 const ROS2_FAILED: &str = "ROS 2; --no-ros stays off it";
-const MANAGED_ALONE: &str = "--managed needs ROS 2, over which the node is configured; --no-ros is given";
+const MANAGED_ALONE: &str = "--managed needs ROS 2 over DDS, over which the node is configured";
+const ZENOH_FAILED: &str = "Zenoh; --rmw dds stays off it";
 const NO_BUS: &str = "no bus to publish on: --no-shm and --no-ros are both given";
 
 impl Buses {
+    /// How ROS 2 is joined, by whatever carries it: names and arguments are the same.
+    fn ros(&self) -> Option<&Ros2Options> {
+        self.ros2.as_ref().or(self.zenoh.as_ref())
+    }
+
     /// How a node with these `settings` starts: the arguments of ROS 2 may name it and change settings.
     ///
     /// # Errors
     /// A parameter that is not known, or whose value is not valid.
     pub fn node(&self, mut settings: Settings) -> anyhow::Result<NodeStart> {
-        let Some(ros2) = &self.ros2 else {
+        let Some(ros2) = self.ros() else {
             return Ok(NodeStart { name: NodeName::default(), settings, parameters: vec![] });
         };
         let declared: Vec<(&str, f64)> = settings.values().collect();
@@ -116,6 +165,10 @@ impl Buses {
                 let start = |ros2| Ros2NodeConnection::start(ros2, parameters.to_vec(), state, sink);
                 boxed(self.ros2.as_ref().map(start), ROS2_FAILED)
             }
+            Bus::Zenoh => {
+                let start = |zenoh| Ros2NodeConnection::start(zenoh, parameters.to_vec(), state, sink);
+                boxed(self.zenoh.as_ref().map(start), ZENOH_FAILED)
+            }
             Bus::Simulator => Ok(None),
         })
     }
@@ -136,6 +189,7 @@ impl Buses {
                 SHM_FAILED,
             ),
             Bus::Ros2 => boxed(self.ros2.as_ref().map(|ros2| Ros2Source::start(ros2, |_| {})), ROS2_FAILED),
+            Bus::Zenoh => self.zenoh.as_ref().map(zenoh::rig).transpose().context(ZENOH_FAILED),
             Bus::Simulator => Ok(None),
         })
     }
@@ -148,6 +202,7 @@ impl Buses {
         self.join_some(|bus| match bus {
             Bus::Shm => boxed(self.shm.as_ref().map(ShmConnection::of_replay), SHM_FAILED),
             Bus::Ros2 => boxed(self.ros2.as_ref().map(Ros2ReplayConnection::start), ROS2_FAILED),
+            Bus::Zenoh => self.zenoh.as_ref().map(zenoh::replay).transpose().context(ZENOH_FAILED),
             Bus::Simulator => Ok(None),
         })
     }
@@ -171,11 +226,11 @@ impl Buses {
 
     /// Where a node on these buses expects its inputs, and the command that simulates them.
     pub fn sources(&self) -> InputSources {
-        let Self { options, ros2, shm } = self;
-        let ros2 = ros2.as_ref();
-        let topic = ros2.map(|ros2| {
-            let name = ros2.args.node_name(NODE_NAME);
-            ros2.args.topic(topic::relative(topic::OPERATING_POINT), &ros2.args.namespace(&name, "/"), &name)
+        let Self { options, ros2, zenoh, shm } = self;
+        let ros = self.ros();
+        let topic = ros.map(|ros| {
+            let name = ros.args.node_name(NODE_NAME);
+            ros.args.topic(topic::relative(topic::OPERATING_POINT), &ros.args.namespace(&name, "/"), &name)
         });
         // The bus of most rigs first.
         let places = Bus::ALL.into_iter().rev().filter_map(|bus| match bus {
@@ -183,7 +238,8 @@ impl Buses {
                 let shm = shm.as_ref()?;
                 Some(format!("{}{} (shared memory)", shm.service_prefix, OperatingPointForm::SERVICE))
             }
-            Bus::Ros2 => Some(format!("{} (ROS 2, domain {})", topic.as_ref()?, ros2?.domain_id)),
+            Bus::Ros2 => Some(format!("{} (ROS 2, domain {})", topic.as_ref()?, ros2.as_ref()?.domain_id)),
+            Bus::Zenoh => Some(format!("{} (ROS 2 over Zenoh, domain {})", topic.as_ref()?, zenoh.as_ref()?.domain_id)),
             Bus::Simulator => None,
         });
         let places: Vec<String> = places.collect();
@@ -196,8 +252,13 @@ impl Buses {
                     command += &format!(" {option}");
                 }
             }
-            if let Some(ros2) = ros2.filter(|ros2| ros2.domain_id != 0) {
-                command += &format!(" --domain {}", ros2.domain_id);
+            match (ros2, zenoh) {
+                (Some(_), Some(_)) => command += " --rmw both",
+                (None, Some(_)) => command += " --rmw zenoh",
+                (_, None) => {}
+            }
+            if let Some(ros) = ros.filter(|ros| ros.domain_id != 0) {
+                command += &format!(" --domain {}", ros.domain_id);
             }
             if let Some(shm) = shm.as_ref().filter(|shm| !shm.service_prefix.is_empty()) {
                 command += &format!(" --shm-prefix {}", shm.service_prefix);
@@ -225,7 +286,14 @@ mod tests {
     use super::*;
 
     fn options() -> BusOptions {
-        BusOptions { no_ros: false, no_shm: false, domain: Some(7), loopback: true, shm_prefix: "cell2/".to_owned() }
+        BusOptions {
+            no_ros: false,
+            rmw: Some(Rmw::Dds),
+            no_shm: false,
+            domain: Some(7),
+            loopback: true,
+            shm_prefix: "cell2/".to_owned(),
+        }
     }
 
     #[test]

@@ -7,6 +7,10 @@ use crate::files::whole_file::{WholeFileError, write_whole};
 /// Name of the file.
 pub const METADATA_FILE: &str = "metadata.yaml";
 
+/// Keys in the metadata of a channel, as the MCAP storage of rosbag2 names them.
+pub const QOS_KEY: &str = "offered_qos_profiles";
+pub const TYPE_HASH_KEY: &str = "topic_type_hash";
+
 /// Entry of a topic in `metadata.yaml`.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct TopicInfo {
@@ -16,6 +20,27 @@ pub struct TopicInfo {
     pub message_encoding: String,
     /// Must equal the text in the channel, or `rosbags` finds no messages.
     pub qos_profiles: String,
+    /// Hash of the type (REP-2016); empty if the channel has none.
+    pub type_hash: String,
+}
+
+impl TopicInfo {
+    /// The entry of a channel.
+    pub fn of_channel(
+        name: &str,
+        type_name: Option<&str>,
+        message_encoding: &str,
+        metadata: &BTreeMap<String, String>,
+    ) -> Self {
+        let value = |key| metadata.get(key).cloned().unwrap_or_default();
+        Self {
+            name: name.to_owned(),
+            type_name: type_name.unwrap_or_default().to_owned(),
+            message_encoding: message_encoding.to_owned(),
+            qos_profiles: value(QOS_KEY),
+            type_hash: value(TYPE_HASH_KEY),
+        }
+    }
 }
 
 /// Entry of an MCAP file in `metadata.yaml`.
@@ -62,15 +87,16 @@ pub fn metadata_yaml(files: &[FileSummary]) -> String {
     let _ = write!(yaml, "  duration:\n    nanoseconds: {}\n", last - first);
     let _ = write!(yaml, "  starting_time:\n    nanoseconds_since_epoch: {first}\n  message_count: {messages}\n");
     list(&mut yaml, "topics_with_message_count", topics.iter(), |yaml, (topic, count)| {
-        let TopicInfo { name, type_name, message_encoding, qos_profiles } = topic;
+        let TopicInfo { name, type_name, message_encoding, qos_profiles, type_hash } = topic;
         let _ = write!(
             yaml,
             "    - topic_metadata:\n        name: {}\n        type: {}\n        serialization_format: {}\n        \
-             offered_qos_profiles: {}\n        type_description_hash: \"\"\n      message_count: {count}\n",
+             offered_qos_profiles: {}\n        type_description_hash: {}\n      message_count: {count}\n",
             quoted(name),
             quoted(type_name),
             quoted(message_encoding),
             quoted(qos_profiles),
+            quoted(type_hash),
         );
     });
     yaml.push_str("  compression_format: \"\"\n  compression_mode: \"\"\n");
@@ -127,12 +153,14 @@ mod tests {
             type_name: "p/msg/T".to_owned(),
             message_encoding: "cdr".to_owned(),
             qos_profiles: "- history: 1\n  depth: 2".to_owned(),
+            type_hash: "RIHS01_0".to_owned(),
         };
         file.count(&topic, 30);
         file.count(&topic, 10);
         let yaml = metadata_yaml(&[file]);
         assert!(yaml.contains(r#"    - "a \"b\"\n_0.mcap""#), "{yaml}");
         assert!(yaml.contains(r#"offered_qos_profiles: "- history: 1\n  depth: 2""#), "{yaml}");
+        assert!(yaml.contains("type_description_hash: \"RIHS01_0\"\n"), "{yaml}");
         assert!(yaml.contains("nanoseconds: 20\n") && yaml.contains("nanoseconds_since_epoch: 10\n"), "{yaml}");
     }
 }

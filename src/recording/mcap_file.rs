@@ -17,16 +17,13 @@ use mcap::{
     write::NoSeek,
 };
 
-use super::bag::{FileSummary, TopicInfo};
+use super::bag::{FileSummary, QOS_KEY, TYPE_HASH_KEY, TopicInfo};
 use super::record_walker::Attachment;
 use crate::files::whole_file::{WholeFile, WholeFileError, folder_of, sync_open_folder};
 use crate::msgs::schema::{MESSAGE_ENCODING, SCHEMA_ENCODING, Topic};
 
 /// A chunk is closed by the first message after this many bytes; including that message it stays below 768 KiB.
 const CHUNK_BYTES: u64 = 640 << 10;
-
-/// Metadata key of a channel for its quality of service.
-const QOS_KEY: &str = "offered_qos_profiles";
 
 /// Why a file cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -144,6 +141,8 @@ pub struct RecordingFile {
     path: PathBuf,
     naming: Naming,
     topics: HashMap<ChannelId, TopicInfo>,
+    /// Channels of the node's own topics.
+    own: HashMap<Topic, ChannelId>,
     summary: FileSummary,
 }
 
@@ -207,7 +206,7 @@ impl RecordingFile {
         let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let summary = FileSummary { name, ..FileSummary::default() };
         let (path, topics) = (path.to_owned(), HashMap::new());
-        Ok(Self { writer, file, disk, bytes, temporary, path, naming, topics, summary })
+        Ok(Self { writer, file, disk, bytes, temporary, path, naming, topics, own: HashMap::new(), summary })
     }
 
     /// Whether the file is still at its place.
@@ -288,10 +287,16 @@ impl RecordingFile {
     ///
     /// Errors of writing.
     pub fn own_channel(&mut self, topic: Topic) -> Result<ChannelId, WriteError> {
-        let metadata = BTreeMap::from([(QOS_KEY.to_owned(), topic.qos_profiles())]);
+        if let Some(&known) = self.own.get(&topic) {
+            return Ok(known);
+        }
+        let metadata =
+            BTreeMap::from([(QOS_KEY.to_owned(), topic.qos_profiles()), (TYPE_HASH_KEY.to_owned(), topic.type_hash())]);
         let schema = Some((topic.type_name(), SCHEMA_ENCODING, topic.schema()));
         let schema = schema.as_ref().map(|(name, encoding, text)| (*name, *encoding, text.as_bytes()));
-        self.channel(topic.name(), schema, MESSAGE_ENCODING, &metadata)
+        let channel = self.channel(topic.name(), schema, MESSAGE_ENCODING, &metadata)?;
+        self.own.insert(topic, channel);
+        Ok(channel)
     }
 
     /// The channel with these properties, created on first use. `schema` is name, encoding and text.
@@ -312,11 +317,8 @@ impl RecordingFile {
             None => 0,
         };
         let id = ChannelId(self.writer.add_channel(schema_id, topic, message_encoding, metadata).map_err(at)?);
-        self.topics.entry(id).or_insert_with(|| TopicInfo {
-            name: topic.to_owned(),
-            type_name: schema.map(|(name, _, _)| name.to_owned()).unwrap_or_default(),
-            message_encoding: message_encoding.to_owned(),
-            qos_profiles: metadata.get(QOS_KEY).cloned().unwrap_or_default(),
+        self.topics.entry(id).or_insert_with(|| {
+            TopicInfo::of_channel(topic, schema.map(|(name, _, _)| name), message_encoding, metadata)
         });
         Ok(id)
     }

@@ -287,11 +287,9 @@ fn summarize(path: &Path) -> Result<FileSummary, RecoverError> {
     for item in open_walker(path, Depth::Messages)? {
         let Item::Message(message) = item else { continue };
         let channel = &message.channel;
-        let topic = topics.entry(channel.id).or_insert_with(|| TopicInfo {
-            name: channel.topic.clone(),
-            type_name: channel.schema.as_ref().map(|schema| schema.name.clone()).unwrap_or_default(),
-            message_encoding: channel.message_encoding.clone(),
-            qos_profiles: channel.metadata.get("offered_qos_profiles").cloned().unwrap_or_default(),
+        let topic = topics.entry(channel.id).or_insert_with(|| {
+            let type_name = channel.schema.as_ref().map(|schema| schema.name.as_str());
+            TopicInfo::of_channel(&channel.topic, type_name, &channel.message_encoding, &channel.metadata)
         });
         summary.count(topic, message.log_time_ns);
     }

@@ -61,6 +61,8 @@ def with_rosbags(directory):
     with Reader(directory) as reader:
         for connection in reader.connections:
             typestore.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+            # The hash in metadata.yaml and the one of the channel's definition.
+            assert connection.digest == typestore.hash_rihs01(connection.msgtype), connection
         # The counts in metadata.yaml and those of the files.
         assert reader.message_count == sum(connection.msgcount for connection in reader.connections)
         for connection, timestamp, raw in reader.messages():

@@ -4,13 +4,14 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::process::{Health, Ros2Process, Sinks};
-use super::{Parameters, Ros2, Ros2Error, Ros2Options, Ros2Source};
+use super::{Middleware, Parameters, REPLAY_NODE_NAME, Ros2, Ros2Error, Ros2Options, Ros2Source};
 use crate::bus::lifecycle::State;
 use crate::bus::{Bus, BusError, Connection, Outgoing, Report, Sink};
 use crate::msgs::schema::Topic;
 
 /// The connection of a long-running node, whose ROS 2 side is a child process.
 pub struct Ros2NodeConnection {
+    middleware: Middleware,
     process: Ros2Process,
     readers: Readers,
     encodings_skipped: u64,
@@ -29,6 +30,7 @@ impl Ros2NodeConnection {
         state: State,
         sink: &Arc<dyn Sink>,
     ) -> Result<Self, Ros2Error> {
+        let middleware = options.middleware;
         let [inputs, vibrations, temperatures, waveforms, changes, states] = std::array::from_fn(|_| sink.clone());
         let sinks = Sinks {
             // The thread that receives from the child process serves all topics: it must not be held up.
@@ -54,9 +56,10 @@ impl Ros2NodeConnection {
             }),
             parameter: Box::new(move |name, value| changes.parameter(name, value)),
             lifecycle: Box::new(move |state| states.lifecycle(state)),
-            fell: Box::new(|why| note!("the ROS 2 side ended and is restarted: {why}")),
+            fell: Box::new(move |why| note!("{} ended and is restarted: {why}", middleware.side())),
         };
         Ok(Self {
+            middleware,
             process: Ros2Process::start(options, parameters, state, sinks)?,
             readers: Readers::default(),
             encodings_skipped: 0,
@@ -67,7 +70,7 @@ impl Ros2NodeConnection {
 
 impl Connection for Ros2NodeConnection {
     fn bus(&self) -> Bus {
-        Bus::Ros2
+        self.middleware.bus()
     }
 
     fn publish(&mut self, message: Outgoing<'_>) -> Result<(), BusError> {
@@ -109,26 +112,30 @@ impl Connection for Ros2NodeConnection {
     }
 
     fn report(&mut self) -> Report {
-        let now = self.process.health();
+        let (now, side) = (self.process.health(), self.middleware.side());
         let before = std::mem::replace(&mut self.health_before, now.clone());
         let mut warnings = vec![];
         if now.falls > before.falls {
-            warnings.push(format!("the ROS 2 side ended and is restarted: {}", now.last_fall));
+            warnings.push(format!("{side} ended and is restarted: {}", now.last_fall));
         } else if !now.up {
-            warnings.push(format!("the ROS 2 side is down: {}", now.last_fall));
+            warnings.push(format!("{side} is down: {}", now.last_fall));
         }
         if now.refused > before.refused {
             warnings.push(format!("{} messages {}", now.refused - before.refused, now.last_refusal));
         }
+        let [falls, process, refused] = match self.middleware {
+            Middleware::Dds => ["ros2_side_falls", "ros2_side_process", "ros2_refused"],
+            Middleware::Zenoh => ["zenoh_side_falls", "zenoh_side_process", "zenoh_refused"],
+        };
         Report {
             counts: Some(self.process.counts()),
             waveform_counts: Some(self.process.waveform_counts()),
             encodings_skipped: self.encodings_skipped,
             restarts: now.falls,
             values: vec![
-                ("ros2_side_falls", now.falls.to_string()),
-                ("ros2_side_process", now.process_id.to_string()),
-                ("ros2_refused", now.refused.to_string()),
+                (falls, now.falls.to_string()),
+                (process, now.process_id.to_string()),
+                (refused, now.refused.to_string()),
             ],
             warnings,
         }
@@ -209,7 +216,7 @@ impl Ros2ReplayConnection {
     /// Invalid names, or an error of DDS.
     pub fn start(options: &Ros2Options) -> Result<Self, Ros2Error> {
         let rig = Ros2Source::start(options, |_| {})?;
-        let options = Ros2Options { args: options.args.clone().renamed("squealcast_replay"), ..options.clone() };
+        let options = Ros2Options { args: options.args.clone().renamed(REPLAY_NODE_NAME), ..options.clone() };
         Ok(Self { rig, node: Ros2::start(&options, Parameters::none(), |_| {}, |_| {})? })
     }
 }

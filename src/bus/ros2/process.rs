@@ -20,7 +20,6 @@ use crossbeam_channel::{Receiver, Sender, bounded, select};
 
 use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide, encode};
 use super::{NOTE, ROSOUT, Ros2Error, Ros2Options};
-use crate::bus::Bus;
 use crate::bus::lifecycle::State;
 use crate::bus::log::Severity;
 use crate::bus::received::{Counts, Received};
@@ -90,6 +89,8 @@ pub struct Health {
 pub struct Ros2Process {
     /// `None` once it has to end.
     queue: Option<Sender<Vec<u8>>>,
+    /// What it is called.
+    side: &'static str,
     shared: Arc<Shared>,
     supervisor: Option<JoinHandle<()>>,
 }
@@ -157,7 +158,8 @@ impl Ros2Process {
         let (joined, waiting) = bounded(1);
         let mut supervisor = Supervisor { program, start, sinks, queued, shared: shared.clone(), joined: Some(joined) };
         let supervisor = thread::Builder::new().name("ros2 side".to_owned()).spawn(move || supervisor.run())?;
-        let this = Self { queue: Some(queue), shared, supervisor: Some(supervisor) };
+        let side = options.middleware.side();
+        let this = Self { queue: Some(queue), side, shared, supervisor: Some(supervisor) };
         // The supervisor limits the waiting time. It only fails to answer if it panicked.
         waiting.recv().unwrap_or_else(|_| Err(Ros2Error::Side("its supervisor failed".to_owned())))?;
         Ok(this)
@@ -170,7 +172,7 @@ impl Ros2Process {
 
     fn send_bytes(&self, topic: &'static str, bytes: Vec<u8>) -> Result<(), Ros2Error> {
         let sent = self.queue.as_ref().is_some_and(|queue| queue.try_send(bytes).is_ok());
-        let full = || Ros2Error::Publish { topic, reason: format!("{QUEUE} messages wait for the ROS 2 side") };
+        let full = || Ros2Error::Publish { topic, reason: format!("{QUEUE} messages wait for {}", self.side) };
         if sent { Ok(()) } else { Err(full()) }
     }
 
@@ -428,6 +430,7 @@ impl Supervisor {
     }
 
     fn take(&mut self, frame: FromSide) {
+        let bus = self.start.options.middleware.bus();
         match frame {
             FromSide::Joined(full_name) => {
                 let mut seen = self.shared.seen();
@@ -438,12 +441,10 @@ impl Supervisor {
                 }
             }
             FromSide::Refused(_) => {}
-            FromSide::Input { at, message } => (self.sinks.input)(Received { bus: Bus::Ros2, at, message }),
-            FromSide::Vibration { at, message } => (self.sinks.vibration)(Received { bus: Bus::Ros2, at, message }),
-            FromSide::Temperature { at, message } => {
-                (self.sinks.temperature)(Received { bus: Bus::Ros2, at, message });
-            }
-            FromSide::Waveform { at, message } => (self.sinks.waveform)(Received { bus: Bus::Ros2, at, message }),
+            FromSide::Input { at, message } => (self.sinks.input)(Received { bus, at, message }),
+            FromSide::Vibration { at, message } => (self.sinks.vibration)(Received { bus, at, message }),
+            FromSide::Temperature { at, message } => (self.sinks.temperature)(Received { bus, at, message }),
+            FromSide::Waveform { at, message } => (self.sinks.waveform)(Received { bus, at, message }),
             FromSide::Parameter { name, value } => {
                 if let Some(parameter) = self.start.parameters.iter_mut().find(|(known, _)| *known == name) {
                     parameter.1 = value;

@@ -18,9 +18,13 @@ use rustix::process::{Resource, Rlimit, Signal, set_parent_process_death_signal,
 use serde::Serialize;
 
 use super::frame::{Frames, FromSide, MAX_TO_SIDE, Next, Start, Status, ToSide, encode};
-use super::{Beside, Describe, Parameters, Ros2, Ros2Error};
+use super::member::Member;
+use super::{Beside, Describe, Middleware, Parameters, Ros2, Ros2Error};
+use crate::bus::Outgoing;
 use crate::bus::received::Received;
-use crate::msgs::{MAX_WAVEFORM_SAMPLES, Prediction};
+use crate::bus::zenoh::{self, Receivers, Take};
+use crate::msgs::schema::Topic;
+use crate::msgs::{MAX_WAVEFORM_SAMPLES, OperatingPoint, Prediction, Temperature, Vibration, Waveform};
 use crate::system::memory;
 
 /// Limit on the private memory of this process, bytes (`RLIMIT_DATA`). An allocation beyond it aborts the process.
@@ -124,9 +128,17 @@ fn contain() -> io::Result<()> {
     Ok(())
 }
 
-fn join(start: Start, validate: Validate, describe: Describe, node: &ToNode) -> Result<Ros2, Ros2Error> {
+fn join(start: Start, validate: Validate, describe: Describe, node: &ToNode) -> Result<Box<dyn Member>, Ros2Error> {
     let [inputs, vibrations, temperatures, waveforms, parameters, states] = std::array::from_fn(|_| node.clone());
-    let parameters = Parameters {
+    let input: Take<OperatingPoint> =
+        Box::new(move |Received { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }));
+    let vibration: Take<Vibration> =
+        Box::new(move |Received { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }));
+    let temperature: Take<Temperature> =
+        Box::new(move |Received { at, message, .. }| temperatures.send_short(&FromSide::Temperature { at, message }));
+    let waveform: Take<Waveform> =
+        Box::new(move |Received { at, message, .. }| waveforms.send_block(&FromSide::Waveform { at, message }));
+    let declared = Parameters {
         values: start.parameters,
         describe,
         validate: Box::new(validate),
@@ -134,23 +146,25 @@ fn join(start: Start, validate: Validate, describe: Describe, node: &ToNode) -> 
             parameters.send(&FromSide::Parameter { name: name.to_owned(), value });
         }),
     };
-    Ros2::start_with(
-        &start.options,
-        parameters,
-        MAX_UNANSWERED,
-        move |Received { at, message, .. }| inputs.send_short(&FromSide::Input { at, message }),
-        move |Received { at, message, .. }| vibrations.send_short(&FromSide::Vibration { at, message }),
-        Some(Beside {
-            temperature: Box::new(move |Received { at, message, .. }| {
-                temperatures.send_short(&FromSide::Temperature { at, message });
-            }),
-            waveform: Box::new(move |Received { at, message, .. }| {
-                waveforms.send_block(&FromSide::Waveform { at, message });
-            }),
-            state: start.state,
-            changed: Box::new(move |state| states.send(&FromSide::Lifecycle(state))),
-        }),
-    )
+    match start.options.middleware {
+        Middleware::Dds => {
+            let changed = Box::new(move |state| states.send(&FromSide::Lifecycle(state)));
+            let beside = Some(Beside { temperature, waveform, state: start.state, changed });
+            let ros2 = Ros2::start_with(&start.options, declared, MAX_UNANSWERED, input, vibration, beside)?;
+            Ok(Box::new(ros2))
+        }
+        Middleware::Zenoh => zenoh::member(
+            &start.options,
+            Receivers {
+                input: Some(input),
+                vibration: Some(vibration),
+                temperature: Some(temperature),
+                waveform: Some(waveform),
+                prediction: None,
+            },
+            declared,
+        ),
+    }
 }
 
 /// The queue to the node. It never blocks: frames that do not fit are lost and counted.
@@ -224,7 +238,7 @@ fn write(mut socket: &UnixStream, queued: &Receiver<Vec<u8>>, bytes_queued: &Ato
 
 /// A ROS 2 side that has joined the network.
 struct Side {
-    ros2: Ros2,
+    ros2: Box<dyn Member>,
     node: ToNode,
     /// When the publisher of predictions was renewed; `None` once the previous one is dropped.
     renewed: Option<Instant>,
@@ -257,7 +271,7 @@ impl Side {
             looks_without_beat = if beat == last_beat { looks_without_beat + 1 } else { 0 };
             last_beat = beat;
             if looks_without_beat > MAX_LOOKS_WITHOUT_BEAT {
-                give_up("its thread that receives from ROS 2 hangs");
+                give_up("its thread that receives hangs");
             }
             let status = self.status();
             let due = reported.is_none_or(|reported| reported.elapsed() >= STATUS_EVERY);
@@ -276,15 +290,15 @@ impl Side {
         let published = match frame {
             ToSide::Start(_) => Ok(()),
             ToSide::Prediction(message) => self.publish_prediction(message.into_owned()),
-            ToSide::Rig(message) => self.ros2.publish_rig(&message),
+            ToSide::Rig(message) => self.ros2.publish(Outgoing::RigInfo(&message)),
             ToSide::SessionEvent(message) => {
                 self.ros2.take_setting(&message);
-                self.ros2.publish_session_event(&message)
+                self.ros2.publish(Outgoing::SessionEvent(&message))
             }
-            ToSide::Sensitivity(message) => self.ros2.publish_sensitivity(&message),
-            ToSide::Diagnostics(message) => self.ros2.publish_diagnostics(&message),
-            ToSide::Heard(message) => self.ros2.publish_heard(&message),
-            ToSide::Log(severity, text) => self.ros2.log(severity, &text),
+            ToSide::Sensitivity(message) => self.ros2.publish(Outgoing::Sensitivity(&message)),
+            ToSide::Diagnostics(message) => self.ros2.publish(Outgoing::Diagnostics(&message)),
+            ToSide::Heard(message) => self.ros2.publish(Outgoing::Heard(&message)),
+            ToSide::Log(severity, text) => self.ros2.publish(Outgoing::Log(severity, &text)),
         };
         self.count_refusal(published);
     }
@@ -293,15 +307,17 @@ impl Side {
     /// renewed, so that this reader delays no other.
     fn publish_prediction(&mut self, prediction: Prediction) -> Result<(), Ros2Error> {
         if !self.settling() && self.held_back.is_empty() {
-            let published = self.ros2.publish_prediction(&prediction);
+            let published = self.ros2.publish(Outgoing::Prediction(&prediction));
             if published.is_ok() || self.renewed.is_some() {
                 return published;
             }
-            self.ros2.renew_prediction_publisher()?;
+            if !self.ros2.renew_prediction_publisher()? {
+                return published;
+            }
             self.renewed = Some(Instant::now());
             // Publish a single one: some readers never request samples that the first heartbeat of a publisher
             // announces before they arrive.
-            return self.ros2.publish_prediction(&prediction);
+            return self.ros2.publish(Outgoing::Prediction(&prediction));
         }
         self.held_back.push_back(prediction);
         if self.held_back.len() > MAX_HELD_BACK {
@@ -329,7 +345,7 @@ impl Side {
         // Not all at once: readers keep no more than their history depth.
         for _ in 0..HELD_BACK_AT_ONCE {
             let Some(prediction) = self.held_back.pop_front() else { return };
-            let published = self.ros2.publish_prediction(&prediction);
+            let published = self.ros2.publish(Outgoing::Prediction(&prediction));
             self.count_refusal(published);
         }
     }
@@ -350,8 +366,8 @@ impl Side {
         waveform_counts.missed += self.node.blocks.lost.load(Ordering::Relaxed);
         Status {
             waveform_counts,
-            prediction_readers: self.ros2.prediction_readers() as u64,
-            sensitivity_readers: self.ros2.sensitivity_readers() as u64,
+            prediction_readers: self.ros2.readers(Topic::Prediction) as u64,
+            sensitivity_readers: self.ros2.readers(Topic::Sensitivity) as u64,
             operating_point_writers: self.ros2.operating_point_writers() as u64,
             counts,
             refused: self.refused,

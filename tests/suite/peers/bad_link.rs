@@ -73,7 +73,7 @@ pub fn node_at(link: &BadLink, more: &[&str]) -> Node {
         domain.id.to_string(),
     ]);
     arguments.extend(more.iter().map(|&argument| argument.to_owned()));
-    let process = start(Path::new("nsenter"), &arguments, folder.path());
+    let process = start(Path::new("nsenter"), &arguments, &[], folder.path());
     Node { process, domain, prefix, folder }
 }
 

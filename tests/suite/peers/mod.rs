@@ -10,6 +10,9 @@ mod exchange;
 mod managed;
 mod operation;
 mod sound;
+mod types;
+#[cfg(feature = "zenoh")]
+mod zenoh;
 
 use std::collections::HashMap;
 use std::ffi::OsString;
@@ -148,6 +151,11 @@ impl Node {
 
     /// The same with more arguments.
     fn start_with(rig: &str, record: bool, more: &[&str]) -> Self {
+        Self::start_in(rig, record, more, &[])
+    }
+
+    /// The same with more variables in its environment.
+    fn start_in(rig: &str, record: bool, more: &[&str], variables: &[(&str, &str)]) -> Self {
         let folder = TempDir::new().expect("a folder");
         let (domain, prefix) = names();
         let mut arguments = vec!["run", rig, "--loopback"].into_iter().map(str::to_owned).collect::<Vec<_>>();
@@ -157,7 +165,7 @@ impl Node {
         }
         arguments.extend(more.iter().map(|&argument| argument.to_owned()));
         let program = Path::new(env!("CARGO_BIN_EXE_squealcast"));
-        Self { process: start(program, &arguments, folder.path()), domain, prefix, folder }
+        Self { process: start(program, &arguments, variables, folder.path()), domain, prefix, folder }
     }
 
     fn domain(&self) -> String {
@@ -191,12 +199,13 @@ fn names() -> (Domain, String) {
     (domain, prefix)
 }
 
-fn start(program: &Path, arguments: &[String], folder: &Path) -> Killed {
+fn start(program: &Path, arguments: &[String], variables: &[(&str, &str)], folder: &Path) -> Killed {
     let file = |name| File::create(folder.join(name)).expect("created");
     let child = Command::new(program)
         .args(arguments)
         .current_dir(folder)
         .env_remove("ROS_DOMAIN_ID")
+        .envs(variables.iter().copied())
         .env("XDG_CACHE_HOME", cache_folder())
         .stdin(Stdio::null())
         .stdout(file("stdout"))

@@ -57,7 +57,7 @@ fn the_launch_file_starts_the_node() {
     // As launched, but for the name of shared memory, which another user's node may have.
     let mut arguments = command[1..].to_vec();
     arguments.splice(2..2, ["--shm-prefix".to_owned(), prefix.clone()]);
-    let process = start(Path::new(&command[0]), &arguments, folder.path());
+    let process = start(Path::new(&command[0]), &arguments, &[], folder.path());
     let mut node = Node { process, domain, prefix, folder };
     let report = peer(
         &ros_python,
