@@ -84,7 +84,7 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_left_out_or_refused() {
-        for (topic, described) in [(Topic::RigInfo, true), (Topic::Prediction, false)] {
+        for (topic, described) in [(Topic::OperatingPoint, true), (Topic::Prediction, false)] {
             let request = Request {
                 type_name: topic.type_name().to_owned(),
                 type_hash: topic.type_hash(),

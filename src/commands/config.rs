@@ -311,6 +311,7 @@ mod tests {
             "display" => "'127.0.0.1:0'",
             "band_hz" => "'1000:9000'",
             "log_format" => "'json'",
+            "rmw" => "'dds'",
             "rig" | "record" | "shm_prefix" => "'name'",
             _ => "5",
         }
