@@ -31,6 +31,7 @@
 //! simulation of disk brake squeal", ZAMM 96 (2016) 1388-1405 (right vectors); Benner, Gugercin, Willcox, "A survey of
 //! projection-based model reduction methods for parametric dynamical systems", SIAM Review 57 (2015) 483-531 (greedy).
 
+mod condition;
 mod estimate;
 mod metric;
 mod request;

@@ -8,7 +8,7 @@ use super::super::full_model::{FullModel, Projected};
 use super::super::matching::Counted;
 use super::super::pencil::Pencil;
 use super::super::{FullSolver, FullSpectrum, FullVectors, ReductionError};
-use super::estimate::Condition;
+use super::condition::Condition;
 use super::metric::Metric;
 use super::request::{ParametricRequest, ParametricStep};
 use crate::physics::{Model, OperatingPoint, SolveError, Solver, Spectrum, Vectors};

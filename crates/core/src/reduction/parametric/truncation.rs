@@ -7,7 +7,7 @@ use super::super::ReductionError;
 use super::super::dense::symmetric_eigen;
 use super::super::full_model::Projected;
 use super::super::matching::match_roots;
-use super::estimate::Condition;
+use super::condition::Condition;
 use super::request::ParametricStep;
 use super::sampling::{Building, comparable_of, solve_failed};
 use crate::physics::{OperatingPoint, Situation, Solver, Vectors};
