@@ -9,8 +9,10 @@ use crate::figures::plot;
 use crate::files::input_file;
 use crate::files::whole_file::{folder_of, write_together};
 use crate::import::tribometer_log::decode_text;
-use crate::physics::identification::{IdentificationError, Identified, identify};
-use crate::physics::{OperatingPoint, Solver, Vectors};
+use crate::physics::identification::{
+    IdentificationError, Identified, IdentifiedExponent, identify, identify_exponent,
+};
+use crate::physics::{ModelError, OperatingPoint, SolveError, Solver, Vectors};
 use crate::rig::{Rig, RigFile};
 
 /// The stiffness counts as poorly determined if the error stays within twice its minimum over more than this factor.
@@ -21,19 +23,23 @@ Examples:
   squealcast identify my-rig.toml --targets measured.csv -o fitted.toml  fit the contact stiffness";
 
 /// Find the contact stiffness that fits measured or computed natural frequencies at rest
+///
+/// With frequencies at several loads it also finds the exponent with which the stiffness follows the load, of rigs whose
+/// contact has one: `[load] exponent`, or that of a power law in `[contact_state]`.
 #[derive(Debug, Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Options {
     /// Rig file, or the name of an embedded rig
     #[arg(value_parser = RigName, hide_possible_values = true)]
     rig: String,
-    /// CSV file with a column `frequency_hz`: the natural frequencies of the rig at rest
+    /// CSV file with a column `frequency_hz`: the natural frequencies of the rig at rest; with a column `normal_load_n` if they
+    /// are of several loads
     #[arg(long, value_name = "FREQ.csv")]
     targets: PathBuf,
-    /// Fit this many of the lowest frequencies [default: all of them]
+    /// Fit this many of the lowest frequencies of each load [default: all of them]
     #[arg(long, value_name = "COUNT")]
     first: Option<usize>,
-    /// Normal load in N [default: the rig's reference]
+    /// Normal load in N of frequencies without a column `normal_load_n` [default: the rig's reference]
     #[arg(long, value_name = "N", value_parser = positive)]
     load: Option<f64>,
     /// Write the rig with the stiffness found, together with the archives it refers to
@@ -62,38 +68,72 @@ struct Report<'a> {
     sensitivity: f64,
     frequency_hz: &'a [f64],
     target_hz: &'a [f64],
+    /// Load of each frequency.
+    normal_load_n: Vec<f64>,
+    /// Exponent of the load, if it was fitted.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    exponent: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    exponent_standard_error: Option<f64>,
+}
+
+/// Natural frequencies at one load, ascending.
+#[derive(Clone, Debug, PartialEq)]
+struct Targets {
+    normal_load_n: f64,
+    frequency_hz: Vec<f64>,
 }
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         let rig = Rig::load(&self.rig)?;
-        let mut targets = read_targets(&self.targets)?;
-        if let Some(first) = self.first {
-            if first == 0 || first > targets.len() {
-                let file = self.targets.display();
-                bail!("--first is {first}, expected 1 to the {} frequencies of {file}", targets.len());
-            }
-            targets.truncate(first);
-        }
-        let load = self.load.unwrap_or(rig.reference.normal_load_n);
+        let targets = self.targets_of(&rig)?;
+        let target_hz: Vec<f64> = targets.iter().flat_map(|at| at.frequency_hz.iter().copied()).collect();
         rig.has_stiffness_to_scale()?;
-        let present = rig.stiffness_to_scale(load)?;
+        let failed = |error: IdentificationError<anyhow::Error>| match error {
+            IdentificationError::Model(error) => error,
+            other => anyhow!("{} and {}: {other}", rig.name, self.targets.display()),
+        };
+        let mut law = None;
+        if let (Some(present), true) = (rig.load_exponent(), targets.len() > 1) {
+            let start = identify(&target_hz, &mut |factor| at_rest_hz(&rig, &targets, factor)).map_err(failed)?;
+            let mut of_exponent = rig.clone();
+            let mut tried = present.value;
+            let fitted = identify_exponent(
+                &target_hz,
+                (start.best.factor, present.value),
+                present.range,
+                &mut |factor, exponent| {
+                    if exponent != tried {
+                        (of_exponent, tried) = (rig.with_load_exponent(exponent)?, exponent);
+                    }
+                    at_rest_hz(&of_exponent, &targets, factor)
+                },
+            );
+            law = Some(fitted.map_err(failed)?);
+        }
+        let with_law = match &law {
+            Some(fitted) => rig.with_load_exponent(fitted.exponent)?,
+            None => rig.clone(),
+        };
+        let load = targets.first().map_or(rig.reference.normal_load_n, |at| at.normal_load_n);
+        let present = with_law.stiffness_to_scale(load)?;
         let Some(low) = present.iter().copied().reduce(f64::min).filter(|low| *low > 0.0) else {
             bail!("{}: has no contact stiffness above 0 to start from", rig.name);
         };
         let high = present.iter().copied().fold(low, f64::max);
-        let found = identify(&targets, &mut |factor| at_rest_hz(&rig, load, factor)).map_err(|error| match error {
-            IdentificationError::Model(error) => error,
-            other => anyhow!("{} and {}: {other}", rig.name, self.targets.display()),
-        })?;
+        let found = identify(&target_hz, &mut |factor| at_rest_hz(&with_law, &targets, factor)).map_err(failed)?;
         if let Some(path) = &self.svg {
-            let title = format!("{}, first {} natural frequencies", rig.name, targets.len());
+            let title = match targets.as_slice() {
+                [_] => format!("{}, first {} natural frequencies", rig.name, target_hz.len()),
+                _ => format!("{}, {} natural frequencies at {} loads", rig.name, target_hz.len(), targets.len()),
+            };
             let stiffness = if low == high { Some(low) } else { None };
             write_file(path, plot::identification(&title, &found, stiffness)?.as_bytes())?;
         }
         let factor = found.best.factor;
         if let Some(path) = &self.output {
-            write_rig(&rig, factor, &self.targets, path)?;
+            write_rig(&with_law, factor, &self.targets, path)?;
         }
         let stiffness = [low, high].map(|k| factor * k);
         if self.json {
@@ -107,14 +147,43 @@ impl Options {
                 factor_to: found.doubled[1],
                 sensitivity: found.sensitivity,
                 frequency_hz: &found.best.frequencies_hz,
-                target_hz: &targets,
+                target_hz: &target_hz,
+                normal_load_n: loads(&targets).collect(),
+                exponent: law.map(|law| law.exponent),
+                exponent_standard_error: law.and_then(|law| law.exponent_standard_error),
             };
             print(&(serde_json::to_string(&report)? + "\n"))?;
         } else {
-            print(&text(&found, &targets, [low, high]))?;
+            print(&text(&found, law.as_ref(), &targets, [low, high]))?;
         }
         Ok(Outcome::Done)
     }
+
+    /// The frequencies to fit, load by load.
+    fn targets_of(&self, rig: &Rig) -> anyhow::Result<Vec<Targets>> {
+        let mut targets = read_targets(&self.targets, self.load.unwrap_or(rig.reference.normal_load_n))?;
+        if let (Some(load), [_, _, ..]) = (self.load, targets.as_slice()) {
+            bail!(
+                "--load is {load}, but {} has a column `normal_load_n`; expected one of them",
+                self.targets.display()
+            );
+        }
+        if let Some(first) = self.first {
+            for Targets { normal_load_n, frequency_hz } in &mut targets {
+                if first == 0 || first > frequency_hz.len() {
+                    let (count, file) = (frequency_hz.len(), self.targets.display());
+                    bail!("--first is {first}, expected 1 to the {count} frequencies of {file} at {normal_load_n} N");
+                }
+                frequency_hz.truncate(first);
+            }
+        }
+        Ok(targets)
+    }
+}
+
+/// The load of every frequency.
+fn loads(targets: &[Targets]) -> impl Iterator<Item = f64> {
+    targets.iter().flat_map(|at| at.frequency_hz.iter().map(|_| at.normal_load_n))
 }
 
 /// Writes `rig` with the stiffness of every contact pair multiplied by `factor`. The name of the rig is that of its file. A
@@ -168,17 +237,34 @@ fn write_rig(rig: &Rig, factor: f64, targets: &Path, path: &Path) -> anyhow::Res
     Ok(write_together(written)?)
 }
 
-/// Natural frequencies without sliding, with the stiffness of every contact pair multiplied by `factor`, Hz.
-fn at_rest_hz(rig: &Rig, normal_load_n: f64, factor: f64) -> anyhow::Result<Vec<f64>> {
+/// Natural frequencies without sliding, with the stiffness of every contact pair multiplied by `factor`, Hz: as many as
+/// targets, load by load. Where there is no state of the contact they are infinite, unless the stiffness is the rig's own.
+fn at_rest_hz(rig: &Rig, targets: &[Targets], factor: f64) -> anyhow::Result<Vec<f64>> {
     let model = rig.at_rest_with_contact_stiffness_times(factor)?;
-    let at_rest = OperatingPoint { normal_load_n, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
-    let spectrum = Solver::new(model.dimension()).solve(&model, &at_rest, Vectors::Right)?;
-    Ok(spectrum.modes().iter().map(|root| root.frequency_hz()).collect())
+    let mut solver = Solver::new(model.dimension());
+    let mut found = vec![];
+    for Targets { normal_load_n, frequency_hz } in targets {
+        let at_rest =
+            OperatingPoint { normal_load_n: *normal_load_n, disc_speed_rad_s: 0.0, friction_coefficient: 0.0 };
+        let wanted = frequency_hz.len();
+        let spectrum = match solver.solve(&model, &at_rest, Vectors::Right) {
+            Err(SolveError::Model(ModelError::State(_))) if factor != 1.0 => {
+                found.extend(std::iter::repeat_n(f64::INFINITY, wanted));
+                continue;
+            }
+            other => other?,
+        };
+        // A contact that is soft enough leaves rigid-body motion.
+        let rigid = wanted.min(spectrum.roots.len()).saturating_sub(spectrum.modes().len());
+        found.extend(std::iter::repeat_n(0.0, rigid));
+        found.extend(spectrum.modes().iter().map(|root| root.frequency_hz()).take(wanted - rigid));
+    }
+    Ok(found)
 }
 
-/// The column `frequency_hz` in ascending order. Columns are separated by `,`, `;` or tabs; unless it is the separator,
-/// `,` may be the decimal sign.
-fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
+/// The column `frequency_hz`, ascending, for each value of the column `normal_load_n`, ascending; without that column they are
+/// of `load_n`. Columns are separated by `,`, `;` or tabs; unless it is the separator, `,` may be the decimal sign.
+fn read_targets(path: &Path, load_n: f64) -> anyhow::Result<Vec<Targets>> {
     let file = path.display();
     let bytes = input_file::read(path, input_file::TARGETS).with_context(|| format!("{file}: cannot be read"))?;
     let text = decode_text(&bytes);
@@ -186,26 +272,36 @@ fn read_targets(path: &Path) -> anyhow::Result<Vec<f64>> {
     let separator = [b';', b'\t'].into_iter().find(|&s| header.contains(char::from(s))).unwrap_or(b',');
     let mut reader = csv::ReaderBuilder::new().delimiter(separator).from_reader(text.as_bytes());
     let headers = reader.headers().with_context(|| format!("{file}: no header"))?;
-    let column = headers
-        .iter()
-        .position(|name| name.trim() == "frequency_hz")
+    let place = |name: &str| headers.iter().position(|header| header.trim() == name);
+    let column = place("frequency_hz")
         .ok_or_else(|| anyhow!("{file}: its columns are `{}`, expected `frequency_hz`", headers.as_slice()))?;
-    let mut targets = vec![];
+    let of_load = place("normal_load_n");
+    let mut targets: Vec<Targets> = vec![];
     for record in reader.records() {
         let record = record.with_context(|| file.to_string())?;
         let line = record.position().map_or(0, csv::Position::line);
-        let value = record.get(column).unwrap_or_default().trim();
-        // A decimal comma without points only: `1.234,5` would be ambiguous.
-        let number = if separator == b',' || value.contains('.') { value.to_owned() } else { value.replace(',', ".") };
-        match number.parse::<f64>() {
-            Ok(hz) if hz.is_finite() && hz > 0.0 => targets.push(hz),
-            _ => bail!("{file}, line {line}: frequency_hz is `{value}`, expected a number above 0"),
+        let number = |name: &str, column: usize| {
+            let value = record.get(column).unwrap_or_default().trim();
+            // A decimal comma without points only: `1.234,5` would be ambiguous.
+            let text =
+                if separator == b',' || value.contains('.') { value.to_owned() } else { value.replace(',', ".") };
+            match text.parse::<f64>() {
+                Ok(number) if number.is_finite() && number > 0.0 => Ok(number),
+                _ => bail!("{file}, line {line}: {name} is `{value}`, expected a number above 0"),
+            }
+        };
+        let hz = number("frequency_hz", column)?;
+        let normal_load_n = of_load.map_or(Ok(load_n), |column| number("normal_load_n", column))?;
+        match targets.iter_mut().find(|at| at.normal_load_n == normal_load_n) {
+            Some(at) => at.frequency_hz.push(hz),
+            None => targets.push(Targets { normal_load_n, frequency_hz: vec![hz] }),
         }
     }
     if targets.is_empty() {
         bail!("{file}: no frequencies, expected at least one");
     }
-    targets.sort_by(f64::total_cmp);
+    targets.sort_by(|a, b| a.normal_load_n.total_cmp(&b.normal_load_n));
+    targets.iter_mut().for_each(|at| at.frequency_hz.sort_by(f64::total_cmp));
     Ok(targets)
 }
 
@@ -223,7 +319,13 @@ fn poorly(found: &Identified) -> String {
     }
 }
 
-fn text(found: &Identified, targets: &[f64], [low, high]: [f64; 2]) -> String {
+/// The line of the exponent.
+fn exponent(law: &IdentifiedExponent) -> String {
+    let error = law.exponent_standard_error.map_or(String::new(), |error| format!(", standard error {error:.1e}"));
+    format!("exponent           {:.6} of the load or the closure{error}\n", law.exponent)
+}
+
+fn text(found: &Identified, law: Option<&IdentifiedExponent>, targets: &[Targets], [low, high]: [f64; 2]) -> String {
     let best = &found.best;
     let stiffness = |factor: f64| {
         let [low, high] = [low, high].map(|k| factor * k);
@@ -235,26 +337,29 @@ fn text(found: &Identified, targets: &[f64], [low, high]: [f64; 2]) -> String {
         "contact stiffness  {} a pair, {:.6} times the rig's\n\
          error              mean {}, rms {}, largest {}, of {} frequencies\n\
          determined         the rms error stays below twice that from {} to {}\n\
-         sensitivity        1 % more stiffness moves the frequencies by {:.4} % (rms){}\n\n\
-         {:>4}  {:>14}  {:>14}  {:>10}\n",
+         sensitivity        1 % more stiffness moves the frequencies by {:.4} % (rms){}\n{}\n\
+         {:>4}  {:>14}  {:>14}  {:>10}  {:>9}\n",
         stiffness(best.factor),
         best.factor,
         percent(best.mean_error),
         percent(best.rms_error),
         percent(best.largest_error),
-        targets.len(),
+        best.frequencies_hz.len(),
         end(found.doubled[0]),
         end(found.doubled[1]),
         found.sensitivity,
         poorly(found),
+        law.map_or(String::new(), exponent),
         "mode",
         "target, Hz",
         "rig, Hz",
         "error, %",
+        "load, N",
     );
-    for (index, (hz, target)) in best.frequencies_hz.iter().zip(targets).enumerate() {
+    let listed = targets.iter().flat_map(|at| at.frequency_hz.iter().enumerate().map(|line| (at.normal_load_n, line)));
+    for (hz, (load, (index, target))) in best.frequencies_hz.iter().zip(listed) {
         let error = 100.0 * (hz / target - 1.0);
-        text += &format!("{:>4}  {target:>14.4}  {hz:>14.4}  {error:>10.4}\n", index + 1);
+        text += &format!("{:>4}  {target:>14.4}  {hz:>14.4}  {error:>10.4}  {load:>9.2}\n", index + 1);
     }
     text
 }

@@ -454,7 +454,8 @@ pub fn identification(title: &str, found: &Identified, stiffness_n_per_m: Option
     let at = |factor: f64| (factor * stiffness_n_per_m.unwrap_or(1.0)).log10();
     // Errors of zero are drawn at the lower edge.
     let height = |error: f64| (100.0 * error).max(1e-12).log10();
-    let mut trials: Vec<&Trial> = found.curve.iter().chain([&found.best]).collect();
+    let finite = |trial: &&Trial| trial.rms_error.is_finite();
+    let mut trials: Vec<&Trial> = found.curve.iter().chain([&found.best]).filter(finite).collect();
     trials.sort_by(|a, b| a.factor.total_cmp(&b.factor));
     let x = range(trials.iter().map(|trial| at(trial.factor)));
     let y = padded(range(trials.iter().flat_map(|trial| [height(trial.mean_error), height(trial.largest_error)])));

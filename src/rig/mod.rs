@@ -128,6 +128,18 @@ pub struct PairPlace {
     pub normal: [f64; 3],
 }
 
+/// How the contact stiffness follows the load.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LoadExponent {
+    /// Table of the rig file that holds it: `load`, the exponent of the load in the stiffness, or `contact_state`, that of
+    /// the closure in the force.
+    pub table: &'static str,
+    /// The exponent.
+    pub value: f64,
+    /// The range that it may have.
+    pub range: [f64; 2],
+}
+
 /// Displacement shapes of one side in the coordinates of the model.
 #[derive(Clone, Debug)]
 pub struct SideShapes {
@@ -458,6 +470,43 @@ impl Rig {
             (None, None) => free.with_contact(&pairs),
         }
         .map_err(|source| RigError::Model { file: self.name.clone(), source })
+    }
+
+    /// The exponent with which the contact stiffness of the rig follows the load or the closure, with the range that it may
+    /// have; `None` for laws without one.
+    pub fn load_exponent(&self) -> Option<LoadExponent> {
+        match self.model.statics().map(|statics| &statics.parts().law) {
+            Some(PressureLaw::Power { exponent, .. }) => {
+                Some(LoadExponent { table: "contact_state", value: *exponent, range: [1.0, 10.0] })
+            }
+            Some(PressureLaw::Linear { .. } | PressureLaw::Exponential { .. } | PressureLaw::Table(_)) => None,
+            None => match &self.contact {
+                // A flexible contact has a stiffness independent of the load.
+                Some(Contact { residual: None, .. }) => {
+                    let value = self.model.contact_law().exponent;
+                    Some(LoadExponent { table: "load", value, range: [-1.0, 2.0] })
+                }
+                Some(Contact { residual: Some(_), .. }) | None => None,
+            },
+        }
+    }
+
+    /// The same rig with another [`Self::load_exponent`].
+    ///
+    /// # Errors
+    /// [`RigError`] if the rig's own files cannot be read again.
+    pub fn with_load_exponent(&self, exponent: f64) -> Result<Self, RigError> {
+        let changed = self.load_exponent().and_then(|LoadExponent { table: name, .. }| {
+            let text = std::str::from_utf8(&self.files.first()?.bytes).ok()?;
+            let mut table: toml::Table = text.parse().ok()?;
+            let of_load = table.entry(name).or_insert_with(|| toml::Table::new().into());
+            of_load.as_table_mut()?.insert("exponent".to_owned(), exponent.into());
+            Some(table.to_string())
+        });
+        let Some(text) = changed else { return Ok(self.clone()) };
+        let mut files = self.files.clone();
+        files[0].bytes = text.into_bytes();
+        Self::from_files_at(&files, self.temperature_c())
     }
 
     /// The text of the rig file with `change` applied to the roughness height of its law; `None` if the file cannot be parsed.

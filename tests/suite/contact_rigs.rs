@@ -4,6 +4,7 @@
 use std::path::Path;
 use std::process::Command;
 
+use crate::identify::targets_at_loads;
 use crate::program::side::{Side, archive};
 use crate::program::{self, folder, json, launch, number, python, rig_file as file, run, text, write};
 use faer::c64;
@@ -414,6 +415,27 @@ fn identification_finds_the_roughness_height() {
     run(["identify", &write(folder.path(), "table.toml", &rig), "--targets", &targets]).exits(1).complains(
         "`contact_state.law` is \"table\", in which no stiffness can be changed; expected linear, power or exponential",
     );
+}
+
+/// Of a power law stiffness and exponent of the closure are identified, from the frequencies at several loads.
+#[test]
+fn identification_finds_the_exponent_of_a_power_law() {
+    let folder = folder();
+    let power = |exponent: &str| {
+        with_law(&format!("law = \"power\"\nreference_m = 2e-6\nexponent = {exponent}\nmeasured = \"back-force\""))
+    };
+    let rig = write(folder.path(), "rig.toml", &power("2.0"));
+    let made = write(folder.path(), "made.toml", &power("1.5").replace("= 3e7", "= 4.5e7"));
+    let targets = targets_at_loads(folder.path(), &made, &[100.0, 400.0, 1500.0]);
+    let found = json(["identify", &rig, "--targets", &targets, "--json"]);
+    assert!((number(&found, "stiffness_factor") - 1.5).abs() < 1e-6, "{found}");
+    assert!((number(&found, "exponent") - 1.5).abs() < 1e-6, "{found}");
+    // An exponential law has one parameter only, which serves all loads.
+    let rough = std::fs::read_to_string(launch("rough-pad.toml")).unwrap();
+    let smoother = write(folder.path(), "smoother.toml", &rough.replace("roughness_m = 2e-6", "roughness_m = 1.6e-6"));
+    let targets = targets_at_loads(folder.path(), &smoother, &[100.0, 1500.0]);
+    let found = json(["identify", "rough-pad", "--targets", &targets, "--json"]);
+    assert!((number(&found, "stiffness_factor") - 1.25).abs() < 1e-6 && found.get("exponent").is_none(), "{found}");
 }
 
 /// The load alone decides whether the rig squeals: at a friction coefficient of 0.4 it does at 500 N, and not at 100, 1000 and

@@ -72,6 +72,45 @@ fn the_stiffness_behind_known_frequencies_is_found() {
     assert!(few > 1.5 * all, "{few} {all}");
 }
 
+/// Frequencies of `rig` at rest under several loads, as a CSV file with a column of loads.
+pub fn targets_at_loads(folder: &Path, rig: &str, loads_n: &[f64]) -> String {
+    let mut lines = "normal_load_n,frequency_hz\n".to_owned();
+    for load in loads_n {
+        let found = json(["predict", rig, "--mu", "0", "--speed", "0", "--load", &load.to_string(), "--json"]);
+        for mode in found["modes"].as_array().unwrap() {
+            lines += &format!("{load},{}\n", number(mode, "frequency_hz"));
+        }
+    }
+    write(folder, "at-loads.csv", &lines)
+}
+
+/// Frequencies at several loads tell how the stiffness follows the load: factor and exponent of the rig that made them.
+#[test]
+fn the_exponent_of_the_load_is_found() {
+    let temp = tempfile::tempdir().unwrap();
+    let nine = fs::read_to_string(launch("nine-dof.toml")).unwrap();
+    let stiffer = nine.replace("stiffness_n_per_m = 1.0", "stiffness_n_per_m = 2.5");
+    let made = write(temp.path(), "made.toml", &format!("{stiffer}\n[load]\nexponent = 0.4\nreference_n = 500.0\n"));
+    let targets = targets_at_loads(temp.path(), &made, &[100.0, 500.0, 2000.0]);
+    let fitted = text(&temp.path().join("fitted.toml"));
+    let found = json(["identify", "nine-dof", "--targets", &targets, "--json", "-o", &fitted]);
+    // Frequencies are printed with all digits.
+    assert!((number(&found, "stiffness_factor") - 2.5).abs() < 1e-6, "{found}");
+    assert!((number(&found, "exponent") - 0.4).abs() < 1e-6, "{found}");
+    assert!(number(&found, "exponent_standard_error") < 1e-6, "{found}");
+    assert_eq!(found["normal_load_n"].as_array().unwrap().len(), 27);
+    let at = ["predict", "--mu", "0.5", "--load", "900", "--json"];
+    let [fitted, made] = [&fitted, &made].map(|rig| json([&at[..1], &[rig.as_str()], &at[1..]].concat()));
+    for (a, b) in fitted["modes"].as_array().unwrap().iter().zip(made["modes"].as_array().unwrap()) {
+        assert!((number(a, "frequency_hz") / number(b, "frequency_hz") - 1.0).abs() < 1e-6, "{a} {b}");
+    }
+    run(["identify", "nine-dof", "--targets", &targets]).exits(0).says("exponent           0.4000").says("2000.00");
+    run(["identify", "nine-dof", "--targets", &targets, "--load", "100"]).exits(1).complains("expected one of them");
+    run(["identify", "nine-dof", "--targets", &targets, "--first", "12"]).exits(1).complains("1 to the 9 frequencies");
+    let wrong = write(temp.path(), "wrong.csv", "normal_load_n,frequency_hz\n-5,1.0\n");
+    run(["identify", "nine-dof", "--targets", &wrong]).exits(1).complains("line 2: normal_load_n is `-5`");
+}
+
 /// A rig of kind 2 with the residual of the truncated modes, against the full model's own frequencies with another
 /// stiffness; and against its own, where nothing is left out.
 #[test]

@@ -261,6 +261,11 @@ impl Model {
         self
     }
 
+    /// How contact stiffness and friction follow load and speed.
+    pub fn contact_law(&self) -> &ContactLaw {
+        &self.contact_law
+    }
+
     /// Number of coordinates, `n`.
     pub fn dimension(&self) -> usize {
         self.dimension
