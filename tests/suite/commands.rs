@@ -736,20 +736,6 @@ fn a_reader_that_has_gone_away_is_no_error() {
 }
 
 #[test]
-fn completions_are_scripts_of_their_shells() {
-    for (shell, sign) in [("bash", "complete -F _squealcast"), ("zsh", "#compdef squealcast"), ("fish", "complete -c")]
-    {
-        let script = run(["completions", shell]).exits(0).says(sign).says("shm-prefix").stdout;
-        // Where the shell itself is there, it reads the script.
-        let folder = folder();
-        let path = write(folder.path(), "script", &script);
-        if let Ok(checked) = std::process::Command::new(shell).args(["-n", &path]).output() {
-            assert!(checked.status.success(), "{shell}: {}", String::from_utf8_lossy(&checked.stderr));
-        }
-    }
-}
-
-#[test]
 fn help_states_units() {
     run(["--version"]).exits(0).says("squealcast ");
     let flat = |command: &str| {
@@ -775,7 +761,7 @@ fn help_states_units() {
         ("check", &["Rig file, full model, or the name of an embedded rig"]),
         ("identify", &["--targets <FREQ.csv>", "`frequency_hz`", "--load <N> Normal load in N"]),
         ("full", &["--load <N> Normal load in N", "--speed <RAD_S> Disc speed in rad/s", "--band-hz <HZ>"]),
-        ("verify", &["--against <FULL>", "Highest frequency in Hz"]),
+        ("verify", &["--against <FULL.toml>", "Highest frequency in Hz"]),
         ("reduce", &["--modes <I+J>", "--cutoff-hz [<HZ>]", "--range <mu=A:B,speed=A:B,load=A:B>"]),
         ("tribometer", &["--dof <N> Degrees of freedom"]),
         ("reproduce", &["--dof <N> Degrees of freedom of the tribometer", "--output <DIR>"]),
