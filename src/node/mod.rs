@@ -18,14 +18,17 @@ mod mapper;
 mod outputs;
 #[cfg(test)]
 mod recorded_tests;
+mod remembered;
 mod sensitivity;
 pub mod sound_view;
 mod statistics;
 pub mod status;
 mod temperature;
+#[cfg(test)]
+mod tests;
 mod watch;
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
 use std::time::{Duration, Instant};
@@ -39,8 +42,8 @@ pub use outputs::{NodeName, Outputs};
 pub use sensitivity::end_derivatives;
 pub use watch::{SAMPLE_MODES, Sample, Snapshot, TemperatureSeen, UnstableMode, VibrationSample, Watch};
 
+use crate::bus::Received;
 use crate::bus::lifecycle::State;
-use crate::bus::{Bus, Received};
 use crate::files::chart_file::ChartFile;
 use crate::msgs::{self, Header, RigInfo, Time};
 use crate::physics::{Chart, OperatingPoint, StabilityMap};
@@ -54,6 +57,7 @@ use detection::DetectionInlet;
 use inlet::Running;
 use lifecycle::{Charting, Lifecycle};
 use mapper::Mapper;
+use remembered::Remembered;
 use sensitivity::Question;
 use statistics::Statistics;
 
@@ -609,233 +613,4 @@ pub fn rig_info(rig: &Rig) -> RigInfo {
 
 fn now_header() -> Header {
     Header { stamp: Time::from_ns(clock::now_ns()), frame_id: String::new() }
-}
-
-/// Recent stamps and sequence numbers, each with the bus that delivered it first.
-struct Remembered {
-    count: usize,
-    bus: HashMap<(Time, u64), Bus>,
-    order: VecDeque<(Time, u64)>,
-}
-
-impl Remembered {
-    /// Remembers the latest `count`. All memory is allocated here. Twice the capacity is reserved, so that the map
-    /// reuses the slots of removed entries instead of growing.
-    fn new(count: usize) -> Self {
-        Self { count, bus: HashMap::with_capacity(2 * (count + 1)), order: VecDeque::with_capacity(count + 1) }
-    }
-
-    /// Whether this was not recently received over another bus. A repetition over the same bus counts as new: a
-    /// recording may be played again.
-    fn is_new(&mut self, bus: Bus, stamp: Time, seq: u64) -> bool {
-        let key = (stamp, seq);
-        if let Some(&first) = self.bus.get(&key) {
-            return first == bus;
-        }
-        self.bus.insert(key, bus);
-        self.order.push_back(key);
-        if self.order.len() > self.count
-            && let Some(oldest) = self.order.pop_front()
-        {
-            self.bus.remove(&oldest);
-        }
-        true
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::status::Status;
-    use super::*;
-    use crate::session::computed::{session_chart, session_map};
-
-    #[test]
-    fn a_bus_may_repeat_itself_but_not_another() {
-        let mut received = Remembered::new(4);
-        let stamp = Time::from_ns(1);
-        assert!(received.is_new(Bus::Shm, stamp, 1));
-        assert!(!received.is_new(Bus::Ros2, stamp, 1), "answered over shared memory already");
-        assert!(received.is_new(Bus::Shm, stamp, 1), "a recording played again");
-        assert!(!received.is_new(Bus::Ros2, stamp, 1));
-    }
-
-    #[test]
-    fn old_inputs_are_forgotten_and_their_memory_reused() {
-        let mut received = Remembered::new(100);
-        let room = (received.bus.capacity(), received.order.capacity());
-        for seq in 0..100_000 {
-            assert!(received.is_new(Bus::Shm, Time::from_ns(0), seq));
-            assert_eq!(seq >= 100, received.is_new(Bus::Ros2, Time::from_ns(0), seq.saturating_sub(100)), "{seq}");
-        }
-        // Slots of removed entries reduce the capacity that a map reports.
-        assert!(received.bus.capacity() <= room.0 && received.order.capacity() == room.1);
-    }
-
-    #[test]
-    fn the_newest_input_of_a_long_backlog_is_predicted_on_either_bus() {
-        const COUNT: u64 = 8000;
-        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let settings = Settings { warn_margin: 0.3, ..Settings::for_rig(&rig) };
-        let watch = Watch::default();
-        let (mut node, inlet) = Node::new(rig, settings, watch.clone());
-        for seq in 0..COUNT {
-            let message = msgs::OperatingPoint {
-                header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
-                seq,
-                normal_load_n: 500.0,
-                disc_speed_rad_s: 13.0,
-                friction_coefficient: 0.3 + 1e-6 * seq as f64,
-            };
-            for bus in [Bus::Ros2, Bus::Shm] {
-                assert!(inlet.input(Received::now(bus, message.clone()), false), "room");
-            }
-        }
-        inlet.stop();
-        // Pretend that a prediction takes 10 ms: at most ten inputs may then wait.
-        node.worker.prediction_times.note(Duration::from_millis(10));
-        node.run(Outputs::default());
-        let seen = watch.snapshot();
-        assert_eq!(seen.settings.map(|settings| settings.warn_margin), Some(0.3), "of the settings, not of the rig");
-        assert_eq!(seen.prediction.expect("one").input_seq, COUNT - 1);
-        assert_eq!((seen.counters.solved, seen.passed_over), (1, COUNT - 1));
-    }
-
-    /// Window ends are computed for a map that may no longer be in force when they are ready.
-    #[test]
-    fn window_ends_of_a_replaced_map_are_discarded() {
-        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let (mut node, _inlet) = Node::new(rig.clone(), Settings::for_rig(&rig), Watch::default());
-        let worker = &mut node.worker;
-        let mut solver = crate::physics::Solver::new(rig.model.dimension());
-        let mut map = || Arc::new(session_map(&rig, &mut solver, &rig.reference).expect("mapped"));
-        let (former, present) = (map(), map());
-        for map in [&former, &present] {
-            worker.computed(&Request::Map(rig.reference), None, Ok(Some(Event::MapReady(map.clone()))));
-        }
-        for (of, taken) in [(&former, 0), (&present, 1)] {
-            let ends = Event::EndsReady(Arc::new(of.ends.clone()));
-            worker.computed(&Request::Ends(rig.reference), Some(of), Ok(Some(ends)));
-            assert_eq!(worker.statistics.ends, taken);
-        }
-    }
-
-    /// With a chart, inputs are predicted on the thread that received them. Inputs that need a dense solve are queued,
-    /// and later inputs do not overtake them.
-    #[test]
-    fn an_input_is_answered_past_the_queue_but_overtakes_none() {
-        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let watch = Watch::default();
-        let (node, inlet) = Node::new(rig.clone(), Settings::for_rig(&rig), watch.clone());
-        let chart = Arc::new(session_chart(&rig, 1, &|| true).expect("charted"));
-        assert!(inlet.send(Incoming::Chart { rig, chart: Ok(chart) }));
-        let mut samples = vec![];
-        watch.take_samples(&mut samples);
-        let thread = std::thread::spawn(move || node.run(Outputs::default()));
-        let (mut seq, mut at_once, mut all) = (0, 0, vec![]);
-        let mut ask = |disc_speed_rad_s: f64| {
-            let message = msgs::OperatingPoint {
-                header: Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() },
-                seq,
-                normal_load_n: 500.0,
-                disc_speed_rad_s,
-                friction_coefficient: 0.3 + 1e-6 * seq as f64,
-            };
-            assert!(inlet.input(Received::now(Bus::Shm, message), seq % 7 != 0));
-            seq += 1;
-            at_once += u32::from(watch.snapshot().prediction.is_some_and(|answer| answer.input_seq == seq - 1));
-            // Only a few inputs wait, so that none is passed over. Now and then none waits, so that the next can be
-            // predicted at once.
-            let may_wait = if seq % 3 == 0 { 0 } else { 20 };
-            while all.len() + may_wait < seq as usize {
-                assert_eq!(watch.take_samples(&mut samples), 0);
-                all.append(&mut samples);
-                std::thread::sleep(Duration::from_micros(50));
-            }
-            at_once
-        };
-        // On a busy machine the node's thread may hold the lock at every attempt, so try until it does not.
-        let begun = Instant::now();
-        let mut asked = 0;
-        while ask(if asked % 10 == 9 { -13.0 } else { 13.0 }) <= 100 || asked < 1000 {
-            // Every tenth input has the opposite direction of rotation, which the chart does not cover.
-            asked += 1;
-            assert!(begun.elapsed() < Duration::from_secs(60), "hardly any was answered at once");
-        }
-        inlet.stop();
-        thread.join().expect("it ended");
-        watch.take_samples(&mut samples);
-        all.append(&mut samples);
-        assert!(all.iter().map(|sample| sample.input_seq).eq(0..seq), "{} of {seq} answered in order", all.len());
-    }
-
-    /// Before the first input nothing is published. Later a silence is published once, as a FAULT, and the next input
-    /// ends it.
-    #[test]
-    fn silence_is_a_fault_once_after_the_first_input_and_none_before() {
-        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let watch = Watch::default();
-        let settings = Settings { silence_timeout_s: 0.02, ..Settings::for_rig(&rig) };
-        let (mut node, inlet) = Node::new(rig, settings, watch.clone());
-        node.worker.next_diagnostics = Instant::now();
-        let thread = std::thread::spawn(move || node.run(Outputs::default()));
-        let (mut samples, mut all) = (vec![], vec![]);
-        watch.take_samples(&mut samples);
-        let mut wait_for = |count: usize| -> Vec<(Status, u64)> {
-            let begun = Instant::now();
-            while all.len() < count {
-                assert!(begun.elapsed() < Duration::from_secs(60), "{all:?}");
-                watch.take_samples(&mut samples);
-                all.extend(samples.drain(..).map(|sample| (sample.status, sample.input_seq)));
-                std::thread::sleep(Duration::from_millis(1));
-            }
-            all.clone()
-        };
-        let input = |seq: u64| {
-            let header = Header { stamp: Time::from_ns(1_000_000_000 + seq as i64), ..Default::default() };
-            let point = msgs::OperatingPoint {
-                header,
-                seq,
-                normal_load_n: 500.0,
-                disc_speed_rad_s: 13.0,
-                friction_coefficient: 0.2,
-            };
-            assert!(inlet.send(Incoming::Input(Received::now(Bus::Shm, point))), "it runs");
-        };
-        // Several times the silence timeout.
-        std::thread::sleep(Duration::from_millis(200));
-        input(7);
-        assert_eq!(wait_for(2), [(Status::Ok, 7), (Status::NoData, 7)], "the input is the first that is published");
-        std::thread::sleep(Duration::from_millis(100));
-        input(8);
-        let found = wait_for(4);
-        assert_eq!(found[2..], [(Status::Ok, 8), (Status::NoData, 8)], "one FAULT for each silence");
-        inlet.stop();
-        thread.join().expect("it ended");
-    }
-
-    /// Inputs older than half a second are passed over, except the newest.
-    #[test]
-    fn old_inputs_are_passed_over_but_for_the_newest() {
-        let rig = Arc::new(Rig::load("nine-dof-case-2").expect("embedded"));
-        let watch = Watch::default();
-        let (node, inlet) = Node::new(rig.clone(), Settings::for_rig(&rig), watch.clone());
-        let mut old = Received::now(Bus::Shm, msgs::OperatingPoint::default());
-        while clock::monotonic_ns().saturating_sub(old.at.monotonic_ns) <= LATEST.as_nanos() as u64 {
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        for seq in 0..3 {
-            old.message = msgs::OperatingPoint {
-                seq,
-                normal_load_n: 500.0,
-                disc_speed_rad_s: 13.0,
-                friction_coefficient: 0.2,
-                ..Default::default()
-            };
-            assert!(inlet.input(old.clone(), false), "room");
-        }
-        inlet.stop();
-        node.run(Outputs::default());
-        let seen = watch.snapshot();
-        assert_eq!((seen.passed_over, seen.prediction.expect("one").input_seq), (2, 2));
-    }
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::*;
+use crate::bus::Bus;
 use crate::msgs::SessionEventKind;
 use crate::recording::reader::{Recorded, Recording};
 use crate::recording::recorder::{QUEUE_MESSAGES, Recorder, RecorderConfig};
