@@ -103,18 +103,7 @@ def main() -> int:
     def read() -> None:
         while not stop.is_set():
             for message in reader.take_iter(timeout=duration(milliseconds=100)):
-                stamp = message.header.stamp
-                exchange.answer(
-                    Answer(
-                        seq=message.input_seq,
-                        stamp_ns=stamp.sec * 1_000_000_000 + stamp.nanosec,
-                        level=message.level,
-                        reason=message.reason,
-                        modes=len(message.modes),
-                        unstable_modes=message.unstable_modes,
-                        reused=message.reused,
-                    )
-                )
+                exchange.answer(Answer.of(message))
 
     thread = threading.Thread(target=read)
     thread.start()

@@ -69,6 +69,20 @@ class Answer:
     unstable_modes: int
     reused: bool
 
+    @classmethod
+    def of(cls, message) -> "Answer":
+        """Of a message in Python, whichever library decoded it."""
+        stamp = message.header.stamp
+        return cls(
+            seq=message.input_seq,
+            stamp_ns=stamp.sec * 1_000_000_000 + stamp.nanosec,
+            level=message.level,
+            reason=message.reason,
+            modes=len(message.modes),
+            unstable_modes=message.unstable_modes,
+            reused=message.reused,
+        )
+
 
 @dataclass
 class Sent:

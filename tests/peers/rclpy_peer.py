@@ -89,18 +89,7 @@ class Peer:
         self.exchange.drain()
 
     def on_prediction(self, message) -> None:
-        stamp = message.header.stamp
-        self.exchange.answer(
-            Answer(
-                seq=message.input_seq,
-                stamp_ns=stamp.sec * 1_000_000_000 + stamp.nanosec,
-                level=message.level,
-                reason=message.reason,
-                modes=len(message.modes),
-                unstable_modes=message.unstable_modes,
-                reused=message.reused,
-            )
-        )
+        self.exchange.answer(Answer.of(message))
 
     def check_rig(self) -> dict[str, object] | None:
         """A late joiner must get the latched rig."""

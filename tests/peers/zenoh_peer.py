@@ -216,18 +216,7 @@ def main() -> int:
     Header, Time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
 
     def read(message) -> None:
-        stamp = message.header.stamp
-        exchange.answer(
-            Answer(
-                seq=message.input_seq,
-                stamp_ns=stamp.sec * 1_000_000_000 + stamp.nanosec,
-                level=message.level,
-                reason=message.reason,
-                modes=len(message.modes),
-                unstable_modes=message.unstable_modes,
-                reused=message.reused,
-            )
-        )
+        exchange.answer(Answer.of(message))
 
     with zenoh.open(config) as session:
         node = Node(session, store, args.domain, "zenoh_peer")
