@@ -15,6 +15,7 @@ pub mod shm;
 mod shm_connection;
 mod shm_place;
 pub mod shm_waveform;
+mod sockets;
 mod type_descriptions;
 pub mod zenoh;
 

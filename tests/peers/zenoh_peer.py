@@ -196,6 +196,7 @@ def main() -> int:
     parser = arguments(__doc__.splitlines()[0])
     parser.add_argument("--router", type=int, required=True, help="port of the router on 127.0.0.1")
     parser.add_argument("--expect-rig", help="name of the rig that a late joiner is told")
+    parser.add_argument("--lease-ms", type=int, default=10_000, help="silence after which others take it for gone")
     parser.add_argument("--services", type=Path, help="JSON of service types and their hashes: calls the services")
     args = parser.parse_args()
     bound_run_time(run_time_limit(args))
@@ -208,6 +209,7 @@ def main() -> int:
         ("listen/endpoints", '["tcp/127.0.0.1:0"]'),
         ("scouting/multicast/enabled", "false"),
         ("timestamping/enabled", "true"),
+        ("transport/link/tx/lease", str(args.lease_ms)),
     ):
         config.insert_json5(key, value)
     exchange = Exchange(args)

@@ -4,35 +4,25 @@
 //! network can reach them. With the sockets bound to the device `lo` (`SO_BINDTODEVICE`, Linux 5.7 or later without
 //! privileges), the kernel drops everything that arrives through other interfaces.
 
-use std::fs;
 use std::io;
-use std::os::fd::{BorrowedFd, RawFd};
 
-use socket2::{SockRef, Type};
+use socket2::Type;
+
+use crate::bus::sockets;
 
 /// Binds every UDP socket of this process to `lo`. Datagrams that arrived before are still read.
 ///
 /// # Errors
 /// `/proc` is not mounted, or the kernel refuses.
 pub(super) fn keep_to_loopback() -> io::Result<()> {
-    // Collected first, because the open directory is itself a descriptor.
-    let names = fs::read_dir("/proc/self/fd")?.map(|entry| Ok(entry?.file_name())).collect::<io::Result<Vec<_>>>()?;
-    for number in names.iter().filter_map(|name| name.to_str()?.parse::<RawFd>().ok()) {
-        // SAFETY: the descriptor is only queried, and bound to a device if it is a UDP socket. A descriptor closed in
-        // the meantime gives EBADF; none is closed here.
-        let descriptor = unsafe { BorrowedFd::borrow_raw(number) };
-        let socket = SockRef::from(&descriptor);
-        let is_internet = || socket.local_addr().is_ok_and(|address| address.is_ipv4() || address.is_ipv6());
-        if matches!(socket.r#type(), Ok(Type::DGRAM)) && is_internet() {
-            socket.bind_device(Some(b"lo"))?;
-        }
-    }
-    Ok(())
+    sockets::each(Type::DGRAM, |socket| socket.bind_device(Some(b"lo")))
 }
 
 #[cfg(test)]
 mod tests {
     use std::net::UdpSocket;
+
+    use socket2::SockRef;
 
     use super::*;
 

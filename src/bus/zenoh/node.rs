@@ -17,7 +17,7 @@ use super::graph::{Graph, Own};
 use super::names::{Attachment, Endpoint, Gid, Kind, NodeKey, all_tokens, dds_type, gid, topic_key};
 use super::parameters::Store;
 use super::services::Server;
-use super::{Receivers, Take, config};
+use super::{Receivers, Take, config, linger};
 use crate::bus::received::{Counters, Counts, Gaps, Received};
 use crate::bus::ros2::{NOTE, Parameters, Ros2Error, Ros2Options};
 use crate::bus::{Bus, Outgoing};
@@ -93,6 +93,7 @@ impl ZenohNode {
             check_name(part)?;
         }
         let session = ::zenoh::open(config::session(options)?).wait().map_err(failed("session"))?;
+        linger::avoid(&session).map_err(failed("links"))?;
         let key = NodeKey {
             domain: options.domain_id,
             session: session.zid().to_string(),
