@@ -159,7 +159,7 @@ pub enum Ros2Error {
     Thread(#[from] std::io::Error),
     #[error("Zenoh: {0}")]
     Zenoh(String),
-    #[error("this program was built without Zenoh: build it with --features zenoh")]
+    #[error("this program was built without Zenoh (--no-default-features)")]
     NoZenoh,
     #[error("not published on {topic}: {reason}")]
     Publish { topic: &'static str, reason: String },

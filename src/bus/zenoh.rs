@@ -4,7 +4,7 @@
 //! declares a liveliness token, and messages carry an attachment. ros2-client has a Zenoh side too, but announces all
 //! types other than its own with a placeholder hash, which matches no peer.
 //!
-//! It is compiled with the feature `zenoh`. Without it everything here returns `Ros2Error::NoZenoh`.
+//! It is compiled with the feature `zenoh`, which is on by default. Without it everything here returns `Ros2Error::NoZenoh`.
 
 #[cfg(not(feature = "zenoh"))]
 mod absent;
@@ -12,6 +12,8 @@ mod absent;
 mod config;
 #[cfg(feature = "zenoh")]
 mod graph;
+#[cfg(feature = "zenoh")]
+mod linger;
 #[cfg(feature = "zenoh")]
 mod names;
 #[cfg(feature = "zenoh")]
