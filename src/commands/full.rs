@@ -4,6 +4,7 @@ use anyhow::Context;
 use clap::Args;
 use serde::Serialize;
 
+use super::engine::EngineOptions;
 use super::format::{self, significant};
 use super::memory::{room, solver};
 use super::predict::ContactReport;
@@ -16,7 +17,8 @@ use crate::reduction::{FullSpectrum, FullVectors};
 
 const EXAMPLES: &str = "\
 Examples:
-  squealcast full model/tribometer.toml --mu 0.7 --band-hz 3000  the roots up to 3 kHz";
+  squealcast full model/tribometer.toml --mu 0.7 --band-hz 3000             the roots up to 3 kHz
+  squealcast full model/tribometer.toml --mu 0.7 --engine slepc --ranks 2  by PETSc and SLEPc";
 
 /// Find the complex eigenvalues of a full model under one set of conditions
 ///
@@ -36,6 +38,8 @@ pub struct Options {
     /// Memory that may be used [default: the memory available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
+    #[command(flatten)]
+    engine: EngineOptions,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -84,6 +88,9 @@ struct RootReport {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        let chosen = self.engine.choose()?;
+        chosen.end_at_signals()?;
+        let engine = chosen.engine();
         let mut steps = self.progress.steps(1);
         let mut full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
@@ -91,13 +98,14 @@ impl Options {
         let p = self.conditions.point(&full.name, &settings.reference, &settings.limits)?;
         let band_hz = self.band_hz.or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
         let room = room(self.memory_gib, &self.full)?;
-        full.damp_modes(room, &mut |_, _| {})?;
-        full.find_statics(room)?;
+        full.damp_modes(engine, room, &mut |_, _| {})?;
+        full.find_statics(engine, room)?;
         let mut said = |step| steps.full("full model", step);
-        let mut solver = solver(&full, room, &mut said)?;
+        let mut solver = solver(engine, &full, room, &mut said)?;
         let found = solver
             .roots(&p, std::f64::consts::TAU * band_hz, FullVectors::None, &mut said)
             .with_context(|| self.full.display().to_string())?;
+        chosen.remark().into_iter().for_each(|by| steps.say(&format!("solved by {by}")));
         drop(steps);
         if self.json {
             print(&(serde_json::to_string(&report(&full, &p, band_hz, &found))? + "\n"))?;

@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context, bail};
 
 use crate::full_model::FullModelFile;
-use crate::reduction::{FullProgress, FullSolver, GIB};
+use crate::reduction::{Engine, FullProgress, FullSolver, GIB};
 use crate::system::memory::{available_bytes, peak_bytes, resident_bytes};
 
 /// Memory that may be used in addition to what this process holds now, bytes; `None` if the system does not report it.
@@ -21,14 +21,15 @@ pub fn room(asked_gib: Option<f64>, full: &Path) -> anyhow::Result<Option<usize>
     Ok(Some(((gib * GIB) as usize).saturating_sub(resident_bytes().unwrap_or(0))))
 }
 
-/// The solver for the full model `full`.
+/// The solver for the full model `full`, by `engine`.
 ///
 /// # Errors
 /// The model cannot be analysed, or not within `room`.
 pub fn solver<'a>(
+    engine: &'a dyn Engine,
     full: &'a FullModelFile,
     room: Option<usize>,
     progress: &mut dyn FnMut(FullProgress),
 ) -> anyhow::Result<FullSolver<'a>> {
-    FullSolver::new(&full.name, &full.model, room, progress).with_context(|| full.path.display().to_string())
+    FullSolver::by(engine, &full.name, &full.model, room, progress).with_context(|| full.path.display().to_string())
 }

@@ -9,6 +9,7 @@ mod config;
 mod critical;
 mod demo;
 mod display;
+mod engine;
 mod format;
 mod foxglove;
 mod full;

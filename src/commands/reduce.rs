@@ -7,6 +7,7 @@ use std::sync::atomic::AtomicBool;
 use anyhow::{Context, bail};
 use clap::{Args, Parser};
 
+use super::engine::EngineOptions;
 use super::memory::{room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
@@ -18,9 +19,10 @@ use crate::export::{
 use crate::files::input_file;
 use crate::files::whole_file::{remove_begun, write_together};
 use crate::full_model::FullModelFile;
+use crate::full_model::slepc::end_all;
 use crate::full_model::verification::{Against, Verified, verify_against};
 use crate::physics::{ContactLaw, ResidualFlexibility};
-use crate::reduction::{FullSolver, Kept, Residual, Wanted};
+use crate::reduction::{Engine, FullSolver, Kept, Residual, Wanted};
 use crate::rig::{Certificate, Rig, RigFile, SideResidual, between_patches};
 
 /// Makes the files of the rig, with the certificate if the rig has been compared.
@@ -72,6 +74,8 @@ pub struct Options {
     /// Memory that may be used [default: the memory available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
+    #[command(flatten)]
+    engine: EngineOptions,
     /// Rig file to write
     #[arg(short, long, value_name = "RIG.toml")]
     output: PathBuf,
@@ -123,6 +127,7 @@ impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
         on_stop(|| {
             remove_begun();
+            end_all();
             note!("\nstopped: nothing was written");
             std::process::exit(130);
         })?;
@@ -135,12 +140,14 @@ impl Options {
     /// Reduces the model and writes the files of the rig.
     fn reduce(&self, mut steps: Steps) -> anyhow::Result<(Rig, Outcome)> {
         let file = self.output_file()?;
+        let chosen = self.engine.choose()?;
+        let engine = chosen.engine();
         steps.say(&format!("reading {}", self.full.display()));
         let mut full = FullModelFile::load(&self.full)?;
         steps.say(&format!("{} degrees of freedom read", full.model.dimension()));
         let room = room(self.memory_gib, &self.full)?;
-        full.damp_modes(room, &mut |_, _| {})?;
-        full.find_statics(room)?;
+        full.damp_modes(engine, room, &mut |_, _| {})?;
+        full.find_statics(engine, room)?;
         let full = full;
         if self.modes.is_none() && self.cutoff_hz.is_none() {
             if full.geometry.len() == 1 {
@@ -151,11 +158,11 @@ impl Options {
             }
             let (tolerance, range) = (self.tolerance.unwrap_or(TOLERANCE), self.range.unwrap_or_default());
             steps.say("ordering and analysing");
-            let mut solver = solver(&full, room, &mut |step| steps.full("full model", step))?;
+            let mut solver = solver(engine, &full, room, &mut |step| steps.full("full model", step))?;
             let (request, basis) = basis_of(&full, tolerance, range, &mut solver, &mut steps)?;
             let method = format!("{} vectors of the full model", basis.projected.omega_squared.len());
             let make = |known: Option<&Certificate>| basis_rig(&file, &full, &request, &basis, known);
-            return self.finish(steps, &full, Some(solver), method, &make);
+            return self.finish(engine, steps, &full, Some(solver), method, &make);
         }
         if full.geometry.is_empty() {
             bail!("{}: a system without pad and disc has no modes of its parts to keep", self.full.display());
@@ -172,8 +179,9 @@ impl Options {
         }
         let wanted = self.wanted(&full)?;
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
-        let kept =
-            full.keep_modes(&wanted, !self.no_residual, room, &mut |part, what| steps.modes(part, names[part], what))?;
+        let kept = full.keep_modes(engine, &wanted, !self.no_residual, room, &mut |part, what| {
+            steps.modes(part, names[part], what)
+        })?;
         for (name, Kept { modes, .. }) in names.iter().zip(&kept) {
             let worst = modes.residuals.iter().copied().fold(0.0, f64::max);
             steps.say(&format!(
@@ -186,6 +194,7 @@ impl Options {
         let residual = if self.compact { between_pairs(&file, &full, &mut sides)? } else { None };
         let (kept, mut remarks) = (remarks(&names, &kept), source_remarks(&full));
         remarks.extend(kept.iter().cloned());
+        remarks.extend(chosen.remark().map(|by| format!("modes and residual flexibility by {by}")));
         let make = |known: Option<&Certificate>| {
             let (patches, mut common) = (full.contact_patches.as_ref(), full.common_tables.clone());
             common.extend(state.iter().map(|state| ("contact_state".to_owned(), state.table.clone().into())));
@@ -193,7 +202,7 @@ impl Options {
             files.extend(state.iter().flat_map(|state| state.files.clone()));
             Ok(files)
         };
-        self.finish(steps, &full, None, kept.join("; "), &make)
+        self.finish(engine, steps, &full, None, kept.join("; "), &make)
     }
 
     /// The name of the rig file; an error if it cannot be written or is the input.
@@ -212,11 +221,12 @@ impl Options {
     }
 
     /// Compares the reduced rig with the full model and writes its files, including the errors found.
-    fn finish(
+    fn finish<'a>(
         &self,
+        engine: &'a dyn Engine,
         mut steps: Steps,
-        full: &FullModelFile,
-        solver: Option<FullSolver<'_>>,
+        full: &'a FullModelFile,
+        solver: Option<FullSolver<'a>>,
         method: String,
         files_of: &FilesOf<'_>,
     ) -> anyhow::Result<(Rig, Outcome)> {
@@ -233,9 +243,9 @@ impl Options {
             let compare = || -> anyhow::Result<Verified> {
                 let mut solver = match solver {
                     Some(solver) => solver,
-                    None => {
-                        self::solver(full, room(self.memory_gib, &self.full)?, &mut |step| report("analysis", step))?
-                    }
+                    None => self::solver(engine, full, room(self.memory_gib, &self.full)?, &mut |step| {
+                        report("analysis", step)
+                    })?,
                 };
                 verify_against(&rig, full, &mut solver, &against, &mut report).map_err(anyhow::Error::from)
             };

@@ -12,7 +12,7 @@ use crate::export::{Besides, write_full_model};
 use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::files::whole_file::remove_begun;
 use crate::full_model::FullModelFile;
-use crate::reduction::Wanted;
+use crate::reduction::{OwnEngine, Wanted};
 use crate::study::reproduce::{Item, MODES, PartModes, Step, Study, index, nine_dof};
 
 const EXAMPLES: &str = "\
@@ -70,15 +70,21 @@ impl Options {
         let toml = folder.join("tribometer.toml");
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
         let most = Wanted::Lowest(MODES.into_iter().max().unwrap_or(0));
-        let kept =
-            full.keep_modes(&vec![most; names.len()], true, room(self.memory_gib, &toml)?, &mut |part, what| {
+        let kept = full.keep_modes(
+            &OwnEngine,
+            &vec![most; names.len()],
+            true,
+            room(self.memory_gib, &toml)?,
+            &mut |part, what| {
                 steps.modes(part, names[part], what);
-            })?;
+            },
+        )?;
         // The modes on all coordinates of the parts are no longer needed.
         let modes = PartModes::new(&full, &kept)?;
         drop(kept);
         steps.say("ordering and analysing");
-        let mut solver = solver(&full, room(self.memory_gib, &toml)?, &mut |step| steps.full("full model", step))?;
+        let mut solver =
+            solver(&OwnEngine, &full, room(self.memory_gib, &toml)?, &mut |step| steps.full("full model", step))?;
         let (_, basis) = basis_of(&full, TOLERANCE, Ranges::default(), &mut solver, &mut steps)?;
         let mut report = |event: Step<'_>| match event {
             Step::Said(text) => steps.say(text),

@@ -11,7 +11,7 @@ use clap::Args;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::physics::OperatingPoint;
-use crate::reduction::{FullProgress, GIB, ParametricStep, Progress};
+use crate::reduction::{CountedBy, FullProgress, GIB, ParametricStep, Progress};
 use crate::system::clock::monotonic_ns;
 use crate::system::memory::resident_bytes;
 use crate::text::terminal::printable;
@@ -160,10 +160,16 @@ impl Steps {
             Progress::Iterated { converged, wanted, .. } => {
                 self.at(part, &format!("{name}: modes"), converged.min(wanted), wanted);
             }
-            Progress::Counted { modes, below } => {
+            Progress::Counted { modes, below, by } => {
                 self.done(part);
                 let below_hz = below.max(0.0).sqrt() / TAU;
-                self.say(&format!("{name}: {modes} modes below {below_hz:.1} Hz, counted by the inertia of K - shift M"));
+                let by = match by {
+                    CountedBy::Us => "",
+                    CountedBy::Engine => " of the engine, unchecked: no memory for a factor of our own",
+                };
+                self.say(&format!(
+                    "{name}: {modes} modes below {below_hz:.1} Hz, counted by the inertia of K - shift M{by}"
+                ));
             }
             Progress::Loaded { solved, loads } => self.at(part, &format!("{name}: residual"), solved, loads),
         }

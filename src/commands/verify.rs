@@ -3,6 +3,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use super::engine::EngineOptions;
 use super::memory::{room, solver};
 use super::steps::ProgressOptions;
 use super::{Outcome, RigName, positive, print};
@@ -51,6 +52,8 @@ pub struct Options {
     /// Memory that may be used [default: the memory available on the machine]
     #[arg(long, value_name = "GIB", value_parser = positive)]
     memory_gib: Option<f64>,
+    #[command(flatten)]
+    engine: EngineOptions,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -60,6 +63,9 @@ pub struct Options {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        let chosen = self.engine.choose()?;
+        chosen.end_at_signals()?;
+        let engine = chosen.engine();
         let mut steps = self.progress.steps(1);
         let rig = Rig::load(&self.rig)?;
         let mut full = FullModelFile::load(&self.against)?;
@@ -72,10 +78,11 @@ impl Options {
         let against =
             Against { points: self.points, seed: self.seed, band_hz: self.band_hz, windows: !self.no_windows };
         let room = room(self.memory_gib, &self.against)?;
-        full.damp_modes(room, &mut |_, _| {})?;
-        full.find_statics(room)?;
-        let mut solver = solver(&full, room, &mut |step| steps.full("full model", step))?;
+        full.damp_modes(engine, room, &mut |_, _| {})?;
+        full.find_statics(engine, room)?;
+        let mut solver = solver(engine, &full, room, &mut |step| steps.full("full model", step))?;
         let found = verify_against(&rig, &full, &mut solver, &against, &mut |what, step| steps.full(what, step))?;
+        chosen.remark().into_iter().for_each(|by| steps.say(&format!("solved by {by}")));
         drop(steps);
         print(&if self.json { serde_json::to_string(&found)? + "\n" } else { text(&rig, &full, &found) })?;
         let certificate = &found.certificate;

@@ -9,6 +9,7 @@ mod entries;
 mod files;
 mod part;
 mod raw;
+pub mod slepc;
 mod state;
 mod tables;
 pub mod verification;
@@ -19,8 +20,8 @@ use std::path::{Path, PathBuf};
 use crate::files::input_file;
 use crate::physics::{ContactLaw, ModelError};
 use crate::reduction::{
-    FullContact, FullModel, FullPart, Kept, PartTurning, Progress, ReductionError, SparseMatrix, SparseRow, SparseTerm,
-    Substructure, Wanted, keep_modes, normal_modes,
+    Analysed, Engine, FullContact, FullModel, FullPart, Kept, PartTurning, Progress, ReductionError, SparseMatrix,
+    SparseRow, SparseTerm, Substructure, Wanted, keep_modes,
 };
 use crate::rig::raw::{Common, RawPatch, RawSystem, RawTerm};
 use crate::rig::settings::Settings;
@@ -167,6 +168,7 @@ impl FullModelFile {
     /// [`RigError::Reduction`].
     pub fn damp_modes(
         &mut self,
+        engine: &dyn Engine,
         memory_limit_bytes: Option<usize>,
         progress: &mut dyn FnMut(usize, Progress),
     ) -> Result<(), RigError> {
@@ -179,7 +181,8 @@ impl FullModelFile {
             };
             let FullPart { name, mass, stiffness } = &self.model.parts[part];
             let report = &mut |step| progress(part, step);
-            let modes = normal_modes(name, mass, stiffness, wanted, memory_limit_bytes, report)
+            let modes = Analysed::new(engine, name, mass, stiffness)
+                .and_then(|analysed| analysed.modes(wanted, memory_limit_bytes, report))
                 .map_err(|source| RigError::Reduction { file: self.path.display().to_string(), source })?;
             let ratios = match &self.geometry[part].damping_ratio {
                 DampedModes::Lowest(ratios) => ratios.clone(),
@@ -190,7 +193,7 @@ impl FullModelFile {
         Ok(())
     }
 
-    /// Computes the lowest modes of pad and disc: `wanted` has an entry for each. If `with_residual`, the residual
+    /// Computes the lowest modes of pad and disc by `engine`: `wanted` has an entry for each. If `with_residual`, the residual
     /// flexibility and inertia of the truncated modes are computed too. `progress` receives the index of the part and
     /// its progress.
     ///
@@ -198,6 +201,7 @@ impl FullModelFile {
     /// [`RigError::Reduction`] with the errors of [`keep_modes`], naming the file of the offending matrix.
     pub fn keep_modes(
         &self,
+        engine: &dyn Engine,
         wanted: &[Wanted],
         with_residual: bool,
         memory_limit_bytes: Option<usize>,
@@ -213,7 +217,7 @@ impl FullModelFile {
                 wanted,
             })
             .collect();
-        keep_modes(&parts, with_residual, memory_limit_bytes, progress).map_err(|source| {
+        keep_modes(engine, &parts, with_residual, memory_limit_bytes, progress).map_err(|source| {
             let file = match &source {
                 ReductionError::Indefinite { what, .. }
                 | ReductionError::NegativeStiffness { what, .. }

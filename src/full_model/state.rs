@@ -8,7 +8,7 @@ use super::files::Files;
 use super::part::Part;
 use super::{FullModelFile, tables};
 use crate::files::input_file;
-use crate::reduction::{ReductionError, SparseRow};
+use crate::reduction::{Engine, ReductionError, SparseRow};
 use crate::rig::contact_state::{self, StateTable};
 use crate::rig::lines::{self, Lines, found};
 use crate::rig::raw::RawContactState;
@@ -200,11 +200,11 @@ impl FullModelFile {
     /// # Errors
     /// [`RigError::Reduction`], [`RigError::ContactState`], [`RigError::Model`]; [`RigError::Range`] if the load does not
     /// press the pad on the disc.
-    pub fn find_statics(&mut self, memory_limit_bytes: Option<usize>) -> Result<(), RigError> {
+    pub fn find_statics(&mut self, engine: &dyn Engine, memory_limit_bytes: Option<usize>) -> Result<(), RigError> {
         let (Some(state), Some(contact)) = (&self.state, &self.model.contact) else { return Ok(()) };
         let file = || self.path.display().to_string();
         let failed = |source: ReductionError| RigError::Reduction { file: file(), source };
-        let response = self.model.static_response(&state.load, memory_limit_bytes).map_err(failed)?;
+        let response = self.model.static_response(engine, &state.load, memory_limit_bytes).map_err(failed)?;
         let Some(response) = response else { return Ok(()) };
         let statics = state.table.statics_of(response, &contact.stiffness_n_per_m, &self.settings)?;
         state.table.check_load(state.key, &statics, &self.settings)?;

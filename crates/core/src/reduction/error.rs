@@ -226,6 +226,14 @@ pub enum ReductionError {
     /// There is no state of steady sliding.
     #[error(transparent)]
     State(Box<ModelError>),
+    /// An engine outside this process failed, or gave a wrong result.
+    #[error("{what}: {reason}")]
+    Engine {
+        /// Name of the part, model or matrix.
+        what: String,
+        /// Why, and what to do.
+        reason: String,
+    },
     /// A factorisation or a small dense problem failed.
     #[error("{what}: {reason}")]
     Factorisation {

@@ -26,10 +26,12 @@ use faer::{Mat, c64};
 use super::ReductionError;
 use super::contact_solver::{PartBytes, Parts, Shifted};
 use super::coverage::{Found, agree, assemble, first_gap};
+use super::engine::Engine;
 use super::full_model::FullModel;
 use super::full_problem::{Problem, WANTED, unit};
 use super::full_root::{FullProgress, FullRoot, FullSpectrum, FullVectors};
 use super::krylov_schur::{BLOCK, capacity, most_found};
+use super::own_engine::OwnEngine;
 use crate::physics::{self, OperatingPoint, Vectors};
 
 /// Largest residual of a linear solve at a shift, relative to `|Q| |x| + |b|`.
@@ -50,11 +52,12 @@ const CHECKING: usize = 64;
 const DENSE_BELOW: usize = 240;
 
 /// Solver for one full model at many operating points. The model is ordered and analysed once. Factors do not depend on
-/// the operating point and are kept between solves.
+/// the operating point and are kept between solves, except those of a foreign engine.
 pub struct FullSolver<'a> {
+    engine: &'a dyn Engine,
     what: String,
     model: &'a FullModel,
-    /// Parts joined by contact only; `None` for other models, which need a sparse LU.
+    /// Parts joined by contact only; `None` for other models and for foreign engines, which need a sparse LU.
     parts: Option<Parts<'a>>,
     kept: Vec<Shifted>,
     memory_limit_bytes: Option<usize>,
@@ -65,25 +68,39 @@ pub struct FullSolver<'a> {
 }
 
 impl<'a> FullSolver<'a> {
-    /// Orders and analyses `model`.
-    ///
-    /// `what` names the model in errors. `memory_limit_bytes` limits the memory taken in addition to what is already
-    /// held; the estimated need is compared with it before the work starts.
+    /// Orders and analyses `model`, to be solved in this process.
     ///
     /// # Errors
-    /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `Memory`, `Factorisation`.
+    /// As [`Self::by`].
     pub fn new(
         what: &str,
         model: &'a FullModel,
         memory_limit_bytes: Option<usize>,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Self, ReductionError> {
+        Self::by(&OwnEngine, what, model, memory_limit_bytes, progress)
+    }
+
+    /// Prepares `model` to be solved by `engine`.
+    ///
+    /// `what` names the model in errors. `memory_limit_bytes` limits the memory taken in addition to what is already
+    /// held; the estimated need is compared with it before the work starts.
+    ///
+    /// # Errors
+    /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `Memory`, `Factorisation`.
+    pub fn by(
+        engine: &'a dyn Engine,
+        what: &str,
+        model: &'a FullModel,
+        memory_limit_bytes: Option<usize>,
+        progress: &mut dyn FnMut(FullProgress),
+    ) -> Result<Self, ReductionError> {
         let has_terms = !(model.stiffness.is_empty() && model.damping.is_empty() && model.modal_damping.is_empty());
-        let by_parts = !has_terms && model.contact.is_some();
+        let by_parts = !has_terms && model.contact.is_some() && !engine.foreign();
         let parts = if by_parts { Some(Parts::new(model)?) } else { None };
         let what = what.to_owned();
         let mut solver =
-            Self { what, model, parts, kept: vec![], memory_limit_bytes, elsewhere_bytes: 0, most_kept: 1 };
+            Self { engine, what, model, parts, kept: vec![], memory_limit_bytes, elsewhere_bytes: 0, most_kept: 1 };
         progress(FullProgress::Analysed { bytes: solver.bytes(FullVectors::None, 0) });
         solver.make_room(FullVectors::None, 0, 0, 0)?;
         Ok(solver)
@@ -108,6 +125,7 @@ impl<'a> FullSolver<'a> {
             // The fill of a sparse LU is not known in advance: 400 entries a column are assumed, at most a tenth of a
             // full matrix.
             // For each damped mode, a real vector and two complex ones are held as well.
+            None if self.engine.foreign() => PartBytes { held: 0, factors: 0, factoring: 0 },
             None => {
                 let modes: usize = self.model.modal_damping.iter().map(|damping| damping.rates_per_s.len()).sum();
                 let factors = size_of::<c64>() * ((n * n / 10).min(400 * n) + 5 * n * modes / 2);
@@ -127,7 +145,7 @@ impl<'a> FullSolver<'a> {
     fn vector_bytes(&self, vectors: FullVectors, roots: usize) -> usize {
         let (n, complex) = (self.model.dimension(), size_of::<c64>());
         // Krylov vectors are real of length `n`, or complex of length `2n`.
-        let undamped = self.parts.is_some() && self.model.is_undamped();
+        let undamped = self.is_real();
         let (rows, each) = if undamped { (n, size_of::<f64>() * n) } else { (2 * n, complex * 2 * n) };
         let both = vectors == FullVectors::Both;
         let right = most_found(WANTED);
@@ -202,6 +220,17 @@ impl<'a> FullSolver<'a> {
         self.kept.iter().find(|shifted| shifted.square == -sigma)
     }
 
+    /// Whether roots are found in `λ²`, with real vectors. Other models than parts joined by contact are not examined for
+    /// damping in this process.
+    fn is_real(&self) -> bool {
+        (self.parts.is_some() || self.engine.foreign()) && self.model.is_undamped()
+    }
+
+    /// The engine that solves.
+    pub(super) fn engine(&self) -> &'a dyn Engine {
+        self.engine
+    }
+
     /// Whether the model consists of parts joined by contact only, without further terms.
     pub(super) fn has_parts(&self) -> bool {
         self.parts.is_some()
@@ -240,7 +269,8 @@ impl<'a> FullSolver<'a> {
             return self.dense(p, band_rad_s, vectors);
         }
         let (here, by_parts) = (self.model.at(p)?, self.parts.is_some());
-        let mut problem = Problem::new(&self.what, self.model, here.clone(), vectors, by_parts, GROWTH * band_rad_s)?;
+        let mut problem =
+            Problem::new(&self.what, self.model, here.clone(), vectors, by_parts, self.is_real(), GROWTH * band_rad_s)?;
         let mut found: Vec<Found> = vec![];
         while let Some(gap) = first_gap(&found, band_rad_s) {
             #[cfg(not(test))]
@@ -257,7 +287,7 @@ impl<'a> FullSolver<'a> {
                     let index = Self::factored(&mut self.kept, parts, &problem, middle, self.most_kept, progress)?;
                     problem.around_parts(&self.kept[index], gap, progress)?
                 }
-                None => problem.around_system(middle, gap, progress)?,
+                None => problem.around_system(self.engine, middle, gap, progress)?,
             };
             progress(FullProgress::Covered { disc: new.disc, roots: new.roots.len() });
             found.push(new);

@@ -1,19 +1,19 @@
 //! The eigenvalue problem of a full model at one operating point: products with its matrices, the shift-inverted
 //! operator for Krylov-Schur, and residuals of the roots found around a shift.
 
-use faer::linalg::solvers::Solve;
-use faer::sparse::linalg::solvers::Lu;
+use faer::linalg::solvers::Solve as _;
 use faer::sparse::{SparseColMat, Triplet};
 use faer::{Mat, MatRef, c64};
 
 use super::contact_solver::{Coupled, Shifted};
 use super::coverage::{Found, SAME};
+use super::engine::Engine;
 use super::full_model::{FullModel, LowRank};
 use super::full_root::{CoveredDisc, FullProgress, FullRoot, FullVectors};
 use super::krylov::{Number, random};
 use super::krylov_schur::{Iteration, Largest};
 use super::sparse::{entries, one_norm, times, times_transposed};
-use super::{ReductionError, SparseMatrix};
+use super::{ReductionError, SparseMatrix, weighted_sum};
 use crate::physics::Situation;
 
 /// Largest residual of an eigenpair of the inverse, relative to its `θ`.
@@ -32,6 +32,9 @@ const FLOATING: f64 = 1e-10;
 /// Number of columns whose residuals are computed at a time.
 const TOGETHER: usize = 8;
 const ZERO: c64 = c64::new(0.0, 0.0);
+
+/// `Q(s)⁻¹ b`, or `Q(s)⁻ᵀ b` if the second argument is true.
+type Solve<'a> = dyn Fn(MatRef<'_, c64>, bool) -> Result<Mat<c64>, ReductionError> + 'a;
 
 /// A full model at one operating point.
 pub(super) struct Problem<'a> {
@@ -56,6 +59,7 @@ impl<'a> Problem<'a> {
         here: Situation,
         vectors: FullVectors,
         by_parts: bool,
+        undamped: bool,
         growth_per_s: f64,
     ) -> Result<Self, ReductionError> {
         if by_parts {
@@ -87,17 +91,7 @@ impl<'a> Problem<'a> {
         let of_modes = (0..modes.nrows()).map(column).fold(0.0, f64::max);
         let norms = [one_norm(&matrices[0]), one_norm(&matrices[1]) + of_modes, one_norm(&matrices[2])];
         let low_rank = LowRank::default();
-        Ok(Self {
-            what,
-            model,
-            here,
-            vectors,
-            undamped: false,
-            low_rank,
-            matrices: Some(matrices),
-            norms,
-            growth_per_s,
-        })
+        Ok(Self { what, model, here, vectors, undamped, low_rank, matrices: Some(matrices), norms, growth_per_s })
     }
 
     /// `(a M + b C + c K) X`, or `(a M + b C + c K)ᵀ X` if `transposed`.
@@ -182,39 +176,54 @@ impl<'a> Problem<'a> {
             let s = c64::new(0.0, omega);
             // Solvers with `Q(s)` and with its transpose, each set up once.
             let (forward, backward) = (self.coupled(shifted, s, false), self.coupled(shifted, s, true));
-            let solve =
-                |b: MatRef<'_, c64>, transposed: bool| if transposed { backward.solve(b) } else { forward.solve(b) };
+            let solve = |b: MatRef<'_, c64>, transposed: bool| {
+                Ok(if transposed { backward.solve(b) } else { forward.solve(b) })
+            };
             return self.linearised(omega, gap, &solve, progress);
         }
         let coupled = [false, true]
             .map(|transposed| shifted.couple::<f64>(&self.low_rank, self.low_rank.stiffness.clone(), transposed));
         let inverse = |x: Mat<f64>, transposed: bool| {
-            coupled[usize::from(transposed)].solve(self.model.mass_times(x.as_ref()).as_ref())
+            Ok(coupled[usize::from(transposed)].solve(self.model.mass_times(x.as_ref()).as_ref()))
         };
-        // `±λ` share a vector. Oscillating roots are listed once, static ones with both signs.
-        let lambdas_of = |theta: c64| {
-            let kappa = 1.0 / theta + square;
-            if kappa.norm() < FLOATING * square {
-                return vec![ZERO];
-            }
-            let root = (-kappa).sqrt();
-            let root = if root.im < 0.0 { -root } else { root };
-            if root.im > REAL * root.norm() {
-                vec![root]
-            } else {
-                vec![c64::new(root.re, 0.0), c64::new(-root.re, 0.0)]
-            }
+        self.around(omega, gap, &inverse, &|theta| undamped_roots(theta, square), progress)
+    }
+
+    /// The roots nearest to `iω` of an undamped model, for assembled matrices.
+    fn around_undamped(
+        &self,
+        engine: &dyn Engine,
+        omega: f64,
+        gap: [f64; 2],
+        progress: &mut dyn FnMut(FullProgress),
+    ) -> Result<Found, ReductionError> {
+        let Some([mass, _, stiffness]) = &self.matrices else {
+            unreachable!("a system has its matrices");
         };
-        self.around(omega, gap, &inverse, &lambdas_of, progress)
+        let square = omega * omega;
+        let sum = weighted_sum(mass.nrows(), &[(1.0, stiffness), (-square, mass)])?;
+        let factor = engine.real(self.what, &sum)?;
+        drop(sum);
+        progress(FullProgress::Factored { shift_rad_s: omega });
+        let inverse = |x: Mat<f64>, transposed: bool| {
+            let mut b = times(mass, x.as_ref());
+            factor.solve(&mut b, transposed)?;
+            Ok(b)
+        };
+        self.around(omega, gap, &inverse, &|theta| undamped_roots(theta, square), progress)
     }
 
     /// The roots nearest to a shift, for assembled matrices.
     pub fn around_system(
         &mut self,
+        engine: &dyn Engine,
         omega: f64,
         gap: [f64; 2],
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
+        if self.undamped {
+            return self.around_undamped(engine, omega, gap, progress);
+        }
         let Some([mass, damping, stiffness]) = &self.matrices else {
             unreachable!("a system has its matrices");
         };
@@ -225,17 +234,14 @@ impl<'a> Problem<'a> {
             .flat_map(|(weight, matrix)| entries(matrix).map(move |(i, j, value)| Triplet::new(i, j, weight * value)))
             .collect();
         let sum = SparseColMat::try_new_from_triplets(n, n, &triplets).map_err(|error| failed(format!("{error:?}")))?;
-        let factor: Lu<usize, c64> =
-            sum.sp_lu().map_err(|error| failed(format!("the sparse factor at {s} failed: {error:?}")))?;
+        drop(triplets);
+        let factor = engine.complex(self.what, &sum)?;
+        drop(sum);
         progress(FullProgress::Factored { shift_rad_s: omega });
         let sparse = |b: MatRef<'_, c64>, transposed: bool| {
             let mut x = b.to_owned();
-            if transposed {
-                factor.solve_transpose_in_place(x.as_mut());
-            } else {
-                factor.solve_in_place(x.as_mut());
-            }
-            x
+            factor.solve(&mut x, transposed)?;
+            Ok::<_, ReductionError>(x)
         };
         if self.model.modal_damping.is_empty() {
             return self.linearised(omega, gap, &sparse, progress);
@@ -245,17 +251,18 @@ impl<'a> Problem<'a> {
         let modes = Mat::from_fn(n, modes.ncols(), |i, j| c64::new(modes[(i, j)], 0.0));
         let weighted =
             |along: Mat<c64>| Mat::from_fn(along.nrows(), along.ncols(), |i, j| s * rates[i] * along[(i, j)]);
-        let corrections = [false, true].map(|transposed| {
-            let responses = sparse(modes.as_ref(), transposed);
+        let correction = |transposed: bool| {
+            let responses = sparse(modes.as_ref(), transposed)?;
             let coupled = weighted(modes.transpose() * &responses) + Mat::<c64>::identity(rates.len(), rates.len());
-            (responses, coupled.partial_piv_lu())
-        });
+            Ok::<_, ReductionError>((responses, coupled.partial_piv_lu()))
+        };
+        let corrections = [correction(false)?, correction(true)?];
         let solve = |b: MatRef<'_, c64>, transposed: bool| {
-            let x = sparse(b, transposed);
+            let x = sparse(b, transposed)?;
             let (responses, coupled) = &corrections[usize::from(transposed)];
             let mut along = weighted(modes.transpose() * &x);
             coupled.solve_in_place(along.as_mut());
-            x - responses * along
+            Ok(x - responses * along)
         };
         self.linearised(omega, gap, &solve, progress)
     }
@@ -266,7 +273,7 @@ impl<'a> Problem<'a> {
         &self,
         omega: f64,
         gap: [f64; 2],
-        solve: &dyn Fn(MatRef<'_, c64>, bool) -> Mat<c64>,
+        solve: &Solve<'_>,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
         let n = self.model.dimension();
@@ -276,10 +283,10 @@ impl<'a> Problem<'a> {
             let (x, y) = (v.subrows(0, n), v.subrows(n, n));
             let b = self.times([c64::new(-omega, 0.0), ZERO, ZERO], y, transposed)
                 + self.times([-s, -one, ZERO], x, transposed);
-            let next = solve(b.as_ref(), transposed);
-            Mat::from_fn(2 * n, v.ncols(), |i, j| {
+            let next = solve(b.as_ref(), transposed)?;
+            Ok(Mat::from_fn(2 * n, v.ncols(), |i, j| {
                 if i < n { next[(i, j)] } else { (x[(i - n, j)] + s * next[(i - n, j)]) / omega }
-            })
+            }))
         };
         let lambdas_of = |theta: c64| {
             let lambda = s + 1.0 / theta;
@@ -295,7 +302,7 @@ impl<'a> Problem<'a> {
         &self,
         omega: f64,
         gap: [f64; 2],
-        inverse: &dyn Fn(Mat<T>, bool) -> Mat<T>,
+        inverse: &dyn Fn(Mat<T>, bool) -> Result<Mat<T>, ReductionError>,
         lambdas_of: &dyn Fn(c64) -> Vec<c64>,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
@@ -411,6 +418,18 @@ impl<'a> Problem<'a> {
             }
         }
     }
+}
+
+/// The roots of an undamped model for an eigenvalue `θ` of `(K - ω² M)⁻¹ M`, with `ω² = square`. `±λ` share a vector:
+/// oscillating roots are listed once, static ones with both signs.
+fn undamped_roots(theta: c64, square: f64) -> Vec<c64> {
+    let kappa = 1.0 / theta + square;
+    if kappa.norm() < FLOATING * square {
+        return vec![ZERO];
+    }
+    let root = (-kappa).sqrt();
+    let root = if root.im < 0.0 { -root } else { root };
+    if root.im > REAL * root.norm() { vec![root] } else { vec![c64::new(root.re, 0.0), c64::new(-root.re, 0.0)] }
 }
 
 /// Scales every column to 2-norm 1.

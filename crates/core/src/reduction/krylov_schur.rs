@@ -63,21 +63,21 @@ impl Iteration<'_> {
     /// converged pairs.
     ///
     /// # Errors
-    /// [`ReductionError`]: `NotConverged`, `Factorisation`.
+    /// [`ReductionError`]: `NotConverged`, `Factorisation`; those of `apply`.
     pub(super) fn run<T: Number>(
         &self,
-        apply: &dyn Fn(Mat<T>) -> Mat<T>,
+        apply: &dyn Fn(Mat<T>) -> Result<Mat<T>, ReductionError>,
         enough: &dyn Fn(&[c64]) -> bool,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Largest, ReductionError> {
         let capacity = capacity(self.dimension, self.count);
         let mut space = Space::<T>::new(self.dimension, capacity);
-        let start = apply(random::<T>(self.dimension, BLOCK, self.seed));
+        let start = apply(random::<T>(self.dimension, BLOCK, self.seed))?;
         space.append(start, None, self.seed);
         let mut next_check = (3 * self.count / 2).min(capacity);
         let (mut restarts, mut built) = (0, BLOCK);
         loop {
-            let mut w = apply(space.basis.last_block(BLOCK));
+            let mut w = apply(space.basis.last_block(BLOCK))?;
             let before = w.norm_l2();
             space.project_out(&mut w);
             let whole = space.basis.size() + BLOCK > self.dimension || w.norm_l2() < 1e-14 * before;
@@ -255,11 +255,11 @@ mod tests {
             c64::new(0.8 * size, if (block / 2).is_multiple_of(3) { 0.0 } else { 0.5 * size })
         };
         let apply = |x: Mat<f64>| {
-            Mat::from_fn(2 * blocks, x.ncols(), |i, j| {
+            Ok(Mat::from_fn(2 * blocks, x.ncols(), |i, j| {
                 let (block, c) = (i / 2, value(i / 2));
                 let (p, q) = (x[(2 * block, j)], x[(2 * block + 1, j)]);
                 if i % 2 == 0 { c.re * p + 2.0 * c.im * q } else { c.re * q - 0.5 * c.im * p }
-            })
+            }))
         };
         let iteration = Iteration { what: "test", dimension: 2 * blocks, count: 16, residual_limit: 1e-12, seed: 0 };
         let mut most = 0;
@@ -281,7 +281,7 @@ mod tests {
         for (k, theta) in found.theta.iter().enumerate() {
             let x = found.vectors.subcols(k, 1);
             let part = |im: bool| Mat::from_fn(2 * blocks, 1, |i, _| if im { x[(i, 0)].im } else { x[(i, 0)].re });
-            let (re, im) = (apply(part(false)), apply(part(true)));
+            let (re, im) = (apply(part(false)).unwrap(), apply(part(true)).unwrap());
             let residual = Mat::from_fn(2 * blocks, 1, |i, _| c64::new(re[(i, 0)], im[(i, 0)]) - theta * x[(i, 0)]);
             assert!(residual.norm_l2() < 1e-11);
         }

@@ -14,6 +14,8 @@
 //! flexibility and inertia, the quasi-static response of the truncated modes at the contact. [`keep_modes`] does both
 //! for all parts of a model.
 //!
+//! Factors and modes come from an [`Engine`]: [`OwnEngine`], or one that runs elsewhere, whose results are checked.
+//!
 //! A [`FullModel`] is the input to all of this. [`FullSolver`] finds complex eigenvalues of the full model itself, as a
 //! reference for comparisons and as samples for a [`parametric_basis`].
 //!
@@ -22,10 +24,12 @@
 //! Pure: no clock, file, bus, log or serialisation.
 
 mod balance;
+mod checked;
 mod compare;
 mod contact_solver;
 mod coverage;
 mod dense;
+mod engine;
 mod error;
 mod full_model;
 mod full_order;
@@ -39,6 +43,7 @@ mod matching;
 mod normal_modes;
 mod operating_box;
 mod ordering;
+mod own_engine;
 mod parametric;
 mod pencil;
 mod project;
@@ -56,6 +61,7 @@ pub use compare::{
     CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
 };
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
+pub use engine::{ComplexSparseMatrix, CountedBy, Eigenpairs, Engine, Factor, Lowest, Progress};
 pub use error::{GIB, ReductionError};
 pub use full_model::{
     FullContact, FullModel, FullPart, FullSteady, ModalDamping, PartMatrices, PartTurning, Projected, SparseRow,
@@ -64,9 +70,11 @@ pub use full_model::{
 pub use full_order::FullSolver;
 pub use full_root::{CoveredDisc, FullProgress, FullRoot, FullSpectrum, FullVectors};
 pub use matching::{Counted, RootMatch, match_roots};
-pub use normal_modes::{Analysed, Progress, SparseModes, Wanted, lowest_modes, normal_modes};
+pub use normal_modes::{Analysed, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use operating_box::OperatingBox;
+pub use own_engine::OwnEngine;
 pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
+pub use pencil::Pencil;
 use project::project_dense;
 pub use project::project_sparse;
 pub use residual::{InertiaBy, Residual};

@@ -8,23 +8,19 @@
 use faer::Mat;
 
 use super::dense::{fix_signs, symmetric_eigen};
-use super::lanczos::{Iteration, capacity};
-use super::pencil::{Llt, Pencil};
-use super::sparse::{entries, one_norm, times};
+use super::engine::{CountedBy, Eigenpairs, Engine, GAP, Lowest, Progress, gap_after};
+use super::lanczos::capacity;
+use super::own_engine::{OwnEngine, TOGETHER};
+use super::pencil::Pencil;
+use super::sparse::{one_norm, times};
 use super::{ReductionError, SparseMatrix, whiten};
 
-/// Largest residual of an eigenpair of `C`, relative to its `θ`.
-const RESIDUAL_LIMIT: f64 = 1e-12;
 /// Largest scaled residual `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of a mode, with 1-norms of the matrices.
 const BACKWARD_LIMIT: f64 = 1e-12;
-/// Relative gap of two neighbouring `ω²` that is wide enough for an inertia (Sturm) count between them.
-const GAP: f64 = 1e-7;
 /// Below this many degrees of freedom a dense solve is at least as fast.
 const DENSE_BELOW: usize = 400;
 /// The first shift `s` to try, relative to `tr K / tr M`.
 const FIRST_SHIFT: f64 = 1e-8;
-/// Upper limit of the shifts to try, relative to `tr K / tr M`.
-const LARGEST_SHIFT: f64 = 1e5;
 /// Largest ratio of the wanted `θ`. Above it the shift is increased, because small `θ` would lose digits to the
 /// rounding of the largest.
 const WIDEST_SPREAD: f64 = 1e6;
@@ -42,49 +38,6 @@ pub enum Wanted {
         modes: usize,
         /// All of them are below this angular frequency, rad/s.
         below_rad_s: f64,
-    },
-}
-
-/// Progress of a computation of modes.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Progress {
-    /// The system is being ordered and analysed.
-    Analysing,
-    /// The system is ordered and symbolically analysed. `factor_entries` is the number of entries of a factor; `bytes`
-    /// is the memory needed in addition to what is already held.
-    Analysed {
-        /// Number of entries of a factor.
-        factor_entries: usize,
-        /// Estimated memory, bytes.
-        bytes: usize,
-    },
-    /// `K + s M` is factorised with the shift `s`, rad²/s².
-    Factored {
-        /// The shift `σ` of `K - σ M`, rad²/s².
-        shift: f64,
-    },
-    /// Lanczos vectors built so far, and how many of the wanted modes have converged.
-    Iterated {
-        /// Number of vectors built.
-        vectors: usize,
-        /// Number of converged modes.
-        converged: usize,
-        /// Number of modes wanted; 0 if not known yet.
-        wanted: usize,
-    },
-    /// The inertia of `K - σ M` gave the number of modes below `ω² = σ`, rad²/s².
-    Counted {
-        /// Number of modes.
-        modes: usize,
-        /// Below this `ω²`, rad²/s².
-        below: f64,
-    },
-    /// Number of unit loads at the contact whose static response has been computed, of `loads`.
-    Loaded {
-        /// Number of loads solved.
-        solved: usize,
-        /// Number of loads in all.
-        loads: usize,
     },
 }
 
@@ -131,22 +84,28 @@ pub fn normal_modes(
     memory_limit_bytes: Option<usize>,
     progress: &mut dyn FnMut(Progress),
 ) -> Result<SparseModes, ReductionError> {
-    Analysed::new(what, mass, stiffness)?.modes(wanted, memory_limit_bytes, progress)
+    Analysed::new(&OwnEngine, what, mass, stiffness)?.modes(wanted, memory_limit_bytes, progress)
 }
 
 /// A sparse symmetric system `K - σ M`, checked, ordered and symbolically analysed: ready to compute its modes and
 /// residuals.
 pub struct Analysed<'a> {
     pub(super) pencil: Pencil<'a>,
+    pub(super) engine: &'a dyn Engine,
 }
 
 impl<'a> Analysed<'a> {
-    /// Analyses a system; see [`normal_modes`].
+    /// Analyses a system that `engine` will solve; see [`normal_modes`].
     ///
     /// # Errors
     /// [`ReductionError`]: `Shape`, `NotFinite`, `Unsymmetric`, `Indefinite`, `Factorisation`.
-    pub fn new(what: &'a str, mass: &'a SparseMatrix, stiffness: &'a SparseMatrix) -> Result<Self, ReductionError> {
-        Ok(Self { pencil: Pencil::new(what, mass, stiffness)? })
+    pub fn new(
+        engine: &'a dyn Engine,
+        what: &'a str,
+        mass: &'a SparseMatrix,
+        stiffness: &'a SparseMatrix,
+    ) -> Result<Self, ReductionError> {
+        Ok(Self { pencil: Pencil::new(what, mass, stiffness)?, engine })
     }
 
     /// Bytes held in addition to the two given matrices.
@@ -162,6 +121,9 @@ impl<'a> Analysed<'a> {
         let vectors = size_of::<f64>() * n * (capacity(n, count) + AT_A_TIME * TOGETHER);
         // After the factor is freed: the modes, a copy of them, and their products with K and M.
         let finished = size_of::<f64>() * n * 4 * count;
+        if self.engine.foreign() {
+            return finished;
+        }
         (self.pencil.factor_bytes() + vectors.max(self.pencil.factoring_bytes())).max(finished)
     }
 
@@ -170,12 +132,21 @@ impl<'a> Analysed<'a> {
         self.pencil.factor_entries()
     }
 
-    /// Number of modes below `omega_rad_s`, from the inertia of `K - ω² M`.
+    /// Number of modes below `square`, rad²/s², from the inertia of `K - σ M`, and whose factor it is of: ours, if
+    /// `memory_limit_bytes` allow it, else the engine's.
     ///
     /// # Errors
-    /// [`ReductionError::Factorisation`].
-    pub fn count_below(&self, omega_rad_s: f64) -> Result<usize, ReductionError> {
-        self.pencil.count_below(omega_rad_s * omega_rad_s)
+    /// [`ReductionError`]: `Factorisation`, `Engine`.
+    pub fn count_below(
+        &self,
+        square: f64,
+        memory_limit_bytes: Option<usize>,
+    ) -> Result<(usize, CountedBy), ReductionError> {
+        let bytes = self.pencil.factor_bytes() + self.pencil.factoring_bytes();
+        if !self.engine.foreign() || memory_limit_bytes.is_none_or(|limit| bytes <= limit) {
+            return Ok((self.pencil.count_below(square)?, CountedBy::Us));
+        }
+        Ok((self.engine.count_below(&self.pencil, square)?, CountedBy::Engine))
     }
 
     /// The lowest modes; see [`normal_modes`].
@@ -211,8 +182,9 @@ impl<'a> Analysed<'a> {
         let count = match wanted {
             Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
             Wanted::Below(omega_rad_s) => {
-                let modes = self.count_below(omega_rad_s)?;
-                progress(Progress::Counted { modes, below: omega_rad_s * omega_rad_s });
+                let below = omega_rad_s * omega_rad_s;
+                let (modes, by) = self.count_below(below, memory_limit_bytes)?;
+                progress(Progress::Counted { modes, below, by });
                 progress(analysing(modes));
                 check(analysing(modes))?;
                 modes
@@ -237,10 +209,14 @@ impl<'a> Analysed<'a> {
         if n < DENSE_BELOW || 3 * count > n {
             return finish(pencil, dense(pencil, count)?);
         }
-        let mut shift = typical_square(pencil) * FIRST_SHIFT;
+        let mut shift = pencil.typical_square() * FIRST_SHIFT;
         for attempt in 0.. {
-            let (found, used) = shifted(pencil, shift, count, cutoff, attempt as u64, progress)?;
-            shift = used;
+            let wanted = Lowest { first_shift: shift, count, cutoff, attempt };
+            let found = self.engine.lowest(pencil, &wanted, progress)?;
+            if self.engine.foreign() {
+                found.check(pencil, count)?;
+            }
+            shift = found.shift;
             let squares = &found.omega_squared;
             let spread = (squares[count - 1] + shift) / (squares[0] + shift);
             if spread > WIDEST_SPREAD && attempt == 0 {
@@ -249,7 +225,7 @@ impl<'a> Analysed<'a> {
             }
             let counted = match cutoff {
                 Some(below) => complete_below_cutoff(pencil, squares, count, below),
-                None => complete_below_gap(pencil, squares, count, progress),
+                None => self.complete_below_gap(squares, count, memory_limit_bytes, progress),
             };
             match counted {
                 Ok(()) => return finish(pencil, found.first(count)),
@@ -260,129 +236,38 @@ impl<'a> Analysed<'a> {
         }
         unreachable!("the loop ends by returning");
     }
+
+    /// Checks that the number of modes below the first gap after `count` equals the inertia count of `K - σ M` there.
+    fn complete_below_gap(
+        &self,
+        squares: &[f64],
+        count: usize,
+        memory_limit_bytes: Option<usize>,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<(), ReductionError> {
+        let what = self.pencil.what;
+        let missed =
+            |found, counted, below| Err(ReductionError::MissedModes { what: what.to_owned(), found, counted, below });
+        let Some(found) = gap_after(squares, count) else { return missed(squares.len(), 0, f64::NAN) };
+        let below = 0.5 * (squares[found - 1] + squares[found]);
+        let (counted, by) = self.count_below(below, memory_limit_bytes)?;
+        progress(Progress::Counted { modes: counted, below, by });
+        if counted == found { Ok(()) } else { missed(found, counted, below) }
+    }
 }
 
-/// Number of vectors transformed back at a time.
-const TOGETHER: usize = 24;
 /// Number of copies of them held meanwhile: the input, permuted to the order of elimination, during the solve, and
 /// permuted back.
 const AT_A_TIME: usize = 4;
 
-/// Modes without residuals yet.
-struct Found {
-    omega_squared: Vec<f64>,
-    phi: Mat<f64>,
-}
-
-impl Found {
-    fn first(self, count: usize) -> Self {
-        Self { omega_squared: self.omega_squared[..count].to_vec(), phi: self.phi.subcols(0, count).to_owned() }
-    }
-}
-
-/// `tr K / tr M`, rad²/s².
-fn typical_square(pencil: &Pencil<'_>) -> f64 {
-    let trace = |matrix: &SparseMatrix| entries(matrix).filter(|e| e.0 == e.1).map(|e| e.2.abs()).sum::<f64>();
-    (trace(pencil.stiffness) / trace(pencil.mass)).max(f64::MIN_POSITIVE)
-}
-
-/// Factorises `K + s M = L Lᵀ` with the smallest `s` of the sequence `first`, 100 `first`, ... for which it is positive
-/// definite.
-///
-/// # Errors
-/// [`ReductionError`]: `NoShift`, `Factorisation`.
-fn factor_from<'p>(pencil: &'p Pencil<'_>, first: f64) -> Result<(Llt<'p>, f64), ReductionError> {
-    let most = typical_square(pencil) * LARGEST_SHIFT;
-    let mut shift = first;
-    while shift < most {
-        if let Some(factor) = pencil.llt(shift)? {
-            return Ok((factor, shift));
-        }
-        shift *= 100.0;
-    }
-    Err(ReductionError::NoShift { what: pencil.what.to_owned(), value: shift })
-}
-
 /// The `count` lowest modes by a dense solve, for small systems.
-fn dense(pencil: &Pencil<'_>, count: usize) -> Result<Found, ReductionError> {
+fn dense(pencil: &Pencil<'_>, count: usize) -> Result<Eigenpairs, ReductionError> {
     let whitening = whiten(&format!("{}.mass", pencil.what), pencil.mass.to_dense().as_ref())?;
     let stiffness = pencil.stiffness.to_dense();
     let (squares, vectors) = symmetric_eigen(pencil.what, whitening.congruence(stiffness.as_ref(), true).as_ref())?;
     let mut phi = vectors.subcols(0, count).to_owned();
     whitening.back(&mut phi);
-    Ok(Found { omega_squared: squares[..count].to_vec(), phi })
-}
-
-/// Converged modes by Lanczos on `L⁻¹ M L⁻ᵀ`: `count` of them and, without a cut-off, more until a gap follows. Also
-/// returns the shift used, which is at least `first`.
-fn shifted(
-    pencil: &Pencil<'_>,
-    first: f64,
-    count: usize,
-    cutoff: Option<f64>,
-    seed: u64,
-    progress: &mut dyn FnMut(Progress),
-) -> Result<(Found, f64), ReductionError> {
-    let n = pencil.dimension();
-    // One more, because a test removes one.
-    #[cfg(test)]
-    let count = count + usize::from(crate::spoil::spoilt(crate::spoil::Spoil::Mode));
-    let (factor, shift) = factor_from(pencil, first)?;
-    progress(Progress::Factored { shift });
-    let square = |theta: f64| 1.0 / theta - shift;
-    let iteration = Iteration {
-        what: pencil.what,
-        dimension: n,
-        count,
-        capacity: capacity(n, count),
-        residual_limit: RESIDUAL_LIMIT,
-        seed,
-    };
-    let enough = |theta: &[f64]| match cutoff {
-        Some(_) => theta.len() >= count,
-        None => {
-            let squares: Vec<f64> = theta.iter().map(|&theta| square(theta)).collect();
-            gap_after(&squares, count).is_some()
-        }
-    };
-    let largest = iteration.run(
-        &|y| factor.whiten(&times(pencil.mass, factor.unwhiten(y).as_ref())),
-        &enough,
-        &mut |vectors, converged| progress(Progress::Iterated { vectors, converged, wanted: count }),
-    )?;
-    let mut basis = largest.vectors;
-    for first in (0..basis.ncols()).step_by(TOGETHER) {
-        let columns = TOGETHER.min(basis.ncols() - first);
-        let phi = factor.unwhiten(basis.subcols(first, columns).to_owned());
-        basis.subcols_mut(first, columns).copy_from(&phi);
-    }
-    for (k, theta) in largest.theta.iter().enumerate() {
-        basis.col_mut(k).iter_mut().for_each(|value| *value /= theta.sqrt());
-    }
-    // Free the factor, then copy the modes out of the larger allocation of the basis.
-    drop(factor);
-    let phi = basis.as_ref().to_owned();
-    let found = Found { omega_squared: largest.theta.into_iter().map(square).collect(), phi };
-    #[cfg(test)]
-    let found = if crate::spoil::spoilt(crate::spoil::Spoil::Mode) { tests::without(found, 2) } else { found };
-    Ok((found, shift))
-}
-
-/// Checks that the number of modes below the first gap after `count` equals the inertia count of `K - σ M` there.
-fn complete_below_gap(
-    pencil: &Pencil<'_>,
-    squares: &[f64],
-    count: usize,
-    progress: &mut dyn FnMut(Progress),
-) -> Result<(), ReductionError> {
-    let missed = |found, counted, below| {
-        Err(ReductionError::MissedModes { what: pencil.what.to_owned(), found, counted, below })
-    };
-    let Some(found) = gap_after(squares, count) else { return missed(squares.len(), 0, f64::NAN) };
-    let below = 0.5 * (squares[found - 1] + squares[found]);
-    let counted = pencil.count_below(below)?;
-    progress(Progress::Counted { modes: counted, below });
-    if counted == found { Ok(()) } else { missed(found, counted, below) }
+    Ok(Eigenpairs { omega_squared: squares[..count].to_vec(), phi, shift: 0.0 })
 }
 
 /// Checks that the `count` lowest modes found all lie below the cut-off `σ`, where the inertia of `K - σ M` counted as
@@ -395,18 +280,12 @@ fn complete_below_cutoff(pencil: &Pencil<'_>, squares: &[f64], count: usize, bel
     Err(ReductionError::MissedModes { what: pencil.what.to_owned(), found, counted: count, below })
 }
 
-/// Smallest number of values, at least `count`, that is followed by a gap; `None` if there is none.
-fn gap_after(squares: &[f64], count: usize) -> Option<usize> {
-    let largest = squares.iter().fold(0.0, |largest: f64, square| largest.max(square.abs()));
-    (count..squares.len()).find(|&k| squares[k] - squares[k - 1] > GAP * squares[k].abs().max(1e-6 * largest))
-}
-
 /// Normalises signs and computes the scaled residual of every mode explicitly.
 ///
 /// # Errors
 /// [`ReductionError::Residual`].
-fn finish(pencil: &Pencil<'_>, found: Found) -> Result<SparseModes, ReductionError> {
-    let Found { omega_squared, mut phi } = found;
+fn finish(pencil: &Pencil<'_>, found: Eigenpairs) -> Result<SparseModes, ReductionError> {
+    let Eigenpairs { omega_squared, mut phi, .. } = found;
     fix_signs(&mut phi);
     #[cfg(test)]
     if crate::spoil::spoilt(crate::spoil::Spoil::Vector) {
@@ -497,7 +376,10 @@ mod tests {
             normal_modes("pad", &mass, &stiffness, Wanted::Below(cutoff), None, &mut |p| reports.push(p)).unwrap();
         assert_eq!(modes.omega_squared.len(), below);
         assert!(modes.residuals.iter().all(|residual| *residual < 1e-12));
-        assert!(reports.contains(&Progress::Counted { modes: below, below: cutoff * cutoff }), "{reports:?}");
+        assert!(
+            reports.contains(&Progress::Counted { modes: below, below: cutoff * cutoff, by: CountedBy::Us }),
+            "{reports:?}"
+        );
         let none = normal_modes("pad", &mass, &stiffness, Wanted::Below(1.0), None, &mut |_| {}).unwrap_err();
         assert_eq!(
             none.to_string(),
@@ -515,15 +397,6 @@ mod tests {
         // At least a basis of 3·40 + 48 vectors of 900 numbers.
         assert!(bytes > 168 * 900 * 8 && limit == 1 << 20, "{bytes} {limit}");
         assert!(matches!(reports[..], [Progress::Analysed { .. }]), "{reports:?}");
-    }
-
-    /// `found` without the mode at index `lost`.
-    pub(super) fn without(found: Found, lost: usize) -> Found {
-        let Found { mut omega_squared, phi } = found;
-        omega_squared.remove(lost);
-        let kept = |column: usize| if column < lost { column } else { column + 1 };
-        let phi = Mat::from_fn(phi.nrows(), omega_squared.len(), |i, j| phi[(i, kept(j))]);
-        Found { omega_squared, phi }
     }
 
     /// The inertia count detects a mode that every attempt of the iteration misses, both for a given number of modes

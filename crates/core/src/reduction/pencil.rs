@@ -20,6 +20,8 @@ use super::ordering::nested_dissection;
 use super::sparse::{entries, worst_asymmetry};
 use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
 
+/// Upper limit of the shifts to try, relative to `tr K / tr M`.
+const LARGEST_SHIFT: f64 = 1e5;
 /// Number of Lanczos steps to estimate the smallest eigenvalue of a scaled mass matrix.
 const MASS_STEPS: usize = 40;
 /// Estimated smallest eigenvalue of a scaled mass matrix above which it counts as positive definite without a
@@ -27,9 +29,12 @@ const MASS_STEPS: usize = 40;
 const CLEARLY_DEFINITE: f64 = 1e-3;
 
 /// A symmetric pencil `K - σ M`: the lower triangles on a common pattern, ordered and symbolically analysed.
-pub(super) struct Pencil<'a> {
+pub struct Pencil<'a> {
+    /// Names the system in errors.
     pub what: &'a str,
+    /// `M`, kg, both triangles.
     pub mass: &'a SparseMatrix,
+    /// `K`, N/m, both triangles.
     pub stiffness: &'a SparseMatrix,
     pattern: SymbolicSparseColMat<usize>,
     lower_mass: Vec<f64>,
@@ -89,8 +94,26 @@ impl<'a> Pencil<'a> {
         Ok(pencil)
     }
 
-    pub(super) fn dimension(&self) -> usize {
+    /// Number of degrees of freedom.
+    pub fn dimension(&self) -> usize {
         self.mass.nrows()
+    }
+
+    /// `tr K / tr M`, rad²/s².
+    pub(super) fn typical_square(&self) -> f64 {
+        let trace = |matrix: &SparseMatrix| entries(matrix).filter(|e| e.0 == e.1).map(|e| e.2.abs()).sum::<f64>();
+        (trace(self.stiffness) / trace(self.mass)).max(f64::MIN_POSITIVE)
+    }
+
+    /// The shifts `s` to try until `K + s M` is positive definite: `first`, 100 `first`, ..., rad²/s².
+    pub fn shifts(&self, first: f64) -> impl Iterator<Item = f64> + use<> {
+        let most = self.typical_square() * LARGEST_SHIFT;
+        std::iter::successors(Some(first), |shift| Some(shift * 100.0)).take_while(move |shift| *shift < most)
+    }
+
+    /// The error where none of [`Self::shifts`] serves.
+    pub fn no_shift(&self) -> ReductionError {
+        ReductionError::NoShift { what: self.what.to_owned(), value: self.typical_square() * LARGEST_SHIFT }
     }
 
     /// Number of entries of a factor.

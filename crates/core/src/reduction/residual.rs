@@ -22,7 +22,9 @@
 use faer::Mat;
 
 use super::ReductionError;
-use super::normal_modes::{Analysed, Progress, SparseModes};
+use super::checked::definite;
+use super::engine::Progress;
+use super::normal_modes::{Analysed, SparseModes};
 use super::sparse::{SparseMatrix, times};
 
 /// The shift `s`, relative to the last kept `ω²`.
@@ -63,6 +65,9 @@ impl Analysed<'_> {
         let vectors = self.pencil.dimension() * (size_of::<f64>() * columns + kept);
         // Both results and reordered copies of them.
         let between = 4 * size_of::<f64>() * loads * loads;
+        if self.engine.foreign() {
+            return between + vectors;
+        }
         self.pencil.factor_bytes() + between + vectors.max(self.pencil.factoring_bytes())
     }
 
@@ -71,7 +76,7 @@ impl Analysed<'_> {
     ///
     /// # Errors
     /// [`ReductionError`]: `OnlyRigid` if all kept modes are rigid-body modes, which give no scale for the shift;
-    /// `NegativeStiffness` if a kept mode is unstable; `NoShift`; `Factorisation`.
+    /// `NegativeStiffness` if a kept mode is unstable; `NoShift`; `Factorisation`; `Engine`.
     pub fn residual(
         &self,
         modes: &SparseModes,
@@ -82,7 +87,8 @@ impl Analysed<'_> {
         let pencil = &self.pencil;
         let (what, mass, n) = (pencil.what, pencil.mass, pencil.dimension());
         let shift = self.shift(modes)?;
-        let factor = pencil.llt(shift)?.ok_or(ReductionError::NoShift { what: what.to_owned(), value: shift })?;
+        let factor = definite(self.engine, pencil, shift)?
+            .ok_or(ReductionError::NoShift { what: what.to_owned(), value: shift })?;
         progress(Progress::Factored { shift });
         let free: Vec<usize> = rows.iter().flatten().copied().collect();
         let phi = modes.phi.as_ref();
@@ -108,14 +114,14 @@ impl Analysed<'_> {
             for (load, &row) in loaded.iter().enumerate() {
                 x[(row, load)] += 1.0;
             }
-            factor.solve(x.as_mut());
+            factor.solve(&mut x, false)?;
             x = freed(x);
             seen(&mut flexibility, &x, chunk * TOGETHER);
             match inertia_by {
                 InertiaBy::KeptAnswers => answers.push(Mat::from_fn(n, x.ncols(), |i, j| x[(i, j)] as f32)),
                 InertiaBy::SecondSolve => {
                     let mut again = times(mass, x.as_ref());
-                    factor.solve(again.as_mut());
+                    factor.solve(&mut again, false)?;
                     seen(&mut inertia, &freed(again), chunk * TOGETHER);
                 }
             }
@@ -198,7 +204,7 @@ fn product_of(left: &Mat<f32>, right: &Mat<f64>) -> Mat<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{ModeSelection, SparseMatrix, free_interface_modes, lowest_modes};
+    use super::super::{ModeSelection, OwnEngine, SparseMatrix, free_interface_modes, lowest_modes};
     use super::*;
     use faer::sparse::Triplet;
 
@@ -222,7 +228,7 @@ mod tests {
     #[test]
     fn nothing_but_rigid_motions_leaves_no_residual() {
         let (mass, stiffness) = chain(420);
-        let analysed = Analysed::new("pad", &mass, &stiffness).unwrap();
+        let analysed = Analysed::new(&OwnEngine, "pad", &mass, &stiffness).unwrap();
         let residual = |count: usize| {
             let kept = lowest_modes("pad", &mass, &stiffness, count).unwrap();
             analysed.residual(&kept, &[Some(3)], InertiaBy::SecondSolve, &mut |_| {})
@@ -237,7 +243,7 @@ mod tests {
         let (mass, stiffness) = chain(n);
         let kept = lowest_modes("pad", &mass, &stiffness, 20).unwrap();
         let rows = [Some(3), None, Some(200), Some(n - 1)];
-        let analysed = Analysed::new("pad", &mass, &stiffness).unwrap();
+        let analysed = Analysed::new(&OwnEngine, "pad", &mass, &stiffness).unwrap();
         let by = |way| analysed.residual(&kept, &rows, way, &mut |_| {}).unwrap();
         let [found, faster] = [InertiaBy::SecondSolve, InertiaBy::KeptAnswers].map(by);
         // `R` depends on the method for `Q` only through `s Q`, a relative 1e-12.

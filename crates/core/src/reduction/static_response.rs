@@ -15,9 +15,10 @@
 
 use faer::Mat;
 
+use super::checked::definite;
+use super::engine::Engine;
 use super::full_model::{FullModel, SparseRow};
-use super::normal_modes::{Wanted, normal_modes};
-use super::pencil::Pencil;
+use super::normal_modes::{Analysed, Wanted};
 use super::sparse::{SparseMatrix, times};
 use super::{FullPart, ReductionError};
 use crate::contact::{RigidMotions, StaticResponse};
@@ -31,7 +32,7 @@ const SHIFT: f64 = 1e-6;
 const TOGETHER: usize = 32;
 
 impl FullModel {
-    /// The static response between contact pairs, and to `load`, the generalised force of a load of 1 N over the rows of
+    /// The static response between contact pairs, solved by `engine`, and to `load`, the generalised force of a load of 1 N over the rows of
     /// all parts. `None` for a model without contact pairs.
     ///
     /// # Errors
@@ -39,6 +40,7 @@ impl FullModel {
     /// a factorisation and, for free-floating parts, of their modes.
     pub fn static_response(
         &self,
+        engine: &dyn Engine,
         load: &SparseRow,
         memory_limit_bytes: Option<usize>,
     ) -> Result<Option<StaticResponse>, ReductionError> {
@@ -57,7 +59,7 @@ impl FullModel {
                 inside.map(|&(index, weight)| (index - offset, weight)).collect()
             };
             let rows = [&contact.normal, &contact.sliding].map(|rows| rows.iter().map(within).collect::<Vec<_>>());
-            add_part(part, &rows, &within(load), memory_limit_bytes, &mut sum)?;
+            add_part(engine, part, &rows, &within(load), memory_limit_bytes, &mut sum)?;
         }
         let flexibility = &mut sum.normal_flexibility;
         for j in 0..c {
@@ -72,33 +74,37 @@ impl FullModel {
 
 /// Adds the response of one part. `normal` and `sliding` are the contact rows over its degrees of freedom.
 fn add_part(
+    engine: &dyn Engine,
     part: &FullPart,
     [normal, sliding]: &[Vec<SparseRow>; 2],
     load: &SparseRow,
     memory_limit_bytes: Option<usize>,
     sum: &mut StaticResponse,
 ) -> Result<(), ReductionError> {
-    let pencil = Pencil::new(&part.name, &part.mass, &part.stiffness)?;
+    let analysed = Analysed::new(engine, &part.name, &part.mass, &part.stiffness)?;
+    let pencil = &analysed.pencil;
     let n = pencil.dimension();
     // The factor, and for one set of loads: loads, responses, products and permuted copies, with rigid motions.
     let columns = size_of::<f64>() * n * (5 * TOGETHER + 12);
-    let bytes = pencil.held_bytes() + pencil.factor_bytes() + pencil.factoring_bytes().max(columns);
+    let factor = if engine.foreign() { [0, 0] } else { [pencil.factor_bytes(), pencil.factoring_bytes()] };
+    let bytes = pencil.held_bytes() + factor[0] + factor[1].max(columns);
     if let Some(limit) = memory_limit_bytes.filter(|limit| bytes > *limit) {
         return Err(ReductionError::Memory { what: format!("statics of {}", part.name), bytes, limit });
     }
     let diagonal = |matrix: &SparseMatrix, k: usize| matrix.get(k, k).copied().unwrap_or(0.0);
     let largest = (0..n).map(|k| diagonal(&part.stiffness, k) / diagonal(&part.mass, k)).fold(0.0, f64::max);
-    let free = pencil.count_below(RIGID * largest)?;
+    let free = analysed.count_below(RIGID * largest, memory_limit_bytes)?.0;
     let (shift, modes) = if free == 0 {
         (0.0, Mat::zeros(n, 0))
     } else {
         let wanted = Wanted::Lowest((free + 1).min(n));
-        let found = normal_modes(&part.name, &part.mass, &part.stiffness, wanted, memory_limit_bytes, &mut |_| {})?;
+        let found = analysed.modes(wanted, memory_limit_bytes, &mut |_| {})?;
         // Nothing but rigid motions: any shift serves.
         let lowest = found.omega_squared.get(free).copied().unwrap_or(1.0);
         (SHIFT * lowest, found.phi.subcols(0, free).to_owned())
     };
-    let factor = pencil.llt(shift)?.ok_or_else(|| ReductionError::NoShift { what: part.name.clone(), value: shift })?;
+    let factor = definite(engine, pencil, shift)?
+        .ok_or_else(|| ReductionError::NoShift { what: part.name.clone(), value: shift })?;
     let along = |row: &SparseRow, x: &Mat<f64>, j: usize| -> f64 {
         row.iter().map(|&(index, weight)| weight * x[(index, j)]).sum()
     };
@@ -121,11 +127,11 @@ fn add_part(
             let kept = Mat::from_fn(free, chunk.len(), |mode, column| along(&normal[chunk[column]], &modes, mode));
             x -= &inertia_of_modes * kept;
         }
-        factor.solve(x.as_mut());
+        factor.solve(&mut x, false)?;
         if free > 0 {
             x = freed(x);
             let mut again = times(&part.mass, x.as_ref());
-            factor.solve(again.as_mut());
+            factor.solve(&mut again, false)?;
             x += faer::Scale(shift) * freed(again);
         }
         for (column, &k) in chunk.iter().enumerate() {
@@ -151,6 +157,7 @@ fn add_part(
 
 #[cfg(test)]
 mod tests {
+    use super::super::OwnEngine;
     use super::super::full_model::FullContact;
     use super::*;
     use crate::contact::{MeasuredLoad, PressureLaw, Statics, StaticsParts};
@@ -201,7 +208,7 @@ mod tests {
             let model = model(held);
             let contact = model.contact.as_ref().unwrap();
             let load: SparseRow = vec![(3, -0.4), (8, -0.6)];
-            let response = model.static_response(&load, None).unwrap().unwrap();
+            let response = model.static_response(&OwnEngine, &load, None).unwrap().unwrap();
             assert_eq!(response.rigid.load.len(), usize::from(!held));
             let law = PressureLaw::Linear { stiffness: 4e6 };
             let gap_m = vec![0.0, 1e-6, 4e-5, 2e-6];

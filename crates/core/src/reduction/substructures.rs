@@ -2,7 +2,8 @@
 
 use std::sync::mpsc;
 
-use super::normal_modes::{Analysed, Progress, SparseModes, Wanted};
+use super::engine::{Engine, Progress};
+use super::normal_modes::{Analysed, SparseModes, Wanted};
 use super::{InertiaBy, ReductionError, Residual, SparseMatrix};
 
 /// A substructure with its contact interface free.
@@ -29,7 +30,7 @@ pub struct Kept {
     pub residual: Option<Residual>,
 }
 
-/// Computes the modes of every part and, if `with_residual`, the residuals of the truncated modes.
+/// Computes the modes of every part by `engine` and, if `with_residual`, the residuals of the truncated modes.
 ///
 /// The parts run in parallel, one thread each, if all of them together fit in `memory_limit_bytes` in addition to the
 /// given matrices; otherwise one after the other. Responses to contact forces are stored if memory allows, see
@@ -40,6 +41,7 @@ pub struct Kept {
 /// # Errors
 /// Those of [`Analysed::modes`] and [`Analysed::residual`]; `Memory` before any factorisation.
 pub fn keep_modes(
+    engine: &dyn Engine,
     parts: &[Substructure<'_>],
     with_residual: bool,
     memory_limit_bytes: Option<usize>,
@@ -47,7 +49,7 @@ pub fn keep_modes(
 ) -> Result<Vec<Kept>, ReductionError> {
     let analysed: Vec<Analysed<'_>> = side_by_side(parts, true, progress, &|part, report| {
         report(Progress::Analysing);
-        Analysed::new(part.name, part.mass, part.stiffness)
+        Analysed::new(engine, part.name, part.mass, part.stiffness)
     })?;
     let held: usize = analysed.iter().map(Analysed::held_bytes).sum();
     let work = |index: usize, wanted: Wanted, inertia_by: InertiaBy| {
@@ -59,7 +61,8 @@ pub fn keep_modes(
         let needs = |inertia_by: InertiaBy| -> Vec<usize> {
             wanted.iter().enumerate().map(|(index, &wanted)| work(index, wanted, inertia_by)).collect()
         };
-        let ways = [true, false].into_iter().flat_map(|at_once| {
+        // A foreign engine solves one after the other: its ranks need the memory.
+        let ways = [true, false].into_iter().filter(|at_once| !(*at_once && engine.foreign())).flat_map(|at_once| {
             [InertiaBy::KeptAnswers, InertiaBy::SecondSolve].map(|inertia_by| Plan { at_once, inertia_by })
         });
         let bytes = |way: &Plan| -> usize {
@@ -90,8 +93,9 @@ pub fn keep_modes(
         let indices: Vec<usize> = (0..parts.len()).collect();
         wanted = side_by_side(&indices, way.at_once, progress, &|&index, report| match parts[index].wanted {
             Wanted::Below(below_rad_s) => {
-                let modes = analysed[index].count_below(below_rad_s)?;
-                report(Progress::Counted { modes, below: below_rad_s * below_rad_s });
+                let below = below_rad_s * below_rad_s;
+                let (modes, by) = analysed[index].count_below(below, memory_limit_bytes)?;
+                report(Progress::Counted { modes, below, by });
                 Ok(Wanted::Counted { modes, below_rad_s })
             }
             wanted => Ok(wanted),
@@ -106,7 +110,8 @@ pub fn keep_modes(
                 report(p);
             }
         };
-        let modes = analysed[index].modes(wanted[index], None, &mut report)?;
+        let limit = memory_limit_bytes.filter(|_| engine.foreign());
+        let modes = analysed[index].modes(wanted[index], limit, &mut report)?;
         let residual = if with_residual {
             Some(analysed[index].residual(&modes, parts[index].rows, way.inertia_by, &mut report)?)
         } else {
@@ -170,6 +175,7 @@ fn side_by_side<T: Sync, R: Send>(
 
 #[cfg(test)]
 mod tests {
+    use super::super::OwnEngine;
     use super::*;
     use faer::sparse::Triplet;
 
@@ -202,7 +208,7 @@ mod tests {
             })
             .collect();
         let mut needs = vec![];
-        let together = keep_modes(&parts, true, None, &mut |_, p| {
+        let together = keep_modes(&OwnEngine, &parts, true, None, &mut |_, p| {
             if let Progress::Analysed { bytes, .. } = p {
                 needs.push(bytes);
             }
@@ -212,7 +218,7 @@ mod tests {
         // Each part fits alone with stored responses; both together do not.
         let limit = needs.iter().copied().max().unwrap() + 200_000;
         let mut order = vec![];
-        let apart = keep_modes(&parts, true, Some(limit), &mut |part, p| {
+        let apart = keep_modes(&OwnEngine, &parts, true, Some(limit), &mut |part, p| {
             if matches!(p, Progress::Loaded { .. }) {
                 order.push(part);
             }
@@ -226,7 +232,7 @@ mod tests {
             assert!((&one.inertia - &other.inertia).norm_max() < 1e-6 * one.inertia.norm_max());
         }
         let mut factored = false;
-        let refused = keep_modes(&parts, true, Some(limit / 4), &mut |_, p| {
+        let refused = keep_modes(&OwnEngine, &parts, true, Some(limit / 4), &mut |_, p| {
             factored |= matches!(p, Progress::Factored { .. });
         });
         assert!(matches!(refused.unwrap_err(), ReductionError::Memory { .. }) && !factored);

@@ -3,6 +3,7 @@
 use faer::{Mat, c64};
 
 use super::super::ReductionError;
+use super::super::checked::definite;
 use super::super::full_model::Projected;
 use super::condition::slope;
 use super::request::ParametricStep;
@@ -10,7 +11,7 @@ use super::sampling::{Building, Estimates, ROOTS_TOGETHER};
 use crate::physics::{Model, OperatingPoint, Spectrum, Vectors};
 
 /// `S⁻¹ B`.
-type Inverse<'a> = dyn Fn(Mat<f64>) -> Mat<f64> + 'a;
+type Inverse<'a> = dyn Fn(Mat<f64>) -> Result<Mat<f64>, ReductionError> + 'a;
 
 impl Building<'_, '_> {
     /// Point with the largest estimate, all estimates there, and the largest one; `None` without points.
@@ -29,18 +30,18 @@ impl Building<'_, '_> {
             let weights = low_rank.stiffness.clone();
             shifted.couple::<f64>(&low_rank, weights, false)
         });
-        let llt =
+        let factor =
             match &self.pencil {
-                Some(pencil) => Some(pencil.llt(sigma)?.ok_or_else(|| {
+                Some(pencil) => Some(definite(self.solver.engine(), pencil, sigma)?.ok_or_else(|| {
                     failed("the symmetric stiffness with its shift is not positive definite".to_owned())
                 })?),
                 None => None,
             };
-        let inverse = |mut b: Mat<f64>| match (&coupled, &llt) {
-            (Some(coupled), _) => coupled.solve(b.as_ref()),
-            (None, Some(llt)) => {
-                llt.solve(b.as_mut());
-                b
+        let inverse = |mut b: Mat<f64>| match (&coupled, &factor) {
+            (Some(coupled), _) => Ok(coupled.solve(b.as_ref())),
+            (None, Some(factor)) => {
+                factor.solve(&mut b, false)?;
+                Ok(b)
             }
             (None, None) => unreachable!("a model without parts has a pencil"),
         };
@@ -48,7 +49,7 @@ impl Building<'_, '_> {
         for (done, point) in points.iter().enumerate() {
             progress(ParametricStep::Estimating { done, of: points.len() });
             let spectrum = self.solve(model, point, Vectors::Both)?;
-            let estimates = self.estimates(&inverse, projected, &spectrum);
+            let estimates = self.estimates(&inverse, projected, &spectrum)?;
             let largest = estimates.iter().map(|(_, estimate)| *estimate).fold(0.0, f64::max);
             if worst.as_ref().is_none_or(|(_, _, before)| largest > *before) {
                 worst = Some((*point, estimates, largest));
@@ -63,18 +64,24 @@ impl Building<'_, '_> {
     }
 
     /// Error estimate of every counted reduced root.
-    fn estimates(&self, inverse: &Inverse<'_>, projected: &Projected, spectrum: &Spectrum) -> Estimates {
+    fn estimates(
+        &self,
+        inverse: &Inverse<'_>,
+        projected: &Projected,
+        spectrum: &Spectrum,
+    ) -> Result<Estimates, ReductionError> {
         let wanted = self.counted(spectrum);
-        let norms = [&spectrum.shapes, &spectrum.left].map(|shapes| -> Vec<f64> {
-            let left = std::ptr::eq(shapes, &spectrum.left);
-            let chunks = wanted.chunks(ROOTS_TOGETHER);
-            chunks.flat_map(|roots| self.residual_norms(inverse, projected, spectrum, shapes, roots, left)).collect()
-        });
+        let mut norms: [Vec<f64>; 2] = [vec![], vec![]];
+        for (left, (norms, shapes)) in norms.iter_mut().zip([&spectrum.shapes, &spectrum.left]).enumerate() {
+            for roots in wanted.chunks(ROOTS_TOGETHER) {
+                norms.extend(self.residual_norms(inverse, projected, spectrum, shapes, roots, left == 1)?);
+            }
+        }
         let estimate = |(j, &k): (usize, &usize)| {
             let lambda = spectrum.roots[k].lambda;
             (lambda, norms[0][j] * norms[1][j] / (slope(spectrum, k).norm() * lambda.norm()))
         };
-        wanted.iter().enumerate().map(estimate).collect()
+        Ok(wanted.iter().enumerate().map(estimate).collect())
     }
 
     /// `S⁻¹`-norms of the residuals `Q V z` or, for left vectors, `Qᴴ V w`, one per root.
@@ -86,7 +93,7 @@ impl Building<'_, '_> {
         shapes: &Mat<c64>,
         roots: &[usize],
         left: bool,
-    ) -> Vec<f64> {
+    ) -> Result<Vec<f64>, ReductionError> {
         let (size, here) = (projected.omega_squared.len(), spectrum.situation());
         // Real and imaginary parts.
         let parts = Mat::from_fn(size, 2 * roots.len(), |i, j| {
@@ -107,11 +114,11 @@ impl Building<'_, '_> {
                 residuals[(i, 2 * j + 1)] = value.im;
             }
         }
-        let solved = inverse(residuals.clone());
+        let solved = inverse(residuals.clone())?;
         let square = |j: usize| residuals.col(j).transpose() * solved.col(j);
         // A negative square is a rounding error. NaN becomes infinity, because taking a maximum would ignore NaN.
         let size = |square: f64| if square.is_nan() { f64::INFINITY } else { square.max(0.0).sqrt() };
-        (0..roots.len()).map(|j| size(square(2 * j) + square(2 * j + 1))).collect()
+        Ok((0..roots.len()).map(|j| size(square(2 * j) + square(2 * j + 1))).collect())
     }
 }
 
