@@ -42,6 +42,7 @@ mod ros2_side;
 mod scipy;
 mod service;
 mod sessions;
+mod slepc;
 mod sound;
 mod sound_beside_logs;
 mod sound_reports;
