@@ -244,6 +244,11 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
         "parameters" => {
             vec![project("launch/params.yaml"), b"/**: {ros__parameters: {a: &x 1, b: *x, c: {d: [1, 2]}}}\n".to_vec()]
         }
+        "configuration" => vec![
+            project("launch/squealcast.toml"),
+            b"rig = 'x'\nno_ros = true\ndomain = 3\nros_args = ['-r', '__ns:=/left']\n[set]\nwarn_margin = 0.1\n"
+                .to_vec(),
+        ],
         "log" => text(&[
             "time_s,normal_load_n,disc_speed_rad_s,friction_coefficient\n0.0,500,13,0.35\n0.1,501,13,0.36\n",
             "Pruefstand 3\nZeit [s];Normalkraft [N];Drehzahl [1/min];Reibwert\n0,0;500,5;124;0,35\n0,1;501;124;0,36\n",

@@ -15,11 +15,12 @@ use super::Cli;
 use crate::bus::ros_args::{RosArgs, RosArgsError};
 use crate::files::input_file;
 
-/// The command that has a configuration file, and the option that names it.
+/// The command that has a configuration file, the option that names it, and the one that leaves keys of it out.
 const COMMAND: &str = "run";
 const OPTION: &str = "config";
+const UNSET: &str = "unset";
 /// Options that a file cannot contain.
-const OF_THE_COMMAND_LINE: [&str; 4] = [OPTION, "check_config", "help", "version"];
+const OF_THE_COMMAND_LINE: [&str; 5] = [OPTION, UNSET, "check_config", "help", "version"];
 /// The key of what follows `--ros-args` on a command line.
 const ROS_ARGS: &str = "ros_args";
 
@@ -38,6 +39,8 @@ pub enum ConfigError {
     Value { file: PathBuf, key: String, message: String },
     #[error("{}: {ROS_ARGS}: {source}", .file.display())]
     RosArgs { file: PathBuf, source: RosArgsError },
+    #[error("--unset {key}: no key of a configuration file{}", .near.as_ref().map(|near| format!(", did you mean {near}?")).unwrap_or_default())]
+    Unset { key: String, near: Option<String> },
     #[error("{} with the command line: {message}", .file.display())]
     Together { file: PathBuf, message: String },
 }
@@ -99,9 +102,14 @@ impl Given {
             let source = given.as_ref().and_then(|given| given.value_source(arg.get_id().as_str()));
             source == Some(ValueSource::CommandLine)
         };
+        let unset: Vec<String> =
+            given.iter().flat_map(|given| given.get_many::<String>(UNSET)).flatten().cloned().collect();
+        if let Some(key) = unset.iter().find(|key| *key != ROS_ARGS && find(&command, key).is_none()) {
+            return Err(ConfigError::Unset { key: key.clone(), near: near(&command, key) });
+        }
         let mut config = Config { file: file.to_owned(), entries: vec![] };
         let mut of_file = RosArgs::default();
-        for (key, value) in &table {
+        for (key, value) in table.iter().filter(|(key, _)| !unset.contains(key)) {
             if key == ROS_ARGS {
                 let arguments = texts(file, key, value)?;
                 let marked = std::iter::once("--ros-args".to_owned()).chain(arguments.iter().cloned());
@@ -183,11 +191,15 @@ fn find<'a>(command: &'a Command, key: &str) -> Option<&'a Arg> {
 }
 
 fn unknown(file: &Path, command: &Command, key: &str) -> ConfigError {
+    ConfigError::Unknown { file: file.to_owned(), key: key.to_owned(), near: near(command, key) }
+}
+
+/// The key that is most like another word.
+fn near(command: &Command, key: &str) -> Option<String> {
     let known = keys(command).map(|(known, _)| known).chain([ROS_ARGS.to_owned()]);
     let near = known.map(|known| (strsim::jaro_winkler(key, &known), known)).max_by(|a, b| a.0.total_cmp(&b.0));
     // The likeness from which on clap offers a name.
-    let near = near.filter(|(likeness, _)| *likeness > 0.7).map(|(_, known)| known);
-    ConfigError::Unknown { file: file.to_owned(), key: key.to_owned(), near }
+    near.filter(|(likeness, _)| *likeness > 0.7).map(|(_, known)| known)
 }
 
 fn is_flag(arg: &Arg) -> bool {
@@ -362,6 +374,13 @@ mod tests {
         assert_eq!(arguments_of(file, "nine-dof --domain 4"), "--no-display --record=sessions");
         // Options that exclude each other.
         assert_eq!(arguments_of(file, "--display 127.0.0.1:0"), "--domain=3 --record=sessions tribometer");
+        // A flag has no other way to be cleared; a key that the file does not have is none the less left out.
+        let line = "--unset no_display --unset domain --unset managed";
+        assert_eq!(arguments_of(file, line), "--record=sessions tribometer");
+        assert_eq!(
+            refused(file, "--unset no_displ"),
+            "--unset no_displ: no key of a configuration file, did you mean no_display?"
+        );
         // Of the values of a list, the later win: the command line's follow the file's.
         assert_eq!(arguments_of("[set]\nwarn_margin = 0.1\n", "--set warn_margin=0.2"), "--set=warn_margin=0.1");
         let (ros_args, _) =

@@ -52,6 +52,7 @@ pub use reduce::reduce_quietly;
 pub use steps::Stopped;
 
 use std::io::Write;
+use std::path::Path;
 use std::process::ExitCode;
 
 use anyhow::Context;
@@ -133,6 +134,16 @@ pub enum Outcome {
     Done,
     /// Finished, with differences or data loss: exit code 3.
     Differences,
+}
+
+/// Reads a configuration file of `run`, as at the start of a node and on SIGHUP.
+///
+/// # Errors
+/// A file with which a node would not start.
+pub fn read_config(file: &Path) -> anyhow::Result<()> {
+    let arguments = ["squealcast", "run"].map(str::to_owned).to_vec();
+    Given { arguments, ros_args: RosArgs::default() }.with_file(file)?;
+    Ok(())
 }
 
 /// Runs the command line of this process. Exit codes: 0 done, 1 failure, 2 usage, 3 differences or data loss.

@@ -46,6 +46,9 @@ pub struct Options {
     /// again
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    /// Leave this key of the configuration file out, such as a flag that it sets; may be repeated
+    #[arg(long, value_name = "KEY", requires = "config")]
+    unset: Vec<String>,
     /// Read the configuration file and the rig, print the command line that they amount to, and exit
     #[arg(long)]
     check_config: bool,

@@ -26,7 +26,7 @@ pub struct Target {
     pub read: fn(&[u8]),
 }
 
-pub const TARGETS: [Target; 16] = [
+pub const TARGETS: [Target; 17] = [
     Target {
         name: "npz",
         read: |bytes| {
@@ -65,6 +65,7 @@ pub const TARGETS: [Target; 16] = [
             let _ = params_file::read(&file("parameters.yaml", bytes), "/", "squealcast");
         },
     },
+    Target { name: "configuration", read: |bytes| drop(squealcast::commands::read_config(&file("run.toml", bytes))) },
     Target {
         name: "log",
         read: |bytes| {
