@@ -6,6 +6,7 @@
 mod connection;
 pub mod lifecycle;
 pub mod log;
+mod managed;
 pub mod params_file;
 pub mod qos_overrides;
 pub mod received;

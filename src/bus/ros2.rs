@@ -24,7 +24,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use ros2_client::{Log, Message, MessageTypeName, ParameterValue, Publisher, ServiceTypeName};
+use ros2_client::{Message, MessageTypeName, ParameterValue, Publisher, ServiceTypeName};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -34,7 +34,8 @@ pub use self::parameters::{Accepted, Describe, Parameters, Validate};
 use self::discovery::Discovery;
 use self::link::{Durability, Link, MAX_ANSWER, MAX_BLOCKS_WAITING, MAX_UNANSWERED, MAX_WAITING};
 use super::lifecycle::State;
-use super::log::Severity;
+use super::log::{Line, ROSOUT, Severity};
+use super::managed::Changed;
 use super::received::{Counters, Counts, Received};
 use super::ros_args::{RosArgs, RosArgsError};
 use super::{Bus, type_descriptions};
@@ -49,8 +50,6 @@ pub const NODE_NAME: &str = "squealcast";
 /// Name of the rig's node before remapping.
 pub const SOURCE_NODE_NAME: &str = "rig";
 
-/// The topic of log lines, one for all namespaces.
-const ROSOUT: &str = "/rosout";
 /// Name of the node of a replay.
 pub(super) const REPLAY_NODE_NAME: &str = "squealcast_replay";
 
@@ -98,6 +97,8 @@ pub struct Ros2Options {
     pub loopback_only: bool,
     /// Names and remappings.
     pub args: RosArgs,
+    /// The node has its lifecycle services elsewhere: it is joined over DDS too.
+    pub is_managed_elsewhere: bool,
 }
 
 impl Ros2Options {
@@ -113,7 +114,7 @@ impl Ros2Options {
             note!("{NOTE}{warning}");
         }
         let loopback_only = loopback_only || discovery.loopback_only;
-        Ok(Self { middleware: Middleware::Dds, domain_id, loopback_only, args })
+        Ok(Self { middleware: Middleware::Dds, domain_id, loopback_only, args, is_managed_elsewhere: false })
     }
 
     /// Over Zenoh. Who is found depends on the settings of the session, not on the variables of DDS.
@@ -124,7 +125,8 @@ impl Ros2Options {
         if !super::zenoh::BUILT_IN {
             return Err(Ros2Error::NoZenoh);
         }
-        Ok(Self { middleware: Middleware::Zenoh, domain_id: domain(domain_id)?, loopback_only, args })
+        let domain_id = domain(domain_id)?;
+        Ok(Self { middleware: Middleware::Zenoh, domain_id, loopback_only, args, is_managed_elsewhere: false })
     }
 }
 
@@ -175,7 +177,7 @@ struct Beside {
     waveform: Box<dyn FnMut(Received<Waveform>) + Send>,
     /// The state in which the node starts, and what gets every later one.
     state: State,
-    changed: lifecycle::Changed,
+    changed: Changed,
 }
 
 /// The node's side: receives operating points, the measured vibration, temperatures and samples, and publishes all other
@@ -192,7 +194,7 @@ pub struct Ros2 {
     diagnostics: Publisher<DiagnosticArray>,
     heard: Publisher<Heard>,
     /// `None` if the user has switched it off.
-    rosout: Option<Publisher<Log>>,
+    rosout: Option<Publisher<Line>>,
     /// Counts of the blocks of samples.
     waveform_counters: Arc<Counters>,
     beats: Arc<AtomicU64>,
@@ -377,17 +379,7 @@ impl Ros2 {
     /// [`Ros2Error::Publish`].
     pub fn log(&self, severity: Severity, text: &str) -> Result<(), Ros2Error> {
         let Some(rosout) = self.rosout.as_ref().filter(|_| self.link.logs(severity)) else { return Ok(()) };
-        let now = self.link.node().time_now().into();
-        let line = Log {
-            stamp: now,
-            level: severity as u8,
-            name: self.full_name().trim_start_matches('/').replace('/', "."),
-            msg: text.to_owned(),
-            file: String::new(),
-            function: String::new(),
-            line: 0,
-        };
-        publish(rosout, ROSOUT, &line)
+        publish(rosout, ROSOUT, &Line::new(&self.full_name(), severity, text))
     }
 
     /// Number of readers of the predictions, including killed ones whose lease has not expired. A [`Ros2Source`] counts

@@ -90,7 +90,8 @@ impl BusOptions {
                 ros2 = Some(Ros2Options::new(self.domain, self.loopback, args.clone())?);
             }
             if matches!(rmw, Rmw::Zenoh | Rmw::Both) {
-                zenoh = Some(Ros2Options::over_zenoh(self.domain, self.loopback, args)?);
+                let options = Ros2Options::over_zenoh(self.domain, self.loopback, args)?;
+                zenoh = Some(Ros2Options { is_managed_elsewhere: ros2.is_some(), ..options });
             }
         }
         Ok(Buses { shm, ros2, zenoh, options: self.clone() })
@@ -116,7 +117,7 @@ pub struct NodeStart {
 /// What tells a user how to do without a bus that cannot be joined.
 const SHM_FAILED: &str = "shared memory; --no-shm stays off it";
 const ROS2_FAILED: &str = "ROS 2; --no-ros stays off it";
-const MANAGED_ALONE: &str = "--managed needs ROS 2 over DDS, over which the node is configured";
+const MANAGED_ALONE: &str = "--managed needs ROS 2, over which the node is configured";
 const ZENOH_FAILED: &str = "Zenoh; --rmw dds stays off it";
 const NO_BUS: &str = "no bus to publish on: --no-shm and --no-ros are both given";
 
@@ -158,7 +159,7 @@ impl Buses {
         state: State,
         sink: &Arc<dyn Sink>,
     ) -> anyhow::Result<Vec<Box<dyn Connection>>> {
-        ensure!(state == State::Active || self.ros2.is_some(), MANAGED_ALONE);
+        ensure!(state == State::Active || self.ros().is_some(), MANAGED_ALONE);
         self.join(|bus| match bus {
             Bus::Shm => boxed(self.shm.as_ref().map(|shm| ShmConnection::of_node(shm, sink)), SHM_FAILED),
             Bus::Ros2 => {

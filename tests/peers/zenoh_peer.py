@@ -78,12 +78,14 @@ class Node:
         self.token("MS", topic, kind)
         return subscriber
 
-    def subscribe_latched(self, topic, kind, take):
+    def subscribe_latched(self, topic, kind, take, depth=1):
         """As a transient-local subscription: it asks publishers for what they keep."""
+        import zenoh.ext
+
         hear = lambda sample: take(self.store.deserialize_cdr(sample.payload.to_bytes(), kind))  # noqa: E731
-        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=depth)
         subscriber = zenoh.ext.declare_advanced_subscriber(self.session, self.key(topic, kind), hear, history=history)
-        self.token("MS", topic, kind, durability="1", depth=1)
+        self.token("MS", topic, kind, durability="1", depth=depth)
         return subscriber
 
     def peers(self, code, topic, kind):
@@ -93,6 +95,7 @@ class Node:
         return [token for token in tokens if f"/{code}/" in token and f"/{end}/" in token and self.zid not in token]
 
 
+NOTHING = "uint8 structure_needs_at_least_one_member"  # what rosidl makes of an empty request
 # Requests and responses of services, which rosbags does not have.
 SERVICES = {
     "rcl_interfaces/srv/ListParameters": ("string[] prefixes\nuint64 depth", "ListParametersResult result"),
@@ -106,6 +109,10 @@ SERVICES = {
         "bool successful\nstring failure_reason\nTypeDescription type_description\nTypeSource[] type_sources\n"
         "KeyValue[] extra_information",
     ),
+    "lifecycle_msgs/srv/ChangeState": ("Transition transition", "bool success"),
+    "lifecycle_msgs/srv/GetState": (NOTHING, "State current_state"),
+    "lifecycle_msgs/srv/GetAvailableStates": (NOTHING, "State[] available_states"),
+    "lifecycle_msgs/srv/GetAvailableTransitions": (NOTHING, "TransitionDescription[] available_transitions"),
 }
 
 
@@ -192,6 +199,21 @@ class Client:
         expect(answer.successful and "friction_margin" in fields, f"not described: {answer.failure_reason}")
 
 
+def session(router, lease_ms=10_000):
+    """A session of a participant as rmw_zenoh opens it."""
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", '"peer"'),
+        ("connect/endpoints", f'["tcp/127.0.0.1:{router}"]'),
+        ("listen/endpoints", '["tcp/127.0.0.1:0"]'),
+        ("scouting/multicast/enabled", "false"),
+        ("timestamping/enabled", "true"),
+        ("transport/link/tx/lease", str(lease_ms)),
+    ):
+        config.insert_json5(key, value)
+    return zenoh.open(config)
+
+
 def main() -> int:
     parser = arguments(__doc__.splitlines()[0])
     parser.add_argument("--router", type=int, required=True, help="port of the router on 127.0.0.1")
@@ -200,18 +222,6 @@ def main() -> int:
     parser.add_argument("--services", type=Path, help="JSON of service types and their hashes: calls the services")
     args = parser.parse_args()
     bound_run_time(run_time_limit(args))
-    import zenoh.ext  # noqa: F401
-
-    config = zenoh.Config()
-    for key, value in (
-        ("mode", '"peer"'),
-        ("connect/endpoints", f'["tcp/127.0.0.1:{args.router}"]'),
-        ("listen/endpoints", '["tcp/127.0.0.1:0"]'),
-        ("scouting/multicast/enabled", "false"),
-        ("timestamping/enabled", "true"),
-        ("transport/link/tx/lease", str(args.lease_ms)),
-    ):
-        config.insert_json5(key, value)
     exchange = Exchange(args)
     store = typestore()
     Point = store.types["squealcast_msgs/msg/OperatingPoint"]
@@ -220,8 +230,8 @@ def main() -> int:
     def read(message) -> None:
         exchange.answer(Answer.of(message))
 
-    with zenoh.open(config) as session:
-        node = Node(session, store, args.domain, "zenoh_peer")
+    with session(args.router, args.lease_ms) as joined:
+        node = Node(joined, store, args.domain, "zenoh_peer")
         publish = node.publisher("/rig/operating_point", "squealcast_msgs/msg/OperatingPoint")
         _predictions = node.subscribe("/squealcast/prediction", "squealcast_msgs/msg/Prediction", read)
         inputs = lambda: node.peers("MS", "/rig/operating_point", "squealcast_msgs/msg/OperatingPoint")  # noqa: E731

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use ros2_client::{
-    Context, Log, Message, MessageTypeName, Name, Node, NodeName, Publisher, QosProfile, Server, ServiceMapping,
+    Context, Message, MessageTypeName, Name, Node, NodeName, Publisher, QosProfile, Server, ServiceMapping,
     ServiceTypeName,
 };
 use rustdds::policy::{History, Lifespan, Reliability, ResourceLimits};
@@ -23,8 +23,8 @@ use super::super::received::{Counters, Counts, Gaps, Received};
 use super::loopback::keep_to_loopback;
 use super::qos_conflicts::QosConflicts;
 use super::subscriptions::{Refused, Subscriptions};
-use super::{Parameters, ROSOUT, Ros2Error, Ros2Options, parameters, received};
-use crate::bus::log::Severity;
+use super::{Parameters, Ros2Error, Ros2Options, parameters, received};
+use crate::bus::log::{KEPT_LINES, Line, ROSOUT, Severity};
 use crate::bus::qos_overrides::{Chosen, QosOverrides, Role};
 use crate::msgs::topic;
 
@@ -39,8 +39,7 @@ pub(super) const MAX_BLOCKS_WAITING: i32 = 1024;
 /// readers.
 pub(super) const MAX_UNANSWERED: i32 = 1 << 15;
 
-/// Lines of `/rosout` that are kept for later readers, and for how long, as in every ROS 2 node.
-const LOG_DEPTH: i32 = 1000;
+/// How long lines of `/rosout` are kept for later readers, as in every ROS 2 node.
 const LOG_LIFESPAN: Duration = Duration::from_secs(10);
 /// Requests of a service that may wait for its answer.
 const REQUESTS_WAITING: i32 = 1000;
@@ -151,13 +150,13 @@ impl<M: DeserializeOwned + Send + Sync + 'static> Link<M> {
     }
 
     /// The publisher of log lines; `None` if the user has switched it off.
-    pub(super) fn rosout(&mut self) -> Result<Option<Publisher<Log>>, Ros2Error> {
+    pub(super) fn rosout(&mut self) -> Result<Option<Publisher<Line>>, Ros2Error> {
         if self.options.args.log_level().is_none() {
             return Ok(None);
         }
         let limits =
             ResourceLimits { max_samples: MAX_UNANSWERED, max_instances: 1, max_samples_per_instance: MAX_UNANSWERED };
-        let qos = qos(Chosen::default(), Durability::TransientLocal, RELIABLE, LOG_DEPTH)
+        let qos = qos(Chosen::default(), Durability::TransientLocal, RELIABLE, KEPT_LINES)
             .lifespan(Lifespan { duration: LOG_LIFESPAN })
             .resource_limits(limits)
             .build();

@@ -19,9 +19,9 @@ use std::time::{Duration, Instant};
 use crossbeam_channel::{Receiver, Sender, bounded, select};
 
 use super::frame::{Frames, FromSide, MAX_FROM_SIDE, Next, Start, Status, ToSide, encode};
-use super::{NOTE, ROSOUT, Ros2Error, Ros2Options};
+use super::{NOTE, Ros2Error, Ros2Options};
 use crate::bus::lifecycle::State;
-use crate::bus::log::Severity;
+use crate::bus::log::{ROSOUT, Severity};
 use crate::bus::received::{Counts, Received};
 use crate::msgs::{
     DiagnosticArray, Heard, OperatingPoint, Prediction, RigInfo, Sensitivity, SessionEvent, SessionEventKind,

@@ -146,9 +146,9 @@ fn join(start: Start, validate: Validate, describe: Describe, node: &ToNode) -> 
             parameters.send(&FromSide::Parameter { name: name.to_owned(), value });
         }),
     };
+    let changed = Box::new(move |state| states.send(&FromSide::Lifecycle(state)));
     match start.options.middleware {
         Middleware::Dds => {
-            let changed = Box::new(move |state| states.send(&FromSide::Lifecycle(state)));
             let beside = Some(Beside { temperature, waveform, state: start.state, changed });
             let ros2 = Ros2::start_with(&start.options, declared, MAX_UNANSWERED, input, vibration, beside)?;
             Ok(Box::new(ros2))
@@ -163,6 +163,8 @@ fn join(start: Start, validate: Validate, describe: Describe, node: &ToNode) -> 
                 prediction: None,
             },
             declared,
+            start.state,
+            changed,
         ),
     }
 }

@@ -2,12 +2,20 @@
 
 use super::Receivers;
 use crate::bus::Connection;
+use crate::bus::lifecycle::State;
+use crate::bus::managed::Changed;
 use crate::bus::ros2::member::Member;
 use crate::bus::ros2::{Parameters, Ros2Error, Ros2Options};
 
 /// # Errors
 /// Always [`Ros2Error::NoZenoh`].
-pub fn member(_: &Ros2Options, _: Receivers, _: Parameters) -> Result<Box<dyn Member>, Ros2Error> {
+pub fn member(
+    _: &Ros2Options,
+    _: Receivers,
+    _: Parameters,
+    _: State,
+    _: Changed,
+) -> Result<Box<dyn Member>, Ros2Error> {
     Err(Ros2Error::NoZenoh)
 }
 

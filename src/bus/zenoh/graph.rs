@@ -135,7 +135,7 @@ mod tests {
 
     fn endpoint(topic: Topic) -> Endpoint {
         let (name, hash) = (topic.name().to_owned(), topic.type_hash());
-        Endpoint { name, dds_type: dds_type(topic.type_name()), hash, latched: false, depth: 64 }
+        Endpoint { name, dds_type: dds_type(topic.type_name()), hash, depth: 64, ..Endpoint::default() }
     }
 
     #[test]

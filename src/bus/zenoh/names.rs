@@ -64,10 +64,12 @@ impl NodeKey {
 
     /// The liveliness token of its endpoint with this number.
     pub(super) fn endpoint_token(&self, number: u32, kind: Kind, endpoint: &Endpoint) -> String {
-        let Endpoint { name, dds_type, hash, latched, depth } = endpoint;
+        let Endpoint { name, dds_type, hash, latched, depth, best_effort, keep_all } = endpoint;
+        // Numbers of the policies in rmw; those of its default are left out.
+        let reliability = if *best_effort { "2" } else { "" };
         let durability = if *latched { "1" } else { "" };
-        // Reliable; values that are the default of rmw are left out.
-        let qos = format!(":{durability}:,{depth}:,:,:,,");
+        let history = if *keep_all { "2" } else { "" };
+        let qos = format!("{reliability}:{durability}:{history},{depth}:,:,:,,");
         format!("{}/{}/{dds_type}/{hash}/{qos}", self.token_of(number, kind.code()), mangled(name))
     }
 
@@ -78,15 +80,17 @@ impl NodeKey {
 }
 
 /// A topic, or service, as one endpoint of a node offers or requests it.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Endpoint {
     /// Absolute, after remapping.
     pub name: String,
     pub dds_type: String,
     pub hash: String,
-    /// Whether late subscribers get the last message.
+    /// Whether late subscribers get the last messages: transient local.
     pub latched: bool,
     pub depth: i32,
+    pub best_effort: bool,
+    pub keep_all: bool,
 }
 
 /// A publisher or subscriber of a peer, according to its token.
@@ -171,8 +175,8 @@ mod tests {
             name: "/chatter".to_owned(),
             dds_type: "std_msgs::msg::dds_::String_".to_owned(),
             hash: HASH.to_owned(),
-            latched: false,
             depth: 7,
+            ..Endpoint::default()
         };
         let token = node.endpoint_token(10, Kind::Publisher, &endpoint);
         assert_eq!(
@@ -187,6 +191,8 @@ mod tests {
         assert_eq!(peer.session, node.session);
         endpoint.latched = true;
         assert!(node.endpoint_token(10, Kind::Subscriber, &endpoint).ends_with("/:1:,7:,:,:,,"));
+        let endpoint = Endpoint { best_effort: true, keep_all: true, ..endpoint };
+        assert!(node.endpoint_token(10, Kind::Subscriber, &endpoint).ends_with("/2:1:2,7:,:,:,,"));
         let left = NodeKey { namespace: "/left".to_owned(), ..node };
         assert!(left.token().ends_with("/NN/%/%left/talker"), "{}", left.token());
     }

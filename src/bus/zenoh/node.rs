@@ -6,18 +6,25 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use ::zenoh::liveliness::LivelinessToken;
 use ::zenoh::pubsub::{Publisher, Subscriber};
-use ::zenoh::qos::CongestionControl;
+use ::zenoh::qos::{CongestionControl, Reliability};
 use ::zenoh::sample::{Sample, SampleKind};
 use ::zenoh::{Session, Wait};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt, CacheConfig};
+use zenoh_ext::{
+    AdvancedPublisher, AdvancedPublisherBuilderExt, AdvancedSubscriber, AdvancedSubscriberBuilderExt, CacheConfig,
+    HistoryConfig,
+};
 
 use super::graph::{Graph, Own};
 use super::names::{Attachment, Endpoint, Gid, Kind, NodeKey, all_tokens, dds_type, gid, topic_key};
 use super::parameters::Store;
+use super::service_types::{self, LOG};
 use super::services::Server;
 use super::{Receivers, Take, config, linger};
+use crate::bus::log::{KEPT_LINES, Line, ROSOUT, Severity};
+use crate::bus::managed::Managed;
+use crate::bus::qos_overrides::{Chosen, QosOverrides, Role};
 use crate::bus::received::{Counters, Counts, Gaps, Received};
 use crate::bus::ros2::{NOTE, Parameters, Ros2Error, Ros2Options};
 use crate::bus::{Bus, Outgoing};
@@ -31,6 +38,8 @@ pub(super) struct ZenohNode {
     publishers: HashMap<Topic, Out>,
     _subscribers: Vec<In>,
     _servers: Vec<Server>,
+    /// Of log lines, and the least severity of those that are wanted; `None` of a rig or a replay.
+    rosout: Option<(Out, Severity)>,
     /// Its parameters; `None` of a rig or a replay.
     store: Option<Arc<Store>>,
     _token: LivelinessToken,
@@ -44,8 +53,14 @@ pub(super) struct ZenohNode {
     _session: Session,
 }
 
+/// What a node offers beside its topics.
+pub(super) struct Offered {
+    pub parameters: Parameters,
+    pub managed: Option<Managed>,
+}
+
 /// A publisher and its token.
-struct Out {
+pub(super) struct Out {
     _token: LivelinessToken,
     publisher: Sender,
     gid: Gid,
@@ -62,7 +77,17 @@ enum Sender {
 /// A subscriber and its token.
 struct In {
     _token: LivelinessToken,
-    _subscriber: Subscriber<()>,
+    _subscriber: Receiver,
+}
+
+enum Receiver {
+    Plain {
+        _subscriber: Subscriber<()>,
+    },
+    /// Asks publishers for the messages that they keep.
+    Latched {
+        _subscriber: AdvancedSubscriber<()>,
+    },
 }
 
 /// Declares the endpoints of a node.
@@ -78,14 +103,14 @@ pub(super) fn failed(what: &str) -> impl Fn(::zenoh::Error) -> Ros2Error {
 }
 
 impl ZenohNode {
-    /// Joins with a node that publishes these topics and receives what `receivers` take. With `parameters` it offers the
-    /// services of a node.
+    /// Joins with a node that publishes these topics and receives what `receivers` take. With `offered` it has the services
+    /// and the log of a node.
     pub(super) fn join(
         options: &Ros2Options,
         default_name: &str,
         published: &[Topic],
         receivers: Receivers,
-        parameters: Option<Parameters>,
+        offered: Option<Offered>,
     ) -> Result<Self, Ros2Error> {
         let name = options.args.node_name(default_name);
         let namespace = options.args.namespace(&name, "/");
@@ -101,10 +126,15 @@ impl ZenohNode {
             namespace: namespace.clone(),
             name: name.clone(),
         };
+        let overrides = match offered {
+            Some(_) => options.args.qos_overrides(&namespace, &name)?.0,
+            None => QosOverrides::default(),
+        };
         let own = |topic: Topic, kind| -> Result<Own, Ros2Error> {
             let name = options.args.topic(topic::relative(topic.name()), &namespace, &name);
             name.split('/').skip(1).try_for_each(check_name)?;
-            Ok(Own { topic, kind, endpoint: endpoint(topic, name) })
+            let chosen = overrides.of(Role::of_node(topic), &name);
+            Ok(Own { topic, kind, endpoint: endpoint(topic, name, chosen) })
         };
         let received = receivers.topics();
         let published: Vec<Own> =
@@ -120,12 +150,25 @@ impl ZenohNode {
             published.iter().map(|own| Ok((own.topic, builder.publisher(own)?))).collect::<Result<_, Ros2Error>>()?;
         let (counters, waveform_counters) = (Arc::<Counters>::default(), Arc::<Counters>::default());
         let subscribers = builder.subscribe_all(&received, receivers, &counters, &waveform_counters)?;
-        let store = parameters.map(|parameters| Arc::new(Store::new(parameters)));
-        let servers = store.as_ref().map(|store| builder.services(options, store)).transpose()?.unwrap_or_default();
+        let (mut store, mut servers, mut rosout) = (None, vec![], None);
+        if let Some(Offered { parameters, managed }) = offered {
+            let parameters = Arc::new(Store::new(parameters, &overrides));
+            servers = builder.services(options, &parameters)?;
+            if let Some(managed) = managed {
+                servers.extend(builder.lifecycle(options, managed)?);
+            }
+            rosout = options
+                .args
+                .log_level()
+                .map(|least| Ok::<_, Ros2Error>((builder.rosout(options)?, least)))
+                .transpose()?;
+            store = Some(parameters);
+        }
         Ok(Self {
             publishers,
             _subscribers: subscribers,
             _servers: servers,
+            rosout,
             store,
             _token: token,
             _peers: peers,
@@ -151,26 +194,20 @@ impl ZenohNode {
             Outgoing::Waveform(message) => self.put(Topic::Waveform, message),
             Outgoing::Heard(message) => self.put(Topic::Heard, message),
             Outgoing::Temperature(message) => self.put(Topic::Temperature, message),
-            // The log is on DDS only.
-            Outgoing::Log(..) => Ok(()),
+            Outgoing::Log(severity, text) => self.log(severity, text),
         }
     }
 
     fn put(&self, topic: Topic, message: &impl Serialize) -> Result<(), Ros2Error> {
-        let Some(out) = self.publishers.get(&topic) else { return Ok(()) };
-        let refused = |reason: String| Ros2Error::Publish { topic: topic.name(), reason };
-        let bytes = to_cdr(message).map_err(|error| refused(error.to_string()))?;
-        let attachment = Attachment {
-            sequence: out.sequence.fetch_add(1, Ordering::Relaxed) + 1,
-            published_ns: clock::now_ns(),
-            publisher: out.gid,
-        };
-        let attachment = attachment.to_bytes().to_vec();
-        let put = match &out.publisher {
-            Sender::Plain(publisher) => publisher.put(bytes).attachment(attachment).wait(),
-            Sender::Latched(publisher) => publisher.put(bytes).attachment(attachment).wait(),
-        };
-        put.map_err(|error| refused(error.to_string()))
+        self.publishers.get(&topic).map_or(Ok(()), |out| out.put(topic.name(), message))
+    }
+
+    /// Writes a line to `/rosout`, unless the user wants only more severe ones.
+    fn log(&self, severity: Severity, text: &str) -> Result<(), Ros2Error> {
+        match &self.rosout {
+            Some((out, least)) if severity >= *least => out.put(ROSOUT, &Line::new(&self.full_name(), severity, text)),
+            _ => Ok(()),
+        }
     }
 
     /// Number of subscribers of a topic that this node publishes.
@@ -212,6 +249,25 @@ impl ZenohNode {
     }
 }
 
+impl Out {
+    /// Publishes a message. `topic` names it in errors.
+    pub(super) fn put(&self, topic: &'static str, message: &impl Serialize) -> Result<(), Ros2Error> {
+        let refused = |reason: String| Ros2Error::Publish { topic, reason };
+        let bytes = to_cdr(message).map_err(|error| refused(error.to_string()))?;
+        let attachment = Attachment {
+            sequence: self.sequence.fetch_add(1, Ordering::Relaxed) + 1,
+            published_ns: clock::now_ns(),
+            publisher: self.gid,
+        };
+        let attachment = attachment.to_bytes().to_vec();
+        let put = match &self.publisher {
+            Sender::Plain(publisher) => publisher.put(bytes).attachment(attachment).wait(),
+            Sender::Latched(publisher) => publisher.put(bytes).attachment(attachment).wait(),
+        };
+        put.map_err(|error| refused(error.to_string()))
+    }
+}
+
 /// Follows the liveliness tokens of a domain.
 fn watch(session: &Session, domain: u16, graph: Arc<Graph>) -> Result<Subscriber<()>, Ros2Error> {
     let look = move |sample: Sample| match sample.kind() {
@@ -226,15 +282,26 @@ fn watch(session: &Session, domain: u16, graph: Arc<Graph>) -> Result<Subscriber
     subscriber.wait().map_err(failed("peers"))
 }
 
-fn endpoint(topic: Topic, name: String) -> Endpoint {
+fn endpoint(topic: Topic, name: String, chosen: Chosen) -> Endpoint {
+    let latched = chosen.transient_local.unwrap_or(topic.is_latched());
+    // Late subscribers get the latest message only.
     let depth = if topic.is_latched() { 1 } else { topic::DEPTH };
     Endpoint {
         name,
         dds_type: dds_type(topic.type_name()),
         hash: topic.type_hash(),
-        latched: topic.is_latched(),
-        depth,
+        latched,
+        depth: chosen.depth.unwrap_or(depth),
+        best_effort: chosen.best_effort.unwrap_or(false),
+        keep_all: chosen.keep_all.unwrap_or(false),
     }
+}
+
+/// The endpoint of a message that is not among our topics, `package/Type`.
+pub(super) fn message_endpoint(short: &str, name: String) -> Result<Endpoint, Ros2Error> {
+    let found = service_types::message(short).map_err(|error| Ros2Error::Zenoh(format!("{name}: {error}")))?;
+    let (type_name, hash) = found;
+    Ok(Endpoint { name, dds_type: dds_type(&type_name), hash, depth: topic::DEPTH, ..Endpoint::default() })
 }
 
 /// A part of a name: letters, digits and underscores, not beginning with a digit.
@@ -261,18 +328,31 @@ impl Builder<'_> {
     }
 
     fn publisher(&mut self, own: &Own) -> Result<Out, Ros2Error> {
-        let failed = failed(&own.endpoint.name);
+        self.out(own.kind, &own.endpoint)
+    }
+
+    /// The publisher of log lines, one topic for all namespaces.
+    fn rosout(&mut self, options: &Ros2Options) -> Result<Out, Ros2Error> {
+        let name = options.args.topic(ROSOUT, &self.key.namespace, &self.key.name);
+        let endpoint = Endpoint { latched: true, depth: KEPT_LINES, ..message_endpoint(LOG, name)? };
+        self.out(Kind::Publisher, &endpoint)
+    }
+
+    /// Declares a publisher.
+    pub(super) fn out(&mut self, kind: Kind, endpoint: &Endpoint) -> Result<Out, Ros2Error> {
+        let failed = failed(&endpoint.name);
+        let reliability = if endpoint.best_effort { Reliability::BestEffort } else { Reliability::Reliable };
         // A peer that does not read must delay nobody: what does not fit into the queue to it is dropped.
-        let publisher =
-            self.session.declare_publisher(self.key(&own.endpoint)).congestion_control(CongestionControl::Drop);
-        let publisher = if own.endpoint.latched {
-            let kept = CacheConfig::default().max_samples(own.endpoint.depth as usize);
+        let publisher = self.session.declare_publisher(self.key(endpoint));
+        let publisher = publisher.congestion_control(CongestionControl::Drop).reliability(reliability);
+        let publisher = if endpoint.latched {
+            let kept = CacheConfig::default().max_samples(endpoint.depth as usize);
             Sender::Latched(publisher.cache(kept).publisher_detection().wait().map_err(&failed)?)
         } else {
             Sender::Plain(publisher.wait().map_err(&failed)?)
         };
         // The token last: who sees it may subscribe at once.
-        let (token, text) = self.token(own.kind, &own.endpoint)?;
+        let (token, text) = self.token(kind, endpoint)?;
         Ok(Out { _token: token, publisher, gid: gid(&text), sequence: AtomicI64::new(0) })
     }
 
@@ -329,8 +409,14 @@ impl Builder<'_> {
             counters.received(gaps.note(attachment.publisher, seq(&message)));
             take(Received::now(Bus::Zenoh, message));
         };
-        let subscriber = self.session.declare_subscriber(self.key(&own.endpoint)).callback(hear).wait();
-        let subscriber = subscriber.map_err(failed(&own.endpoint.name))?;
+        let Endpoint { name, latched, depth, .. } = &own.endpoint;
+        let subscriber = self.session.declare_subscriber(self.key(&own.endpoint)).callback(hear);
+        let subscriber = if *latched {
+            let history = HistoryConfig::default().detect_late_publishers().max_samples(*depth as usize);
+            Receiver::Latched { _subscriber: subscriber.history(history).wait().map_err(failed(name))? }
+        } else {
+            Receiver::Plain { _subscriber: subscriber.wait().map_err(failed(name))? }
+        };
         Ok(In { _token: self.token(own.kind, &own.endpoint)?.0, _subscriber: subscriber })
     }
 }

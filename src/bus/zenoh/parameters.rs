@@ -1,14 +1,18 @@
-//! The parameter services of a node, answered from its parameters: all are numbers.
+//! The parameter services of a node, answered from its parameters: numbers that can be set, and the choice of quality of
+//! service, which cannot.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};
 
+use crate::bus::qos_overrides::QosOverrides;
 use crate::bus::ros2::Parameters;
 
 /// Numbers of types in `rcl_interfaces/ParameterType`.
 const NOT_SET: u8 = 0;
+const INTEGER: u8 = 2;
 const DOUBLE: u8 = 3;
+const STRING: u8 = 4;
 
 /// `rcl_interfaces/ParameterValue`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -100,12 +104,18 @@ pub(super) struct Store {
     parameters: Parameters,
     /// Present values.
     values: Mutex<Vec<(String, f64)>>,
+    read_only: Vec<(String, Value)>,
 }
 
 impl Store {
-    pub(super) fn new(mut parameters: Parameters) -> Self {
+    pub(super) fn new(mut parameters: Parameters, overrides: &QosOverrides) -> Self {
         let values = Mutex::new(std::mem::take(&mut parameters.values));
-        Self { parameters, values }
+        let value = |text: &str| match text.parse() {
+            Ok(integer_value) => Value { kind: INTEGER, integer_value, ..Value::default() },
+            Err(_) => Value { kind: STRING, string_value: text.to_owned(), ..Value::default() },
+        };
+        let read_only = overrides.parameters().map(|(name, text)| (name.to_owned(), value(text))).collect();
+        Self { parameters, values, read_only }
     }
 
     fn values(&self) -> MutexGuard<'_, Vec<(String, f64)>> {
@@ -119,27 +129,28 @@ impl Store {
         }
     }
 
-    fn value(&self, name: &str) -> Option<f64> {
-        self.values().iter().find(|(known, _)| known == name).map(|(_, value)| *value)
+    /// The value of a parameter; one of the type `NOT_SET` if there is none of this name.
+    fn value(&self, name: &str) -> Value {
+        let read_only = || self.read_only.iter().find(|(known, _)| known == name).map(|(_, value)| value.clone());
+        match self.values().iter().find(|(known, _)| known == name) {
+            Some(&(_, double_value)) => Value { kind: DOUBLE, double_value, ..Value::default() },
+            None => read_only().unwrap_or(Value { kind: NOT_SET, ..Value::default() }),
+        }
     }
 
     pub(super) fn get(&self, request: &Names) -> Vec<Value> {
-        let value = |name: &String| match self.value(name) {
-            Some(double_value) => Value { kind: DOUBLE, double_value, ..Value::default() },
-            None => Value { kind: NOT_SET, ..Value::default() },
-        };
-        request.names.iter().map(value).collect()
+        request.names.iter().map(|name| self.value(name)).collect()
     }
 
     pub(super) fn types(&self, request: &Names) -> Vec<u8> {
-        request.names.iter().map(|name| if self.value(name).is_some() { DOUBLE } else { NOT_SET }).collect()
+        request.names.iter().map(|name| self.value(name).kind).collect()
     }
 
     pub(super) fn list(&self, request: &Prefixes) -> Listed {
         let wanted = |name: &str| request.prefixes.is_empty() || request.prefixes.iter().any(|prefix| prefix == name);
         let values = self.values();
-        let names = values.iter().map(|(name, _)| name).filter(|name| wanted(name)).cloned().collect();
-        Listed { names, prefixes: vec![] }
+        let all = values.iter().map(|(name, _)| name).chain(self.read_only.iter().map(|(name, _)| name));
+        Listed { names: all.filter(|name| wanted(name)).cloned().collect(), prefixes: vec![] }
     }
 
     pub(super) fn describe(&self, request: &Names) -> Vec<Descriptor> {
@@ -156,6 +167,7 @@ impl Store {
             kind,
             description: description.unwrap_or_default().to_owned(),
             floating_point_range: range.into_iter().collect(),
+            read_only: self.read_only.iter().any(|(known, _)| known == name),
             ..Descriptor::default()
         }
     }
@@ -185,6 +197,9 @@ impl Store {
 
     fn check(&self, values: &[(String, f64)], parameter: &Parameter) -> Result<(), String> {
         let Parameter { name, value } = parameter;
+        if self.read_only.iter().any(|(known, _)| known == name) {
+            return Err(format!("{name} is read-only"));
+        }
         if !values.iter().any(|(known, _)| known == name) {
             return Err(format!("{name} is no parameter of this node"));
         }
@@ -211,12 +226,13 @@ mod tests {
     fn parameters_are_set_together_or_not_at_all() {
         let accepted = Arc::new(Mutex::new(vec![]));
         let seen = accepted.clone();
-        let store = Store::new(Parameters {
+        let parameters = Parameters {
             values: vec![("a".to_owned(), 1.0), ("b".to_owned(), 2.0)],
             describe: |name| (name == "a").then_some(("the first", [0.0, 10.0])),
             validate: Box::new(|name, value| if value < 10.0 { Ok(()) } else { Err(format!("{name} too large")) }),
             accepted: Box::new(move |name, value| seen.lock().expect("a lock").push((name.to_owned(), value))),
-        });
+        };
+        let store = Store::new(parameters, &QosOverrides::default());
         let names = |names: &[&str]| Names { names: names.iter().map(|&name| name.to_owned()).collect() };
         let outcomes = store.set(&Wishes { parameters: vec![wish("a", 3.0), wish("b", 11.0), wish("c", 0.0)] });
         assert_eq!(outcomes.iter().map(|outcome| outcome.successful).collect::<Vec<_>>(), [true, false, false]);
@@ -244,5 +260,23 @@ mod tests {
         assert_eq!(store.get(&names(&["b"]))[0].double_value, 7.0);
         let expected = [("a", 3.0), ("a", 5.0), ("b", 6.0)].map(|(name, value)| (name.to_owned(), value));
         assert_eq!(*accepted.lock().expect("a lock"), expected);
+    }
+
+    #[test]
+    fn a_chosen_quality_of_service_is_listed_and_kept() {
+        let mut overrides = QosOverrides::default();
+        for (name, value) in [("depth", "10"), ("reliability", "best_effort")] {
+            let name = format!("qos_overrides./x.publisher.{name}");
+            overrides.take(name, value.to_owned()).expect("valid");
+        }
+        let store = Store::new(Parameters::none(), &overrides);
+        let listed = store.list(&Prefixes::default()).names;
+        assert_eq!(listed.len(), 2);
+        let names = Names { names: listed.clone() };
+        assert_eq!(store.types(&names), [INTEGER, STRING]);
+        assert_eq!((store.get(&names)[0].integer_value, &*store.get(&names)[1].string_value), (10, "best_effort"));
+        assert!(store.describe(&names).iter().all(|described| described.read_only));
+        let refused = store.set_all(&[wish(&listed[0], 5.0)]);
+        assert_eq!(refused.reason, format!("{} is read-only", listed[0]));
     }
 }

@@ -1,7 +1,9 @@
 //! The participants: a node, a rig and a replay.
 
 use super::Receivers;
-use super::node::ZenohNode;
+use super::node::{Offered, ZenohNode};
+use crate::bus::lifecycle::State;
+use crate::bus::managed::{Changed, Managed};
 use crate::bus::ros2::member::Member;
 use crate::bus::ros2::{NODE_NAME, Parameters, REPLAY_NODE_NAME, Ros2Error, Ros2Options, SOURCE_NODE_NAME};
 use crate::bus::{Bus, BusError, Connection, Counts, Outgoing};
@@ -14,7 +16,8 @@ const OF_NODE: [Topic; 6] =
 /// Topics that a rig publishes.
 const OF_RIG: [Topic; 4] = [Topic::OperatingPoint, Topic::Vibration, Topic::Temperature, Topic::Waveform];
 
-/// Joins as a node with these parameters that receives what `receivers` take.
+/// Joins as a node with these parameters, which starts in `state` and receives what `receivers` take. `changed` gets every
+/// state into which a peer brings it.
 ///
 /// # Errors
 /// Settings or names that are not valid, or an error of Zenoh.
@@ -22,8 +25,12 @@ pub fn member(
     options: &Ros2Options,
     receivers: Receivers,
     parameters: Parameters,
+    state: State,
+    changed: Changed,
 ) -> Result<Box<dyn Member>, Ros2Error> {
-    Ok(Box::new(ZenohNode::join(options, NODE_NAME, &OF_NODE, receivers, Some(parameters))?))
+    let managed = (!options.is_managed_elsewhere).then(|| Managed::new(state, changed));
+    let offered = Offered { parameters, managed };
+    Ok(Box::new(ZenohNode::join(options, NODE_NAME, &OF_NODE, receivers, Some(offered))?))
 }
 
 /// Joins as a rig, which publishes what it measures.

@@ -1,6 +1,6 @@
-//! The services of a node, and the hashes of their types.
+//! The services of a node, and the hashes of their types and of messages that are not among our topics.
 
-use crate::bus::type_descriptions;
+use crate::bus::{managed, type_descriptions};
 use crate::msgs::type_description::{DefinitionError, TypeDescription};
 
 /// A service that a node offers.
@@ -13,10 +13,15 @@ pub(super) enum Service {
     ListParameters,
     DescribeParameters,
     GetTypeDescription,
+    ChangeState,
+    GetState,
+    GetAvailableStates,
+    GetAvailableTransitions,
+    GetTransitionGraph,
 }
 
-/// Messages that the requests and responses refer to.
-const MESSAGES: [(&str, &str); 15] = [
+/// These messages, and those that requests and responses refer to.
+const MESSAGES: [(&str, &str); 20] = [
     ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec"),
     (
         "service_msgs/ServiceEventInfo",
@@ -50,7 +55,30 @@ const MESSAGES: [(&str, &str); 15] = [
     ),
     ("type_description_interfaces/TypeSource", "string type_name\nstring encoding\nstring raw_file_contents"),
     ("type_description_interfaces/KeyValue", "string key\nstring value"),
+    (
+        "rcl_interfaces/Log",
+        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line",
+    ),
+    ("lifecycle_msgs/State", "uint8 id\nstring label"),
+    ("lifecycle_msgs/Transition", "uint8 id\nstring label"),
+    ("lifecycle_msgs/TransitionDescription", "Transition transition\nState start_state\nState goal_state"),
+    ("lifecycle_msgs/TransitionEvent", "uint64 timestamp\nTransition transition\nState start_state\nState goal_state"),
 ];
+
+/// What rosidl makes of an empty request.
+const NOTHING: &str = "uint8 structure_needs_at_least_one_member";
+/// Messages that a node publishes beside its topics.
+pub(super) const LOG: &str = "rcl_interfaces/Log";
+pub(super) const EVENT: &str = "lifecycle_msgs/TransitionEvent";
+
+/// `package/msg/Type` and the hash of one of [`MESSAGES`], given as `package/Type`.
+pub(super) fn message(short: &str) -> Result<(String, String), DefinitionError> {
+    let name = short.replace('/', "/msg/");
+    let definition = MESSAGES.iter().find(|(known, _)| *known == short).map(|(_, definition)| *definition);
+    let definition = definition.ok_or_else(|| DefinitionError::Undefined(name.clone()))?;
+    let hash = TypeDescription::of_message(&name, definition, &MESSAGES)?.hash();
+    Ok((name, hash))
+}
 
 impl Service {
     /// Its name after that of the node.
@@ -63,6 +91,11 @@ impl Service {
             Self::ListParameters => "list_parameters",
             Self::DescribeParameters => "describe_parameters",
             Self::GetTypeDescription => type_descriptions::SERVICE,
+            Self::ChangeState => managed::CHANGE_STATE,
+            Self::GetState => managed::GET_STATE,
+            Self::GetAvailableStates => managed::GET_AVAILABLE_STATES,
+            Self::GetAvailableTransitions => managed::GET_AVAILABLE_TRANSITIONS,
+            Self::GetTransitionGraph => managed::GET_TRANSITION_GRAPH,
         }
     }
 
@@ -89,6 +122,12 @@ impl Service {
                 "bool successful\nstring failure_reason\nTypeDescription type_description\nTypeSource[] type_sources\n\
                  KeyValue[] extra_information",
             ),
+            Self::ChangeState => ("lifecycle_msgs/srv/ChangeState", "Transition transition", "bool success"),
+            Self::GetState => ("lifecycle_msgs/srv/GetState", NOTHING, "State current_state"),
+            Self::GetAvailableStates => ("lifecycle_msgs/srv/GetAvailableStates", NOTHING, "State[] available_states"),
+            Self::GetAvailableTransitions | Self::GetTransitionGraph => {
+                ("lifecycle_msgs/srv/GetAvailableTransitions", NOTHING, "TransitionDescription[] available_transitions")
+            }
         }
     }
 
@@ -121,8 +160,21 @@ mod tests {
             (Service::ListParameters, "RIHS01_3e6062bfbb27bfb8730d4cef2558221f51a11646d78e7bb30a1e83afac3aad9d"),
             (Service::DescribeParameters, "RIHS01_845b484d71eb0673dae682f2e3ba3c4851a65a3dcfb97bddd82c5b57e91e4cff"),
             (Service::GetTypeDescription, "RIHS01_69b9c19c1021405984cc60dbbb1edceb147a6538b411d812ba6afabeed962cd5"),
+            (Service::ChangeState, "RIHS01_356fe34f0475a43acf54542013af4167b0e729f77ea22ffb045c6ad8e20668e5"),
+            (Service::GetState, "RIHS01_800a0a5aae599782b02932de0caf563f6dc4e7e94b794eadde075ba2cbef9795"),
+            (Service::GetAvailableStates, "RIHS01_00a07d79d2207d71e81a8cbc1880e5d924cc16d4688ea8e8e06e443dc8f8aa1d"),
+            (
+                Service::GetAvailableTransitions,
+                "RIHS01_59b7ecefce0982a8a844b9f2c4f14764c1c4543cc55e72924e2aa4adad83e9bc",
+            ),
         ] {
             assert_eq!(service.hash().expect("described"), hash, "{service:?}");
+        }
+        for (short, hash) in [
+            (LOG, "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac"),
+            (EVENT, "RIHS01_d5f8873a2f0146498f812d7885c7327ce27e463d36811d8792f35ee38c0d6c38"),
+        ] {
+            assert_eq!(message(short).expect("described").1, hash, "{short}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Serves the parameters and the type descriptions of a node.
+//! Serves the parameters, the type descriptions and the lifecycle of a node.
 
 use std::sync::Arc;
 
@@ -9,9 +9,10 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::names::{Attachment, Endpoint, Kind, dds_type};
-use super::node::{Builder, failed};
+use super::node::{Builder, failed, message_endpoint};
 use super::parameters::Store;
-use super::service_types::Service;
+use super::service_types::{EVENT, Service};
+use crate::bus::managed::{ChangeState, Managed, Nothing, TRANSITION_EVENT};
 use crate::bus::ros2::{Ros2Error, Ros2Options};
 use crate::bus::type_descriptions;
 use crate::msgs::{from_cdr, to_cdr};
@@ -45,6 +46,24 @@ impl Builder<'_> {
         Ok(all)
     }
 
+    /// Offers the services of a managed node, and the topic of its transitions.
+    pub(super) fn lifecycle(&mut self, options: &Ros2Options, managed: Managed) -> Result<Vec<Server>, Ros2Error> {
+        let name = options.args.topic(TRANSITION_EVENT, &self.key.namespace, &self.key.name);
+        let events = self.out(Kind::Publisher, &message_endpoint(EVENT, name)?)?;
+        let node = Arc::new(managed);
+        let [changing, current, available] = std::array::from_fn(|_| node.clone());
+        Ok(vec![
+            self.service(options, Service::ChangeState, move |asked: ChangeState| {
+                // Without it a peer still learns of the change from the answer.
+                changing.change(&asked, |event| drop(events.put(TRANSITION_EVENT, &event)))
+            })?,
+            self.service(options, Service::GetState, move |_: Nothing| current.state())?,
+            self.service(options, Service::GetAvailableStates, |_: Nothing| Managed::states())?,
+            self.service(options, Service::GetAvailableTransitions, move |_: Nothing| available.transitions())?,
+            self.service(options, Service::GetTransitionGraph, |_: Nothing| Managed::graph())?,
+        ])
+    }
+
     fn service<Request: DeserializeOwned, Response: Serialize>(
         &mut self,
         options: &Ros2Options,
@@ -54,7 +73,8 @@ impl Builder<'_> {
         let private = format!("~/{}", service.name());
         let name = options.args.topic(&private, &self.key.namespace, &self.key.name);
         let hash = service.hash().map_err(|error| Ros2Error::Zenoh(format!("{name}: {error}")))?;
-        let endpoint = Endpoint { name, dds_type: dds_type(service.type_name()), hash, latched: false, depth: DEPTH };
+        let dds_type = dds_type(service.type_name());
+        let endpoint = Endpoint { name, dds_type, hash, depth: DEPTH, ..Endpoint::default() };
         let respond = move |query: Query| {
             // A request that cannot be read gets no answer, as from rmw_zenoh; its client gives up.
             let _ = reply(&query, &answer);

@@ -13,7 +13,7 @@ use super::{
     signal, verify,
 };
 use crate::program::{self, command, until as wait_until};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 /// A router of its own on 127.0.0.1.
 struct Router {
@@ -99,20 +99,62 @@ fn parameters_and_types_are_served_over_zenoh() {
     let (Some(python), Some(ros_python)) = (peer_program("python"), peer_program("ros-python")) else { return };
     let _alone = alone();
     let Some(router) = Router::start(&python) else { return };
-    let names = ["GetParameters", "GetParameterTypes", "SetParameters", "SetParametersAtomically", "ListParameters"];
-    let names = names.iter().chain(&["DescribeParameters"]).map(|name| format!("rcl_interfaces/srv/{name}"));
-    let names = names.chain(["type_description_interfaces/srv/GetTypeDescription".to_owned()]);
-    let hash = |name: &str| file_of_rosidl(&folder_of(&ros_python), name)["type_hashes"][0]["hash_string"].clone();
-    let hashes: serde_json::Map<String, Value> = names.map(|name| (name.clone(), hash(&name))).collect();
     let mut node = node(router.environment(), "zenoh", true);
-    let file = node.folder.path().join("hashes.json");
-    std::fs::write(&file, Value::from(hashes).to_string()).expect("written");
-    let (port, domain, file) = (router.port.to_string(), node.domain(), file.display().to_string());
+    let file = hashes_of_services(&ros_python, node.folder.path());
+    let (port, domain) = (router.port.to_string(), node.domain());
     let arguments = ["--router", &port, "--domain", &domain, "--services", &file, "--rate", "50", "--seconds", "1"];
     let report = peer(&python, "zenoh_peer.py", &arguments);
-    assert_eq!(report["failures"], serde_json::json!([]), "{report}");
+    assert_eq!(report["failures"], json!([]), "{report}");
     node.interrupt();
     // What was set is part of the session, and verifies.
+    verify(&node.recording());
+}
+
+/// A file with the hashes of rosidl.
+fn hashes_of_services(ros_python: &Path, folder: &Path) -> String {
+    let parameters = ["Get", "Set", "List", "Describe"].map(|verb| format!("rcl_interfaces/srv/{verb}Parameters"));
+    let others = ["rcl_interfaces/srv/GetParameterTypes", "rcl_interfaces/srv/SetParametersAtomically"];
+    let others = others.into_iter().chain(["type_description_interfaces/srv/GetTypeDescription"]).map(str::to_owned);
+    let lifecycle = ["ChangeState", "GetState", "GetAvailableStates", "GetAvailableTransitions"];
+    let lifecycle = lifecycle.map(|name| format!("lifecycle_msgs/srv/{name}"));
+    let hash = |name: &str| file_of_rosidl(&folder_of(ros_python), name)["type_hashes"][0]["hash_string"].clone();
+    let all = parameters.into_iter().chain(others).chain(lifecycle);
+    let hashes: serde_json::Map<String, Value> = all.map(|name| (name.clone(), hash(&name))).collect();
+    let file = folder.join("hashes.json");
+    std::fs::write(&file, Value::from(hashes).to_string()).expect("written");
+    file.display().to_string()
+}
+
+/// Managed life, the log and the choice of quality of service over Zenoh.
+#[test]
+fn a_managed_node_follows_a_zenoh_peer() {
+    let (Some(python), Some(ros_python)) = (peer_program("python"), peer_program("ros-python")) else { return };
+    let _alone = alone();
+    let Some(router) = Router::start(&python) else { return };
+    let (variable, endpoints) = router.environment();
+    let chosen = "qos_overrides./squealcast/prediction.publisher";
+    let [reliability, depth] = [format!("{chosen}.reliability:=best_effort"), format!("{chosen}.depth:=10")];
+    let options = ["--rmw", "zenoh", "--managed", "--plain", "--ros-args", "-p", &reliability, "-p", &depth];
+    let mut node = Node::start_in(RIG, true, &options, &[(variable, &endpoints)]);
+    let file = hashes_of_services(&ros_python, node.folder.path());
+    let (port, domain) = (router.port.to_string(), node.domain());
+    // The script fails unless every state is the expected one and predictions come only while the node is active.
+    let report = peer(&python, "zenoh_managed.py", &["--router", &port, "--domain", &domain, "--services", &file]);
+    say(&format!("phases: {}", report["phases"]));
+    assert_eq!((&report["first"], &report["available"]), (&json!("unconfigured"), &json!(["configure", "shutdown"])));
+    assert_eq!(report["phases"][0]["success"], false, "it cannot be activated before it is configured");
+    assert_eq!((&report["states"]["finalized"], &report["graph"]), (&json!(4), &json!(7 + 5)), "{report}");
+    let events = report["events"].as_array().expect("events");
+    assert_eq!(
+        events[..2],
+        [json!(["unconfigured", "configure", "configuring"]), json!(["configuring", "transition_success", "inactive"])]
+    );
+    assert_eq!(events.len(), 2 * 5, "{report}");
+    let log = report["log"].as_array().expect("lines");
+    assert!(log.contains(&json!(["squealcast", 20, "the node is active"])), "{report}");
+    let expected = json!({ format!("{chosen}.reliability"): "best_effort", format!("{chosen}.depth"): 10 });
+    assert_eq!((&report["overrides"], &report["qos"]), (&expected, &json!("2::,10:,:,:,,")), "{report}");
+    node.interrupt();
     verify(&node.recording());
 }
 
