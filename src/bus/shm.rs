@@ -15,6 +15,7 @@ use iceoryx2::port::listener::{Listener, ListenerCreateError};
 use iceoryx2::port::notifier::{Notifier, NotifierCreateError, NotifierNotifyError};
 use iceoryx2::port::publisher::{Publisher, PublisherCreateError};
 use iceoryx2::port::subscriber::{Subscriber, SubscriberCreateError};
+use iceoryx2::port::update_connections::{ConnectionFailure, UpdateConnections};
 use iceoryx2::port::{LoanError, ReceiveError, SendError};
 use iceoryx2::prelude::*;
 use iceoryx2::service::builder::event::{EventCreateError, EventOpenError, EventOpenOrCreateError};
@@ -121,6 +122,8 @@ pub enum ShmError {
     Loan { service: String, source: LoanError },
     #[error("sample not sent on {service}: {source:?}")]
     Send { service: String, source: SendError },
+    #[error("readers of {service} are not connected: {source:?}")]
+    Readers { service: String, source: ConnectionFailure },
     #[error("sample sent on {service}, but its readers were not woken: {source:?}")]
     Notify { service: String, source: NotifierNotifyError },
 }
@@ -181,6 +184,16 @@ pub(super) fn wake(notifier: &Notifier<Ipc>, service: &str) -> Result<(), ShmErr
 }
 
 impl<F: Form> ShmWriter<F> {
+    /// Hands readers that came since the last message the latest ones, which they would otherwise get with the next.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub fn meet_readers(&self) -> Result<(), ShmError> {
+        let connected = self.publisher.update_connections();
+        connected.map_err(|source| ShmError::Readers { service: self.service.clone(), source })?;
+        wake(&self.notifier, &self.service)
+    }
+
     /// Number of readers, including killed ones whose remains have not been removed.
     pub fn readers(&self) -> usize {
         self.topic.dynamic_config().number_of_subscribers()

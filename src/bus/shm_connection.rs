@@ -26,6 +26,8 @@ pub struct ShmConnection {
     vibration_inputs: Option<ShmVibrationInput>,
     temperature_inputs: Option<ShmTemperatureInput>,
     waveform_inputs: Option<ShmWaveformInput>,
+    /// Number of readers of each topic with a history at the last report.
+    readers: [usize; 3],
 }
 
 impl ShmConnection {
@@ -123,11 +125,15 @@ impl Connection for ShmConnection {
         }
     }
 
-    /// The counts of its receiver, and a warning if other nodes publish predictions on the same service: readers cannot
-    /// distinguish them.
+    /// Hands new readers the latest messages. Returns the counts of the receiver, and a warning if other nodes publish
+    /// predictions on the same service: readers cannot distinguish them.
     fn report(&mut self) -> Report {
         let others = self.predictions.as_ref().map_or(0, ShmOutput::other_writers);
         let service = self.predictions.as_ref().map_or("", ShmOutput::service);
+        let [of_predictions, of_sensitivities, of_heard] = &mut self.readers;
+        meet(self.predictions.as_ref(), of_predictions);
+        meet(self.sensitivities.as_ref(), of_sensitivities);
+        meet(self.heard.as_ref(), of_heard);
         let warning = || {
             format!(
                 "{others} more publish on the service {service} over shared memory, whose readers get the predictions \
@@ -148,6 +154,17 @@ fn publish<F: Form>(writer: Option<&ShmWriter<F>>, message: &F::Message) -> Resu
         writer.publish(message)?;
     }
     Ok(())
+}
+
+/// Hands the latest messages to readers that have come since there were `known`.
+fn meet<F: Form>(writer: Option<&ShmWriter<F>>, known: &mut usize) {
+    let Some(writer) = writer else { return };
+    let now = writer.readers();
+    // A reader that cannot be connected is tried again with the next message.
+    if now > *known {
+        let _ = writer.meet_readers();
+    }
+    *known = now;
 }
 
 fn readers<F: Form>(writer: Option<&ShmWriter<F>>) -> usize {

@@ -9,14 +9,15 @@ use std::time::{Duration, Instant};
 use crate::bus::{PATIENCE, answer, into, next, point, shm, wait_until};
 use crate::domain::Domain;
 use crossbeam_channel::unbounded;
+use squealcast::bus::lifecycle::State;
 use squealcast::bus::ros_args::RosArgs;
 use squealcast::bus::ros2::{Parameters, Ros2, Ros2Options, Ros2Source};
 use squealcast::bus::shm::{
     ShmInput, ShmOptions, ShmOutput, ShmSink, ShmSource, ShmVibrationInput, ShmVibrationSource,
 };
-use squealcast::bus::{Bus, Received};
+use squealcast::bus::{Bus, Connection, Outgoing, Received, ShmConnection, Sink};
 use squealcast::msgs::shm::{Form, OperatingPointForm};
-use squealcast::msgs::{OperatingPoint, Prediction, RigInfo, Vibration};
+use squealcast::msgs::{OperatingPoint, Prediction, RigInfo, Temperature, Vibration, Waveform};
 use squealcast::rig::Rig;
 use squealcast::session::settings::{PARAMETERS, Settings};
 
@@ -149,6 +150,48 @@ fn a_late_shared_memory_reader_gets_the_latest() {
     source.publish(&point(100)).expect("published");
     let seqs: Vec<u64> = (0..17).map(|_| next(&received).message.seq).collect();
     assert_eq!(seqs, (84..=100).collect::<Vec<_>>());
+}
+
+/// iceoryx2 delivers history when a writer looks at its readers; a node does that with its report, once a second.
+#[test]
+fn a_late_shared_memory_reader_of_a_node_gets_the_latest_without_a_further_message() {
+    let options = shm("history");
+    let sink: Arc<dyn Sink> = Arc::new(Deaf);
+    let mut node = ShmConnection::of_node(&options, &sink).expect("a node");
+    for input_seq in 0..3 {
+        let prediction = Prediction { input_seq, ..Prediction::default() };
+        node.publish(Outgoing::Prediction(&prediction)).expect("published");
+    }
+    node.report();
+    let (sender, received) = unbounded();
+    let _reader = ShmSink::spawn(&options, into(sender)).expect("a reader");
+    assert!(received.recv_timeout(Duration::from_millis(300)).is_err(), "iceoryx2 delivers it by itself");
+    node.report();
+    let seqs: Vec<u64> = (0..3).map(|_| next(&received).message.input_seq).collect();
+    assert_eq!(seqs, [0, 1, 2]);
+    node.report();
+    assert!(received.recv_timeout(Duration::from_millis(300)).is_err(), "once");
+}
+
+/// Takes nothing.
+struct Deaf;
+
+impl Sink for Deaf {
+    fn takes_inputs(&self) -> bool {
+        false
+    }
+
+    fn operating_point(&self, _: Received<OperatingPoint>, _: bool) {}
+
+    fn vibration(&self, _: Received<Vibration>) {}
+
+    fn temperature(&self, _: Received<Temperature>) {}
+
+    fn waveform(&self, _: Received<Waveform>) {}
+
+    fn parameter(&self, _: &str, _: f64) {}
+
+    fn lifecycle(&self, _: State) {}
 }
 
 #[test]
