@@ -12,6 +12,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -38,6 +39,7 @@ def main() -> int:
         ("rclpy of Kilted, Fast DDS", ros, "rclpy_peer.py", every),
         ("rclpy of Jazzy, Fast DDS", jazzy / "bin/ros-python", "rclpy_peer.py", every),
         ("CycloneDDS, Python", tools, "cyclone_peer.py", every),
+        ("Zenoh, Python, through its router", tools, "zenoh_peer.py", every),
         ("iceoryx2, Python (shared memory)", tools, "shm_peer.py", count),
     ]
     logs = collections.Counter()
@@ -56,10 +58,20 @@ def row(options, name: str, python: Path, script: str, arguments: list[str], dom
         prefix = f"table-{os.getpid()}-{domain}/"
         command = [options.program, "run", RIG, "--loopback", "--plain", "--no-display", "--domain", str(domain)]
         errors = Path(folder, "stderr").open("w+")
-        node = subprocess.Popen([*command, "--shm-prefix", prefix], stdout=subprocess.DEVNULL, stderr=errors)
         where = ["--prefix", prefix] if script == "shm_peer.py" else ["--domain", str(domain)]
+        environment, router = dict(os.environ), None
+        if script == "zenoh_peer.py":
+            router, port = start_router(python)
+            command += ["--rmw", "zenoh"]
+            where += ["--router", port]
+            environment["ZENOH_CONFIG_OVERRIDE"] = f'connect/endpoints=["tcp/127.0.0.1:{port}"]'
+        command += ["--shm-prefix", prefix]
+        node = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, env=environment)
         time.sleep(1)
         peer = subprocess.run([python, HERE / script, *where, *arguments], capture_output=True, text=True)
+        if router:
+            router.stdin.close()
+            router.wait()
         node.send_signal(signal.SIGINT)
         node.wait()
         errors.seek(0)
@@ -76,6 +88,17 @@ def row(options, name: str, python: Path, script: str, arguments: list[str], dom
         checked = ", ".join(part for part in ("rig", "parameters", "diagnostics") if report.get(part))
     times = ", ".join(f"{unit * of[key]:.2f}" for key in ("p50", "p99", "max") if key in of)
     return f"| {name} | {report['sent']} | {report['sent'] - report['answered']} | {times} ms | {checked} |"
+
+
+def start_router(python: Path) -> tuple[subprocess.Popen, str]:
+    """A router of Zenoh on a free port."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    pipe = subprocess.PIPE
+    router = subprocess.Popen([python, HERE / "zenoh_router.py", port], stdin=pipe, stdout=pipe, text=True)
+    router.stdout.readline()
+    return router, port
 
 
 def note(logs, who: str, text: str) -> None:
