@@ -6,7 +6,7 @@
 //! - [`analysis`] predicts, sweeps and finds windows over given conditions.
 //! - [`node`] runs a session on a [`bus`] and records it ([`recording`]); [`offline`] runs one without buses.
 //! - [`sound`] detects squeal in sampled sound or acceleration.
-//! - [`display`] shows a node or a recording; [`figures`] draws; [`study`] measures and reproduces.
+//! - [`display`] shows a node or a recording; [`figures`] draws; [`evidence`] measures and reproduces.
 //! - [`commands`] contains the commands.
 //!
 //! `ARCHITECTURE.md` describes the rooms and their invariants.
@@ -23,6 +23,7 @@ pub mod analysis;
 pub mod bus;
 pub mod commands;
 pub mod display;
+pub mod evidence;
 pub mod export;
 pub mod figures;
 pub mod files;
@@ -37,6 +38,5 @@ pub mod rig;
 pub mod session;
 pub mod simulator;
 pub mod sound;
-pub mod study;
 pub mod system;
 mod text;

@@ -8,8 +8,8 @@ use serde::Serialize;
 use super::{Outcome, positive, print, write_file};
 use crate::figures::plot;
 use crate::proof::stress;
-use crate::study::bench::lapack::Lapack;
-use crate::study::bench::{HeldOut, Kind, Offline, Plan, Route, measure};
+use crate::evidence::bench::lapack::Lapack;
+use crate::evidence::bench::{HeldOut, Kind, Offline, Plan, Route, measure};
 
 const EXAMPLES: &str = "\
 Examples:

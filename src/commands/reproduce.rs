@@ -12,8 +12,8 @@ use crate::export::{Besides, write_full_model};
 use crate::fem::tribometer::{Dimensions, Tribometer};
 use crate::files::whole_file::remove_begun;
 use crate::full_model::FullModelFile;
+use crate::evidence::reproduce::{Item, MODES, PartModes, Step, Study, index, nine_dof};
 use crate::reduction::{OwnEngine, Wanted};
-use crate::study::reproduce::{Item, MODES, PartModes, Step, Study, index, nine_dof};
 
 const EXAMPLES: &str = "\
 Examples:

@@ -16,7 +16,7 @@ use crate::display::history::{Bin, History};
 use crate::msgs::level;
 use crate::physics::Window;
 use crate::physics::identification::{Identified, Trial};
-use crate::study::bench::Route;
+use crate::evidence::bench::Route;
 
 /// Drawing units per px. The plotting library rounds positions to whole units; a finer grid keeps curves smooth.
 pub(super) const FINE: u32 = 8;
