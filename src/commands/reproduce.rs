@@ -8,11 +8,11 @@ use super::on_basis::{Ranges, TOLERANCE, basis_of};
 use super::signals::on_stop;
 use super::steps::ProgressOptions;
 use super::{Outcome, positive, write_file};
+use crate::evidence::reproduce::{Item, MODES, PartModes, Step, Study, index, nine_dof};
 use crate::export::{Besides, write_full_model};
-use crate::fem::tribometer::{Dimensions, Tribometer};
+use crate::fem::tribometer::{Properties, Tribometer};
 use crate::files::whole_file::remove_begun;
 use crate::full_model::FullModelFile;
-use crate::evidence::reproduce::{Item, MODES, PartModes, Step, Study, index, nine_dof};
 use crate::reduction::{OwnEngine, Wanted};
 
 const EXAMPLES: &str = "\
@@ -62,7 +62,7 @@ impl Options {
     fn tribometer(&self) -> anyhow::Result<Vec<Item>> {
         let mut steps = self.progress.steps(2);
         let folder = self.output.join("tribometer");
-        let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
+        let tribometer = Tribometer::with_dof(&Properties::default(), self.dof as usize)?;
         write_full_model(&tribometer, Besides::default(), &folder, |_| ())?;
         steps.say(&format!("{} written", folder.display()));
         let full = FullModelFile::load(&folder.join("tribometer.toml"))?;

@@ -5,7 +5,7 @@ use clap::Args;
 use super::Outcome;
 use super::signals::on_stop;
 use crate::export::{Besides, write_full_model};
-use crate::fem::tribometer::{Dimensions, Tribometer};
+use crate::fem::tribometer::{Properties, Tribometer};
 use crate::files::whole_file::remove_begun;
 
 const EXAMPLES: &str = "\
@@ -41,7 +41,7 @@ impl Options {
             note!("\nstopped: not all files were written");
             std::process::exit(130);
         })?;
-        let tribometer = Tribometer::with_dof(&Dimensions::default(), self.dof as usize)?;
+        let tribometer = Tribometer::with_dof(&Properties::default(), self.dof as usize)?;
         let (pad, disc) = (tribometer.pad.structure.dof(), tribometer.disc.structure.dof());
         note!("{} degrees of freedom: {pad} of the upper part, {disc} of the lower", tribometer.dof());
         let besides = Besides { rotation: self.rotation, lining: self.lining };

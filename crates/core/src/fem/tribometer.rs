@@ -45,26 +45,76 @@ pub const CONTACT_STIFFNESS_N_PER_M: f64 = 1.251e7;
 /// Axis about which the disc turns.
 pub const AXIS: Axis = Axis { point_m: [0.0; 3], direction: [0.0, 1.0, 0.0] };
 
-const PAD: Material = material(4500.0, 20e9, 0.29);
-const PAD_HOLDER: Material = material(7000.0, 180e9, 0.3);
-const FORCE_SENSOR: Material = material(7700.0, 190e9, 0.28);
-const SENSOR_HOLDER: Material = material(7800.0, 196e9, 0.3);
-const LINEAR_BEARING: Material = material(7850.0, 210e9, 0.28);
-const CYLINDER: Material = material(7800.0, 196e9, 0.3);
-const SPRING_HOLDER: Material = material(7800.0, 196e9, 0.3);
-const DISC: Material = material(7800.0, 210e9, 0.27);
-const DISC_HOLDER: Material = material(7700.0, 200e9, 0.27);
-
-/// Total stiffness along x and along z of the ground springs, spread over the supported part of the back of the bracket
-/// plate, N/m.
-const GROUND_SPRING_N_PER_M: f64 = 1e10;
-/// Stiffness along y of the spring between the middles of spring holder and cylinder, N/m.
-const MIDDLE_SPRING_N_PER_M: f64 = 1e9;
-/// Stiffness along x, y and z of each spring between the corners and edge middles of spring holder and cylinder, N/m.
-const EDGE_SPRING_N_PER_M: [f64; 3] = [1e10, 1e6, 1e10];
-
 const fn material(density_kg_per_m3: f64, young_pa: f64, poisson: f64) -> Material {
     Material { density_kg_per_m3, young_pa, poisson }
+}
+
+/// What the rig is made of: the arguments of its finite-element model.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Properties {
+    /// Dimensions.
+    pub dimensions: Dimensions,
+    /// Materials of the components.
+    pub materials: Materials,
+    /// Springs.
+    pub supports: Supports,
+}
+
+/// Materials of the components.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Materials {
+    /// The friction material.
+    pub pad: Material,
+    /// Holder of the pad.
+    pub pad_holder: Material,
+    /// Force sensor.
+    pub force_sensor: Material,
+    /// Sensor holder.
+    pub sensor_holder: Material,
+    /// Linear bearing and bracket plate.
+    pub linear_bearing: Material,
+    /// Cylinder.
+    pub cylinder: Material,
+    /// Spring holder.
+    pub spring_holder: Material,
+    /// Disc.
+    pub disc: Material,
+    /// Both disc holders.
+    pub disc_holder: Material,
+}
+
+impl Default for Materials {
+    fn default() -> Self {
+        Self {
+            pad: material(4500.0, 20e9, 0.29),
+            pad_holder: material(7000.0, 180e9, 0.3),
+            force_sensor: material(7700.0, 190e9, 0.28),
+            sensor_holder: material(7800.0, 196e9, 0.3),
+            linear_bearing: material(7850.0, 210e9, 0.28),
+            cylinder: material(7800.0, 196e9, 0.3),
+            spring_holder: material(7800.0, 196e9, 0.3),
+            disc: material(7800.0, 210e9, 0.27),
+            disc_holder: material(7700.0, 200e9, 0.27),
+        }
+    }
+}
+
+/// Springs of the upper part, N/m.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Supports {
+    /// Total stiffness along x and along z of the ground springs, spread over the supported part of the back of the bracket
+    /// plate.
+    pub ground_spring_n_per_m: f64,
+    /// Stiffness along y of the spring between the middles of spring holder and cylinder.
+    pub middle_spring_n_per_m: f64,
+    /// Stiffness along x, y and z of each spring between the corners and edge middles of spring holder and cylinder.
+    pub edge_spring_n_per_m: [f64; 3],
+}
+
+impl Default for Supports {
+    fn default() -> Self {
+        Self { ground_spring_n_per_m: 1e10, middle_spring_n_per_m: 1e9, edge_spring_n_per_m: [1e10, 1e6, 1e10] }
+    }
 }
 
 /// Dimensions of the rig, m. In the upper part, `x` is measured from [`MEAN_RADIUS_M`].
@@ -176,31 +226,32 @@ pub struct Tribometer {
 impl Tribometer {
     /// The rig meshed with bricks of about `spacing_m`, m, away from the contact patch. The upper part is meshed more
     /// finely, because its column is thinner than the disc is wide.
-    pub fn with_spacing(dimensions: &Dimensions, spacing_m: f64) -> Self {
-        let (pad, loaded) = upper_part(dimensions, 0.6 * spacing_m);
+    pub fn with_spacing(properties: &Properties, spacing_m: f64) -> Self {
+        let Properties { dimensions, materials, .. } = properties;
+        let (pad, loaded) = upper_part(properties, 0.6 * spacing_m);
         let [from, to] = dimensions.pad_x;
         let contact_area_m2 = (to - from) * 2.0 * dimensions.pad_half_z;
-        Self { pad, disc: lower_part(dimensions, spacing_m), loaded, contact_area_m2 }
+        Self { pad, disc: lower_part(dimensions, materials, spacing_m), loaded, contact_area_m2 }
     }
 
     /// The coarsest mesh found with at least `dof` degrees of freedom in both parts together.
     ///
     /// # Errors
     /// [`FemError::Size`] if `dof` is below the size of the coarsest mesh, rounded down to thousands.
-    pub fn with_dof(dimensions: &Dimensions, dof: usize) -> Result<Self, FemError> {
+    pub fn with_dof(properties: &Properties, dof: usize) -> Result<Self, FemError> {
         let (mut coarse, mut fine) = (0.1, 0.1);
-        let mut found = Self::with_spacing(dimensions, fine);
+        let mut found = Self::with_spacing(properties, fine);
         let least = found.dof() / 1000 * 1000;
         if dof < least {
             return Err(FemError::Size { value: dof, limit: least });
         }
         while found.dof() < dof {
             (coarse, fine) = (fine, 0.85 * fine);
-            found = Self::with_spacing(dimensions, fine);
+            found = Self::with_spacing(properties, fine);
         }
         while coarse / fine > 1.002 {
             let spacing_m = (coarse * fine).sqrt();
-            let between = Self::with_spacing(dimensions, spacing_m);
+            let between = Self::with_spacing(properties, spacing_m);
             if between.dof() < dof {
                 coarse = spacing_m;
             } else {
@@ -277,7 +328,8 @@ fn between(lines: &[f64], from: f64, to: f64) -> Vec<f64> {
 }
 
 /// The upper part, above the contact, and the nodes at its top.
-fn upper_part(d: &Dimensions, spacing: f64) -> (Part, Vec<usize>) {
+fn upper_part(properties: &Properties, spacing: f64) -> (Part, Vec<usize>) {
+    let Properties { dimensions: d, materials, supports } = properties;
     let [pad_x, pad_z] = patch_lines(d);
     let (bearing_z, plate_z) = (d.column_half[1] + d.bearing_depth, d.column_half[1] + d.bearing_depth + d.plate_depth);
     let halves = [d.pad_holder_half, d.column_half, d.cylinder_half, d.spring_holder_half];
@@ -314,30 +366,57 @@ fn upper_part(d: &Dimensions, spacing: f64) -> (Part, Vec<usize>) {
         };
     let around = |half: [f64; 2]| [-half[1], half[1]];
     let [column_x, column_z] = d.column_half;
-    let pad_holder = add("pad-holder", PAD_HOLDER, d.pad_holder_half[0], [1, 2], around(d.pad_holder_half), &[]);
-    let pad = add("pad", PAD, d.pad_x[1], [0, 1], [-d.pad_half_z, d.pad_half_z], &[&pad_holder]);
-    let sensor = add("force-sensor", FORCE_SENSOR, column_x, [2, 3], around(d.column_half), &[&pad_holder]);
-    let sensor_holder = add("sensor-holder", SENSOR_HOLDER, column_x, [3, 6], around(d.column_half), &[&sensor]);
-    let bearing =
-        add("linear-bearing", LINEAR_BEARING, d.bearing_half_x, [4, 5], [column_z, bearing_z], &[&sensor_holder]);
-    let plate =
-        add("bracket-plate", LINEAR_BEARING, d.spring_holder_half[0], [4, 7], [bearing_z, plate_z], &[&bearing]);
-    let cylinder = add("cylinder", CYLINDER, d.cylinder_half[0], [6, 7], around(d.cylinder_half), &[&sensor_holder]);
-    let spring_holder =
-        add("spring-holder", SPRING_HOLDER, d.spring_holder_half[0], [7, 8], around(d.spring_holder_half), &[]);
+    let pad_holder =
+        add("pad-holder", materials.pad_holder, d.pad_holder_half[0], [1, 2], around(d.pad_holder_half), &[]);
+    let pad = add("pad", materials.pad, d.pad_x[1], [0, 1], [-d.pad_half_z, d.pad_half_z], &[&pad_holder]);
+    let sensor = add("force-sensor", materials.force_sensor, column_x, [2, 3], around(d.column_half), &[&pad_holder]);
+    let sensor_holder =
+        add("sensor-holder", materials.sensor_holder, column_x, [3, 6], around(d.column_half), &[&sensor]);
+    let bearing = add(
+        "linear-bearing",
+        materials.linear_bearing,
+        d.bearing_half_x,
+        [4, 5],
+        [column_z, bearing_z],
+        &[&sensor_holder],
+    );
+    let plate = add(
+        "bracket-plate",
+        materials.linear_bearing,
+        d.spring_holder_half[0],
+        [4, 7],
+        [bearing_z, plate_z],
+        &[&bearing],
+    );
+    let cylinder =
+        add("cylinder", materials.cylinder, d.cylinder_half[0], [6, 7], around(d.cylinder_half), &[&sensor_holder]);
+    let spring_holder = add(
+        "spring-holder",
+        materials.spring_holder,
+        d.spring_holder_half[0],
+        [7, 8],
+        around(d.spring_holder_half),
+        &[],
+    );
 
     let interface = level(&pad, 0).collect();
     let mut structure = Structure { mesh, ..Structure::default() };
     let top: Vec<usize> = level(&spring_holder, spring_holder.counts()[1] - 1).collect();
     structure.fixed.extend(top.iter().flat_map(|&node| [(node, 0), (node, 2)]));
-    hold_plate(&mut structure, &plate, [levels[4], levels[5]], d.bearing_half_x);
-    join_cylinder(&mut structure, &cylinder, &spring_holder, levels[7], d.cylinder_half);
+    hold_plate(&mut structure, &plate, [levels[4], levels[5]], d.bearing_half_x, supports);
+    join_cylinder(&mut structure, [&cylinder, &spring_holder], levels[7], d.cylinder_half, supports);
     (Part { structure, interface }, top)
 }
 
 /// Adds the springs between the top of the cylinder and the spring holder above it: at the middle, the corners and the
 /// edge middles.
-fn join_cylinder(structure: &mut Structure, cylinder: &Block, holder: &Block, height: f64, half: [f64; 2]) {
+fn join_cylinder(
+    structure: &mut Structure,
+    [cylinder, holder]: [&Block; 2],
+    height: f64,
+    half: [f64; 2],
+    supports: &Supports,
+) {
     let at = |block: &Block, x: f64, z: f64| {
         let weights = block.locate([x, height, z]).expect("a place on both faces");
         assert_eq!(weights.len(), 1, "springs join nodes");
@@ -347,7 +426,8 @@ fn join_cylinder(structure: &mut Structure, cylinder: &Block, holder: &Block, he
         for z in [-half[1], 0.0, half[1]] {
             let (node, other) = (at(cylinder, x, z), Some(at(holder, x, z)));
             let middle = x == 0.0 && z == 0.0;
-            let stiffness = if middle { [0.0, MIDDLE_SPRING_N_PER_M, 0.0] } else { EDGE_SPRING_N_PER_M };
+            let stiffness =
+                if middle { [0.0, supports.middle_spring_n_per_m, 0.0] } else { supports.edge_spring_n_per_m };
             let along = stiffness.into_iter().enumerate().filter(|(_, stiffness)| *stiffness > 0.0);
             structure.springs.extend(along.map(|(direction, stiffness_n_per_m)| Spring {
                 node,
@@ -361,7 +441,7 @@ fn join_cylinder(structure: &mut Structure, cylinder: &Block, holder: &Block, he
 
 /// Supports the back of the bracket plate over the bearing: `y` fixed, `x` and `z` on springs distributed over the
 /// area.
-fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], half_x: f64) {
+fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], half_x: f64, supports: &Supports) {
     let back = plate.counts()[2] - 1;
     // Length of the supported part that belongs to each grid line.
     let shares = |lines: &[f64], low: f64, high: f64| -> Vec<f64> {
@@ -381,7 +461,7 @@ fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], h
             if width * height > NEAR * NEAR {
                 let node = plate.node([i, j, back]);
                 structure.fixed.insert((node, 1));
-                let stiffness_n_per_m = GROUND_SPRING_N_PER_M * width * height / area;
+                let stiffness_n_per_m = supports.ground_spring_n_per_m * width * height / area;
                 structure.springs.extend([0, 2].map(|direction| Spring {
                     node,
                     other: None,
@@ -394,7 +474,7 @@ fn hold_plate(structure: &mut Structure, plate: &Block, [low, high]: [f64; 2], h
 }
 
 /// The lower part: the disc between its holders.
-fn lower_part(d: &Dimensions, spacing: f64) -> Part {
+fn lower_part(d: &Dimensions, materials: &Materials, spacing: f64) -> Part {
     let [patch_x, patch_z] = patch_lines(d);
     // Fine mesh around the contact patch: grid lines of radius and angle, with margins around the patch.
     let with_margins = |patch: &[f64], margin: f64, scale: f64| {
@@ -421,7 +501,7 @@ fn lower_part(d: &Dimensions, spacing: f64) -> Part {
 
     let mut mesh = Mesh::default();
     let polar = |[r, y, angle]: [f64; 3]| [r * angle.cos(), y, r * angle.sin()];
-    let disc = mesh.add_component("disc", DISC);
+    let disc = mesh.add_component("disc", materials.disc);
     let hole = |[i, _, k]: [usize; 3]| {
         let (r, angle) = (0.5 * (r[i] + r[i + 1]), 0.5 * (angle[k] + angle[k + 1]));
         r > inner && r < outer && angle > start && angle < end
@@ -441,7 +521,7 @@ fn lower_part(d: &Dimensions, spacing: f64) -> Part {
     };
     let fine = mesh.add_block(disc, [fine_r.clone(), y, fine_angle.clone()], SOLID, &[&ring], blended);
 
-    let holder = mesh.add_component("disc-holder", DISC_HOLDER);
+    let holder = mesh.add_component("disc-holder", materials.disc_holder);
     let clamped: Vec<f64> = r.iter().copied().filter(|&line| line < d.disc_holder_radius + 1e-9).collect();
     for (from, to) in [(0.0, d.disc_holder_height), (-d.disc_thickness - d.disc_holder_height, -d.disc_thickness)] {
         let lines = [clamped.clone(), stations(&[from, to], spacing), angle.clone()];
@@ -491,7 +571,7 @@ mod tests {
     #[test]
     fn the_first_frequencies_of_the_default_size_are_the_published_ones() {
         // Table 3 of the paper, within the 1 % that the dimensions were tuned for.
-        let tribometer = Tribometer::with_dof(&Dimensions::default(), 20_000).unwrap();
+        let tribometer = Tribometer::with_dof(&Properties::default(), 20_000).unwrap();
         let whole = tribometer.at_rest(CONTACT_STIFFNESS_N_PER_M);
         for (what, structure, published_hz) in [
             ("upper part", &tribometer.pad.structure, 331.44),
@@ -506,10 +586,10 @@ mod tests {
 
     #[test]
     fn the_same_294_pairs_coincide_at_any_size() {
-        let dimensions = Dimensions::default();
+        let properties = Properties::default();
         let mut places: Option<Vec<[f64; 3]>> = None;
         for dof in [5_000, 20_000, 100_000] {
-            let tribometer = Tribometer::with_dof(&dimensions, dof).unwrap();
+            let tribometer = Tribometer::with_dof(&properties, dof).unwrap();
             assert!((dof..dof + dof / 4).contains(&tribometer.dof()), "{} for {dof}", tribometer.dof());
             let at = |part: &Part| -> Vec<[f64; 3]> {
                 let mesh = &part.structure.mesh;
@@ -530,7 +610,7 @@ mod tests {
     fn the_mass_is_that_of_boxes_and_rings() {
         // Density times volume of each component, calculated by hand. The polar mesh approximates rings by polygons.
         let d = Dimensions::default();
-        let tribometer = Tribometer::with_dof(&d, 20_000).unwrap();
+        let tribometer = Tribometer::with_dof(&Properties::default(), 20_000).unwrap();
         let mass_kg = |part: &Part, name: &str| -> f64 {
             let mesh = &part.structure.mesh;
             let of_it = |brick: &&super::super::Brick| mesh.components[brick.component].name == name;
@@ -571,7 +651,7 @@ mod tests {
 
     #[test]
     fn a_size_below_the_coarsest_mesh_is_refused() {
-        let refused = Tribometer::with_dof(&Dimensions::default(), 1_000).unwrap_err();
+        let refused = Tribometer::with_dof(&Properties::default(), 1_000).unwrap_err();
         assert!(matches!(refused, FemError::Size { value: 1_000, limit: 1_001..=5_000 }), "{refused}");
     }
 }
