@@ -76,31 +76,9 @@ impl Options {
         if recording.topics().name_of(Topic::OperatingPoint).is_none() {
             return Err(anyhow!("{}: holds no operating points to predict", path.display()));
         }
-        let points = recording.messages().filter_map(|entry| match entry.message {
-            Recorded::Known(Payload::OperatingPoint(input)) => Some(conditions(&input)),
-            _ => None,
-        });
+        let points = offline::points(&recording);
         let mut messages = recording.messages();
-        let measured = messages.by_ref().filter_map(|entry| {
-            let quantity = match entry.message {
-                Recorded::Known(Payload::OperatingPoint(input)) => Quantity::Conditions(input),
-                Recorded::Known(Payload::Vibration(vibration)) => Quantity::Vibration(vibration),
-                Recorded::Known(Payload::Temperature(measured)) => Quantity::Temperature(measured),
-                Recorded::Known(Payload::Waveform(block)) => Quantity::Samples(block),
-                // Of the rig's messages only these are predicted or recorded again; the node's own are made anew.
-                Recorded::Known(
-                    Payload::Prediction(_)
-                    | Payload::SessionEvent(_)
-                    | Payload::RigInfo(_)
-                    | Payload::Sensitivity(_)
-                    | Payload::Diagnostics(_)
-                    | Payload::Heard(_),
-                )
-                | Recorded::Unreadable(_)
-                | Recorded::Other => return None,
-            };
-            Some(Measured { log_time_ns: entry.log_time_ns, publish_time_ns: entry.publish_time_ns, quantity })
-        });
+        let measured = messages.by_ref().filter_map(offline::measured);
         let (first_ns, ahead_ns) = first(&recording);
         let with_sound = recording.topics().name_of(Topic::Waveform).is_some();
         ensure!(

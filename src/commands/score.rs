@@ -7,10 +7,9 @@ use serde::Serialize;
 use super::recordings::{Recordings, without_predictions};
 use super::{Outcome, not_negative, positive, print, write_file};
 use crate::msgs::schema::Topic;
-use crate::offline::score::{HeardAndPredicted, MetChannel};
-use crate::offline::verify_sound::recorded_settings;
-use crate::recording::reader::Recorded;
-use crate::sound::matching::{Criteria, Score, Slots, median};
+use crate::offline::score::MetChannel;
+use crate::offline::score_table::{Row, Sum, met};
+use crate::sound::matching::Criteria;
 use crate::text::terminal::printable;
 
 const EXAMPLES: &str = "\
@@ -45,37 +44,6 @@ pub struct Options {
     json: bool,
 }
 
-/// The scores of a channel of a recording, or their sum; a line of the CSV file. Every score stands beside its counts.
-#[derive(Clone, Debug, Default, Serialize)]
-struct Row {
-    /// Empty in the sum.
-    recording: String,
-    channel: String,
-    judged_s: f64,
-    /// Squeals found in the sound: predicted, not predicted, harmonics of others, and outside the time of predictions.
-    hits: u64,
-    misses: u64,
-    harmonics: u64,
-    squeals_not_judged: u64,
-    /// Predicted squeals: found in the sound, not found, and outside the time or band of the sound.
-    confirmed: u64,
-    false_alarms: u64,
-    predictions_not_judged: u64,
-    recall: Option<f64>,
-    precision: Option<f64>,
-    /// Of slots of time of `slot_s`: with a hit, a miss, a false alarm, and with nothing.
-    mcc: Option<f64>,
-    slot_s: f64,
-    slots_hit: u64,
-    slots_missed: u64,
-    slots_false_alarm: u64,
-    slots_quiet: u64,
-    /// Of the hits: from the warning to the onset.
-    least_lead_s: Option<f64>,
-    median_lead_s: Option<f64>,
-    longest_lead_s: Option<f64>,
-}
-
 /// The output of `score --json`.
 #[derive(Serialize)]
 struct Report {
@@ -84,51 +52,6 @@ struct Report {
     total: Row,
     /// Recordings without sound.
     without_sound: Vec<String>,
-}
-
-/// Sums of rows, from which their scores follow.
-#[derive(Default)]
-struct Sum {
-    row: Row,
-    score: Score,
-    slots: Slots,
-    leads_s: Vec<f64>,
-}
-
-impl Sum {
-    fn add(&mut self, met: &MetChannel) {
-        let meeting = &met.meeting;
-        self.score += meeting.score;
-        self.slots += meeting.slots;
-        self.leads_s.extend(meeting.leads_s());
-        self.row.judged_s += met.judged_s;
-        self.row.harmonics += meeting.harmonics;
-        self.row.squeals_not_judged += meeting.squeals_not_judged;
-        self.row.predictions_not_judged += meeting.predictions_not_judged;
-        self.row.slot_s = self.row.slot_s.max(meeting.slot_s);
-    }
-
-    fn row(mut self) -> Row {
-        self.leads_s.sort_by(f64::total_cmp);
-        let (score, slots, leads) = (self.score, self.slots, &self.leads_s);
-        Row {
-            hits: score.hits,
-            misses: score.misses,
-            confirmed: score.confirmed,
-            false_alarms: score.false_alarms,
-            recall: score.recall(),
-            precision: score.precision(),
-            mcc: slots.mcc(),
-            slots_hit: slots.hits,
-            slots_missed: slots.misses,
-            slots_false_alarm: slots.false_alarms,
-            slots_quiet: slots.quiet,
-            least_lead_s: leads.first().copied(),
-            median_lead_s: median(leads),
-            longest_lead_s: leads.last().copied(),
-            ..self.row
-        }
-    }
 }
 
 impl Options {
@@ -176,15 +99,7 @@ impl Options {
         if recording.topics().name_of(Topic::Prediction).is_none() {
             return Err(without_predictions(path, &recording));
         }
-        let mut found = HeardAndPredicted::new(recorded_settings(&recording).band_hz);
-        let mut messages = recording.messages();
-        for entry in messages.by_ref() {
-            if let Recorded::Known(payload) = entry.message {
-                found.take(&payload);
-            }
-        }
-        let lost = recording.damage().iter().chain(messages.damage()).any(|damage| damage.damage.loses_data);
-        let mut met = found.meet(criteria);
+        let (mut met, lost) = met(&recording, criteria);
         met.retain(|met| self.channel.as_ref().is_none_or(|channel| *channel == met.channel));
         Ok((met, if lost { Outcome::Differences } else { Outcome::Done }))
     }

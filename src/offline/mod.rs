@@ -5,6 +5,7 @@
 
 mod ahead;
 pub mod score;
+pub mod score_table;
 mod sound_search;
 pub mod verify;
 pub mod verify_sound;
@@ -17,6 +18,7 @@ use crate::msgs::{Header, Heard, OperatingPoint, Temperature, Time, Vibration, W
 use crate::node::rig_info;
 use crate::physics::{self, Chart, Solver};
 use crate::recording::message::{Message, Payload};
+use crate::recording::reader::{Entry, Recorded, Recording};
 use crate::recording::recorder::{Recorder, RecorderConfig, RecorderError};
 use crate::rig::Rig;
 use crate::session::computed::{Request, compute, parameter_record, record_of, session_rig};
@@ -75,6 +77,36 @@ impl Measured {
         let time_ns = u64::try_from(stamp.as_ns()).unwrap_or(0);
         Self { log_time_ns: time_ns, publish_time_ns: time_ns, quantity }
     }
+}
+
+/// What a recording holds of the rig: what a session predicts from, and what it records beside its predictions.
+pub fn measured(entry: Entry) -> Option<Measured> {
+    let quantity = match entry.message {
+        Recorded::Known(Payload::OperatingPoint(input)) => Quantity::Conditions(input),
+        Recorded::Known(Payload::Vibration(vibration)) => Quantity::Vibration(vibration),
+        Recorded::Known(Payload::Temperature(measured)) => Quantity::Temperature(measured),
+        Recorded::Known(Payload::Waveform(block)) => Quantity::Samples(block),
+        // Of the rig's messages only these are predicted or recorded again; the node's own are made anew.
+        Recorded::Known(
+            Payload::Prediction(_)
+            | Payload::SessionEvent(_)
+            | Payload::RigInfo(_)
+            | Payload::Sensitivity(_)
+            | Payload::Diagnostics(_)
+            | Payload::Heard(_),
+        )
+        | Recorded::Unreadable(_)
+        | Recorded::Other => return None,
+    };
+    Some(Measured { log_time_ns: entry.log_time_ns, publish_time_ns: entry.publish_time_ns, quantity })
+}
+
+/// The operating points of a recording.
+pub fn points(recording: &Recording) -> impl Iterator<Item = physics::OperatingPoint> {
+    recording.messages().filter_map(|entry| match entry.message {
+        Recorded::Known(Payload::OperatingPoint(input)) => Some(conditions(&input)),
+        _ => None,
+    })
 }
 
 /// Summary of a session that was predicted and recorded.
