@@ -7,6 +7,7 @@
 //! - [`node`] runs a session on a [`bus`] and records it ([`recording`]); [`offline`] runs one without buses.
 //! - [`sound`] detects squeal in sampled sound or acceleration.
 //! - [`display`] shows a node or a recording; [`figures`] draws; [`evidence`] measures and reproduces.
+//! - [`study`] computes many cases of a rig or full model, or of many recordings, in one table.
 //! - [`commands`] contains the commands.
 //!
 //! `ARCHITECTURE.md` describes the rooms and their invariants.
@@ -38,5 +39,6 @@ pub mod rig;
 pub mod session;
 pub mod simulator;
 pub mod sound;
+pub mod study;
 pub mod system;
 mod text;

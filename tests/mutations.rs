@@ -272,6 +272,8 @@ fn seeds(name: &str) -> Vec<Vec<u8>> {
             "time [s],microphone [Pa],load [N]\n0,0.5,1\n0.00002,-1e-3,1\n0.00004,2,1\n",
             "Zeit (ms);Mikrofon (Pa)\n0,00;1,5\n0,02;-2,5\n0,04;1\n",
         ]),
+        "study" => ["nine-dof", "tribometer"].map(|name| project(&format!("launch/study/{name}.toml"))).into(),
+        "study_table" => vec![targets::study_table()],
         "recording" => {
             let folder =
                 std::fs::read_dir(format!("{}/recordings/ramp", env!("CARGO_MANIFEST_DIR"))).expect("a recording");

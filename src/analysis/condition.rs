@@ -82,6 +82,16 @@ listed! {
 }
 
 impl Condition {
+    /// Name with unit, as in tables and rig files.
+    pub fn key(self) -> &'static str {
+        match self {
+            Self::Friction => "friction_coefficient",
+            Self::Load => "normal_load_n",
+            Self::Speed => "disc_speed_rad_s",
+            Self::Temperature => "temperature_c",
+        }
+    }
+
     /// Name with unit, for axes.
     pub fn label(self) -> &'static str {
         match self {

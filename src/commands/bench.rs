@@ -6,10 +6,10 @@ use clap::Args;
 use serde::Serialize;
 
 use super::{Outcome, positive, print, write_file};
-use crate::figures::plot;
-use crate::proof::stress;
 use crate::evidence::bench::lapack::Lapack;
 use crate::evidence::bench::{HeldOut, Kind, Offline, Plan, Route, measure};
+use crate::figures::plot;
+use crate::proof::stress;
 
 const EXAMPLES: &str = "\
 Examples:

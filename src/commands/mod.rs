@@ -43,6 +43,7 @@ mod simulated_modes;
 mod simulated_sound;
 mod sound_files;
 mod steps;
+mod study;
 mod sweep;
 mod tribometer;
 mod verify;
@@ -114,6 +115,7 @@ enum Command {
     Recover(recover::Options),
     Rigs(rigs::Options),
     Check(check::Options),
+    Study(study::Options),
     Identify(identify::Options),
     Bench(bench::Options),
     Tribometer(tribometer::Options),
@@ -187,6 +189,7 @@ pub fn main() -> ExitCode {
         Command::Map(options) => options.run(),
         Command::Rigs(options) => options.run(),
         Command::Check(options) => options.run(),
+        Command::Study(options) => options.run(),
         Command::Identify(options) => options.run(),
         Command::Bench(options) => options.run(),
         Command::Tribometer(options) => options.run(),

@@ -5,4 +5,5 @@ pub mod html;
 pub mod plane;
 pub mod plot;
 pub mod png;
+pub mod scatter;
 pub mod spectrogram;

@@ -5,7 +5,7 @@ use plotters::prelude::*;
 use super::plot::{FINE, PlotError, axes, failed, figure, legend_text};
 
 /// Number of classes of growth rates.
-const CLASSES: usize = 6;
+pub(super) const CLASSES: usize = 6;
 /// Colours of the slowest and the fastest class.
 const SLOW: [f64; 3] = [254.0, 232.0, 200.0];
 const FAST: [f64; 3] = [153.0, 0.0, 13.0];
@@ -137,7 +137,7 @@ fn dot<C: Clone>(place: C, edge: Edge) -> [Circle<C, u32>; 2] {
 }
 
 /// Colour of a class.
-fn colour(class: usize) -> RGBColor {
+pub(super) fn colour(class: usize) -> RGBColor {
     let share = class as f64 / (CLASSES - 1) as f64;
     let mixed = |k: usize| (SLOW[k] + share * (FAST[k] - SLOW[k])).round() as u8;
     RGBColor(mixed(0), mixed(1), mixed(2))

@@ -13,10 +13,10 @@ use crate::analysis::condition::Condition;
 use crate::analysis::sweep::{Sweep, Swept};
 use crate::display::curves::Curves;
 use crate::display::history::{Bin, History};
+use crate::evidence::bench::Route;
 use crate::msgs::level;
 use crate::physics::Window;
 use crate::physics::identification::{Identified, Trial};
-use crate::evidence::bench::Route;
 
 /// Drawing units per px. The plotting library rounds positions to whole units; a finer grid keeps curves smooth.
 pub(super) const FINE: u32 = 8;
@@ -591,7 +591,7 @@ fn decades((low, high): (f64, f64)) -> (f64, f64) {
 }
 
 /// Smallest and largest of `values`, widened if they are equal; `(0, 1)` if there are no values.
-fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
+pub(super) fn range(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
     match (low < high, low.is_finite()) {
         (true, _) => (low, high),

@@ -16,6 +16,8 @@
 //! | matrices, nodes and rows of a full model | [`FULL_MODEL_PART`] | about 20 times the file; lines of 1 MiB |
 //! | table of contact pressures of a full model (CSV) | [`TABLE`] | 3 times the file; 1000 points |
 //! | tribometer log | [`LOG`] | about 12 times the file; lines of 64 KiB |
+//! | study (TOML) | [`TOML`] | about 100 times the file, and 80 MB for a Latin hypercube |
+//! | table of a study (Parquet) | [`STUDY_TABLE`] | about 12 times the file, for each column that is read |
 //! | target frequencies | [`TARGETS`] | about 10 times the file |
 //! | WAV file | none: read in pieces | 20 MiB for each channel, of at most 64 |
 //! | Universal File and CSV file of samples | [`SAMPLES`] | 8 times the file |
@@ -43,6 +45,8 @@ pub const LOG: u64 = 512 << 20;
 pub const SAMPLES: u64 = 1 << 30;
 /// Natural frequencies to which a rig is fitted.
 pub const TARGETS: u64 = 1 << 20;
+/// Tables of studies, which are read column by column.
+pub const STUDY_TABLE: u64 = 2 << 30;
 /// Charts on disk.
 pub const CHART: u64 = 1 << 30;
 /// For files that are read in pieces.

@@ -21,19 +21,11 @@ pub struct Files {
 }
 
 impl Files {
-    /// Opens the TOML file and returns its bytes.
-    ///
-    /// # Errors
-    /// [`RigError::NoSuchFile`].
-    pub fn open(path: &Path) -> Result<(Self, Vec<u8>), RigError> {
-        let bytes = input_file::read(path, input_file::TOML).map_err(|error| RigError::NoSuchFile {
-            value: path.display().to_string(),
-            reason: error.to_string(),
-            limit: "the TOML file of a full model".to_owned(),
-        })?;
-        let toml = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
-        let digests = vec![(toml.clone(), Sha256::digest(&bytes).into())];
-        Ok((Self { toml, directory: path.parent().unwrap_or(Path::new("")).to_owned(), digests }, bytes))
+    /// The TOML file at `path` with this content.
+    pub fn new(path: &Path, toml: &[u8]) -> Self {
+        let name = path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned();
+        let digests = vec![(name.clone(), Sha256::digest(toml).into())];
+        Self { toml: name, directory: path.parent().unwrap_or(Path::new("")).to_owned(), digests }
     }
 
     /// Opens the file `name`, which `field` refers to, and returns the result of `work` on it. The first time, its hash

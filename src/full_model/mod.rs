@@ -111,9 +111,29 @@ impl FullModelFile {
     /// # Errors
     /// [`RigError`], naming file, field or line, value and limit.
     pub fn load(path: &Path) -> Result<Self, RigError> {
-        let (mut files, bytes) = Files::open(path)?;
-        let own: RawFullModel = crate::rig::raw::parse(&files.toml, &bytes)?;
-        let mut common_tables: toml::Table = crate::rig::raw::parse(&files.toml, &bytes)?;
+        Self::load_as(path, &Self::toml(path)?)
+    }
+
+    /// The content of the TOML file at `path`.
+    ///
+    /// # Errors
+    /// [`RigError::NoSuchFile`].
+    pub fn toml(path: &Path) -> Result<Vec<u8>, RigError> {
+        input_file::read(path, input_file::TOML).map_err(|error| RigError::NoSuchFile {
+            value: path.display().to_string(),
+            reason: error.to_string(),
+            limit: "the TOML file of a full model".to_owned(),
+        })
+    }
+
+    /// Loads the full model as if the TOML file at `path` had this content.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_as(path: &Path, toml: &[u8]) -> Result<Self, RigError> {
+        let mut files = Files::new(path, toml);
+        let own: RawFullModel = crate::rig::raw::parse(&files.toml, toml)?;
+        let mut common_tables: toml::Table = crate::rig::raw::parse(&files.toml, toml)?;
         let contact_patches = common_tables.remove("contact_patch");
         let state_keys = common_tables.remove("contact_state").and_then(|table| table.as_table().cloned());
         common_tables.retain(|key, _| Common::TABLES.contains(&key));

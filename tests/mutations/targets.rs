@@ -18,6 +18,7 @@ use squealcast::recording::reader::Recording;
 use squealcast::recording::recover::recover;
 use squealcast::rig::{Rig, RigFile, matrix_market, npz, read_pressures, scale, uff};
 use squealcast::simulator::Profile;
+use squealcast::study::{Cell, Column, Kind, Reader, Study, Table, Writer};
 use tempfile::TempDir;
 
 /// A reader by name.
@@ -26,7 +27,7 @@ pub struct Target {
     pub read: fn(&[u8]),
 }
 
-pub const TARGETS: [Target; 17] = [
+pub const TARGETS: [Target; 19] = [
     Target {
         name: "npz",
         read: |bytes| {
@@ -84,6 +85,15 @@ pub const TARGETS: [Target; 17] = [
     Target { name: "wav", read: wav },
     Target { name: "uff58", read: |bytes| drop(uff58::read("a.uff", bytes)) },
     Target { name: "samples_csv", read: |bytes| drop(samples_csv::read("a.csv", bytes)) },
+    Target { name: "study", read: |bytes| drop(Study::read("study.toml", bytes, FOLDER.path())) },
+    Target {
+        name: "study_table",
+        read: |bytes| {
+            if let Ok(reader) = Reader::new("table.parquet", bytes.to_vec()) {
+                let _ = reader.read_all();
+            }
+        },
+    },
     Target { name: "recording", read: recording },
     Target {
         name: "cdr",
@@ -127,6 +137,20 @@ fn full_model(bytes: &[u8]) {
 /// The seeds of `full_model`.
 pub fn full_models() -> Vec<Vec<u8>> {
     (0..).zip(FULL_MODEL).map(|(k, (_, content))| [&[k][..], content.as_bytes()].concat()).collect()
+}
+
+/// A table with a column of each kind.
+pub fn study_table() -> Vec<u8> {
+    let names = ["case", "load_n", "status", "modes_hz"].into_iter().zip(Kind::ALL);
+    let columns: Vec<Column> = names.map(|(name, kind)| Column::new(name, kind)).collect();
+    let mut table = Table::new(&columns);
+    for case in 0..20 {
+        let list = if case % 3 == 0 { Cell::Missing } else { Cell::List(vec![1.0; case]) };
+        table.push(vec![Cell::count(case), Cell::Number(0.5), Cell::Text("done".to_owned()), list]);
+    }
+    let mut writer = Writer::new(&columns, &[("study".to_owned(), "name = 'a'".to_owned())]).expect("a schema");
+    writer.write(&table).expect("memory");
+    writer.finish().expect("memory")
 }
 
 /// Reads the samples too, as far as they are there.

@@ -703,6 +703,12 @@ fn wrong_usage_ends_with_2() {
         &["import", "x", "-o", "y", "--column", "time_s"],
         &["import", "x", "-o", "y", "--column", "temperature=T"],
         &["completions", "tcsh"],
+        &["study"],
+        &["study", "x"],
+        &["study", "x", "-o", "y", "--shard", "0/3"],
+        &["study", "x", "-o", "y", "--threads", "0"],
+        &["study", "merge", "-o", "y"],
+        &["study", "figure", "x", "--x", "case", "-o", "y"],
         &["run", "nine-dof", "--ros-args", "-r"],
     ] {
         let failed = run(args);
@@ -764,6 +770,7 @@ fn help_states_units() {
         ("verify", &["--against <FULL.toml>", "Highest frequency in Hz"]),
         ("reduce", &["--modes <I+J>", "--cutoff-hz [<HZ>]", "--range <mu=A:B,speed=A:B,load=A:B>"]),
         ("tribometer", &["--dof <N> Degrees of freedom"]),
+        ("study", &["--shard <I/N>", "merge", "figure", "--memory-gib <GIB>", "launch/study/README.md"]),
         ("reproduce", &["--dof <N> Degrees of freedom of the tribometer", "--output <DIR>"]),
         ("completions", &["bash", "fish", "zsh"]),
     ] {

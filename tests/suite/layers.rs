@@ -38,13 +38,18 @@ const PROGRAM: &[&str] = &[
     "figures",
     "display",
     "evidence",
+    "study",
     "commands",
 ];
 
 /// Imports that point outward, and why they are there: file, room, reason.
 const OUTWARD: &[(&str, &str, &str)] = &[
     ("figures/plot.rs", "display", "figures are drawn from the curves and the history that the page shows"),
-    ("figures/plot.rs", "evidence", "the figure of run time against error is drawn from the routes that `bench` measured"),
+    (
+        "figures/plot.rs",
+        "evidence",
+        "the figure of run time against error is drawn from the routes that `bench` measured",
+    ),
 ];
 
 /// Files of the core that import each other in a circle, and why.

@@ -48,6 +48,7 @@ mod sound_beside_logs;
 mod sound_reports;
 mod steady_states;
 mod stress;
+mod study;
 mod temperature;
 mod tribometer;
 mod upstream;
