@@ -4,11 +4,12 @@
 //! the approach of a pair in series with a spring of typical flexibility `f_k`. The force is nearly linear in `u_k` for an
 //! exponential law as for a law with a sharp onset, so long steps neither overflow nor open every pair.
 
-use faer::{Mat, MatMut};
+use faer::linalg::matmul::matmul;
+use faer::{Accum, Mat, MatMut, Par};
 
 use super::factors::Factors;
 use super::law::LawValue;
-use super::statics::{MeasuredLoad, PathEnd, StateSlope, Statics, StaticsError, SteadyState, times_columns};
+use super::statics::{MeasuredLoad, PathEnd, StateSlope, Statics, StaticsError, SteadyState};
 
 /// Largest residual of a state, relative to the largest terms of the equations.
 const LIMIT: f64 = 1e-11;
@@ -130,6 +131,43 @@ impl Scales {
     }
 }
 
+/// `a b`, on the calling thread only.
+fn product(a: &Mat<f64>, b: &Mat<f64>) -> Mat<f64> {
+    let mut out = Mat::zeros(a.nrows(), b.ncols());
+    matmul(&mut out, Accum::Replace, a, b, 1.0, Par::Seq);
+    out
+}
+
+/// `Σ_j G_kj N_j` and `Σ_j |G_kj N_j|` over the pairs `loaded`, `c` each.
+fn sums(flexibility: &Mat<f64>, forces: &[f64], loaded: &[usize]) -> [Vec<f64>; 2] {
+    let mut sums = [vec![0.0; forces.len()], vec![0.0; forces.len()]];
+    let [values, sizes] = &mut sums;
+    let column = |pair: usize| (forces[pair], flexibility.col_as_slice(pair));
+    // Uses the widest vector registers available, which does not change the result.
+    pulp::Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            let mut pairs = loaded.chunks_exact(2);
+            for two in &mut pairs {
+                let [(n, a), (m, b)] = [column(two[0]), column(two[1])];
+                for (((value, size), a), b) in values.iter_mut().zip(sizes.iter_mut()).zip(a).zip(b) {
+                    let (a, b) = (n * a, m * b);
+                    *value = *value + a + b;
+                    *size = *size + a.abs() + b.abs();
+                }
+            }
+            for &pair in pairs.remainder() {
+                let (n, a) = column(pair);
+                for ((value, size), a) in values.iter_mut().zip(sizes.iter_mut()).zip(a) {
+                    *value += n * a;
+                    *size += (n * a).abs();
+                }
+            }
+        },
+    );
+    sums
+}
+
 impl<'a> Equations<'a> {
     fn new(statics: &'a Statics, load: f64, x: f64, support: f64, scales: &'a Scales) -> Self {
         Self::within(Mat::new(), statics, load, x, support, scales)
@@ -193,15 +231,7 @@ impl<'a> Equations<'a> {
         let forces: Vec<f64> = law.iter().map(|value| value.pressure).collect();
         let loaded: Vec<usize> = (0..c).filter(|&k| forces[k] != 0.0).collect();
         let closed: Vec<usize> = (0..c).filter(|&k| law[k].tangent != 0.0).collect();
-        let (mut moved, mut size) = (vec![0.0; c], vec![0.0; c]);
-        for &j in &loaded {
-            let force = forces[j];
-            for ((sum, most), entry) in moved.iter_mut().zip(&mut size).zip(self.flexibility.col(j).iter()) {
-                let term = force * entry;
-                *sum += term;
-                *most += term.abs();
-            }
-        }
+        let [moved, size] = sums(&self.flexibility, &forces, &loaded);
         let back = self.back_force(&point);
         let mut residual = Vec::with_capacity(c + point.others.len());
         let mut largest = 0.0f64;
@@ -297,27 +327,29 @@ impl<'a> Equations<'a> {
     fn times(&self, at: &Evaluated, vectors: &Mat<f64>) -> Mat<f64> {
         let parts = &self.statics.parts;
         let (c, rigid, weight) = (self.statics.pairs(), self.rigid(), self.weight());
-        let mut out = Mat::zeros(vectors.nrows(), vectors.ncols());
-        let (mut forces, mut moved) = (vec![0.0; c], vec![0.0; c]);
+        let mut forces = Mat::zeros(c, vectors.ncols());
         for column in 0..vectors.ncols() {
             for &k in &at.closed {
-                forces[k] = at.law[k].tangent * vectors[(k, column)];
+                forces[(k, column)] = at.law[k].tangent * vectors[(k, column)];
             }
-            times_columns(self.flexibility.as_ref(), &forces, &at.closed, &mut moved);
+        }
+        let moved = product(&self.flexibility, &forces);
+        let mut out = Mat::zeros(vectors.nrows(), vectors.ncols());
+        for column in 0..vectors.ncols() {
+            for k in 0..c {
+                out[(k, column)] = vectors[(k, column)] + moved[(k, column)];
+            }
             for other in 0..vectors.nrows() - c {
                 let value = vectors[(c + other, column)];
-                for (k, moved) in moved.iter_mut().enumerate() {
-                    *moved += value * self.per_other(k, other);
+                for k in 0..c {
+                    out[(k, column)] += value * self.per_other(k, other);
                 }
                 let along = |k: usize| if other < rigid { self.pushed[(k, other)] } else { 1.0 };
-                let mut balance = at.closed.iter().map(|&k| along(k) * forces[k]).sum::<f64>();
+                let mut balance = at.closed.iter().map(|&k| along(k) * forces[(k, column)]).sum::<f64>();
                 if other < rigid && vectors.nrows() > c + rigid {
                     balance += parts.response.rigid.load[other] * vectors[(c + rigid, column)];
                 }
                 out[(c + other, column)] = weight * balance;
-            }
-            for (k, moved) in moved.iter().enumerate() {
-                out[(k, column)] = vectors[(k, column)] + moved;
             }
         }
         out
@@ -339,18 +371,21 @@ impl<'a> Equations<'a> {
         });
         jacobian.factors.solve(reduced.as_mut());
         let open: Vec<usize> = (0..c).filter(|&k| jacobian.tangent[k] == 0.0).collect();
-        let mut moved = vec![0.0; c];
-        let mut increments = vec![0.0; c];
+        let moved = if open.is_empty() {
+            Mat::new()
+        } else {
+            let mut increments = Mat::zeros(c, right.ncols());
+            for column in 0..right.ncols() {
+                for (row, &k) in jacobian.closed.iter().enumerate() {
+                    increments[(k, column)] = jacobian.tangent[k] * reduced[(row, column)];
+                }
+            }
+            product(&self.flexibility, &increments)
+        };
         for column in 0..right.ncols() {
-            for (row, &k) in jacobian.closed.iter().enumerate() {
-                increments[k] = jacobian.tangent[k] * reduced[(row, column)];
-            }
-            if !open.is_empty() {
-                times_columns(self.flexibility.as_ref(), &increments, &jacobian.closed, &mut moved);
-            }
             for &k in &open {
                 // The closure of an open pair follows from the other unknowns.
-                let mut value = right[(k, column)] - moved[k];
+                let mut value = right[(k, column)] - moved[(k, column)];
                 for other in 0..others {
                     value -= self.per_other(k, other) * reduced[(m + other, column)];
                 }
@@ -490,13 +525,11 @@ impl<'a> Equations<'a> {
     fn parameters(&self, at: &Evaluated) -> Mat<f64> {
         let parts = &self.statics.parts;
         let (c, rigid, weight) = (self.statics.pairs(), self.rigid(), self.weight());
-        let forces: Vec<f64> = at.law.iter().map(|value| value.pressure).collect();
-        let all: Vec<usize> = (0..c).filter(|&k| forces[k] != 0.0).collect();
-        let (mut by_friction, mut by_stiffness) = (vec![0.0; c], vec![0.0; c]);
-        times_columns(parts.response.sliding_flexibility.as_ref(), &forces, &all, &mut by_friction);
-        times_columns(self.flexibility.as_ref(), &forces, &all, &mut by_stiffness);
+        let forces = Mat::from_fn(c, 1, |k, _| at.law[k].pressure);
+        let [by_friction, by_stiffness] =
+            [&parts.response.sliding_flexibility, &self.flexibility].map(|flexibility| product(flexibility, &forces));
         let back = parts.measured == MeasuredLoad::Back;
-        let work = |rows: &Mat<f64>, j: usize| all.iter().map(|&k| rows[(k, j)] * forces[k]).sum::<f64>();
+        let work = |rows: &Mat<f64>, j: usize| (0..c).map(|k| rows[(k, j)] * forces[(k, 0)]).sum::<f64>();
         Mat::from_fn(at.residual.len(), 3, |row, parameter| {
             let of_pair = row < c;
             let of_motion = (!of_pair && row - c < rigid).then(|| row - c);
@@ -504,12 +537,12 @@ impl<'a> Equations<'a> {
                 (0, _) if of_pair => -if back { parts.response.gap_per_load[row] } else { 0.0 },
                 (0, Some(j)) => -weight * if back { parts.response.rigid.load[j] } else { 0.0 },
                 (0, None) => weight,
-                (1, _) if of_pair => -by_friction[row],
+                (1, _) if of_pair => -by_friction[(row, 0)],
                 (1, Some(j)) => -weight * work(&parts.response.rigid.sliding, j),
                 (1, None) => 0.0,
-                (_, _) if of_pair => -by_stiffness[row],
+                (_, _) if of_pair => -by_stiffness[(row, 0)],
                 (_, Some(j)) => -weight * work(&self.pushed, j),
-                (_, None) => -weight * forces.iter().sum::<f64>(),
+                (_, None) => -weight * at.law.iter().map(|value| value.pressure).sum::<f64>(),
             }
         })
     }

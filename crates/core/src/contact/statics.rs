@@ -2,7 +2,7 @@
 
 use std::sync::{Mutex, OnceLock, PoisonError};
 
-use faer::{Mat, MatRef};
+use faer::Mat;
 
 use super::law::{LawError, LawValue, PressureLaw};
 use super::path;
@@ -333,16 +333,5 @@ impl Statics {
     /// Number of unknowns beside the closures: rigid motions, and the force on the back if it is not measured.
     pub(super) fn others(&self) -> usize {
         self.parts.response.rigid.load.len() + usize::from(self.parts.measured == MeasuredLoad::Contact)
-    }
-}
-
-/// `matrix * vector` over the listed `columns` only, in ascending order.
-pub(super) fn times_columns(matrix: MatRef<'_, f64>, vector: &[f64], columns: &[usize], out: &mut [f64]) {
-    out.fill(0.0);
-    for &j in columns {
-        let factor = vector[j];
-        for (sum, entry) in out.iter_mut().zip(matrix.col(j).iter()) {
-            *sum += factor * entry;
-        }
     }
 }

@@ -289,7 +289,7 @@ impl SteadyContact {
         let stiffness = &state.tangent_n_per_m;
         let c = stiffness.len();
         let forces = if x == 0.0 { self.normal.clone() } else { &self.normal + faer::Scale(x) * &self.sliding };
-        let scaled = by_row(stiffness, self.normal.as_ref());
+        let scaled = by_row(stiffness, &self.normal);
         let Some([normal, sliding]) = &self.residual else {
             return Response {
                 contact: self,
@@ -366,10 +366,11 @@ impl SteadyContact {
             }
         } else {
             // `(D' F + dx D B_t)ᵀ B_n`.
-            let (value, forces) = (response.stiffness, &response.forces);
-            let pushed = Mat::from_fn(forces.nrows(), forces.ncols(), |i, j| {
-                stiffness[i] * forces[(i, j)] + dx * value[i] * self.sliding[(i, j)]
-            });
+            let mut pushed = by_row(&stiffness, &response.forces);
+            if dx != 0.0 {
+                let turned: Vec<f64> = response.stiffness.iter().map(|k| dx * k).collect();
+                pushed += by_row(&turned, &self.sliding);
+            }
             product(pushed.transpose(), self.normal.as_ref())
         };
         let symmetric = response.x == 0.0 && dx == 0.0;
@@ -424,7 +425,7 @@ impl SteadyContact {
     /// Adds `B_tᵀ diag(s N) B_t` for the slopes `s`.
     fn add_along(&self, slopes: &[f64], force_n: &[f64], c: &mut Mat<f64>) {
         let weights: Vec<f64> = slopes.iter().zip(force_n).map(|(slope, force)| slope * force).collect();
-        let rows = by_row(&weights, self.sliding.as_ref());
+        let rows = by_row(&weights, &self.sliding);
         add(c, &product(self.sliding.transpose(), rows.as_ref()), true);
     }
 
@@ -432,7 +433,7 @@ impl SteadyContact {
     fn add_lateral_damping(&self, factor: f64, force_n: &[f64], c: &mut Mat<f64>) {
         if factor != 0.0 && !self.inverse_radius.is_empty() {
             let weights: Vec<f64> = force_n.iter().zip(&self.inverse_radius).map(|(n, r)| factor * n * r).collect();
-            let rows = by_row(&weights, self.lateral.as_ref());
+            let rows = by_row(&weights, &self.lateral);
             add(c, &product(self.lateral.transpose(), rows.as_ref()), true);
         }
     }
@@ -467,41 +468,44 @@ impl Response<'_> {
 
     /// `Y`.
     fn dampers(&self) -> Mat<f64> {
-        self.relaxed(by_row(&self.damping(self.stiffness), self.seen().as_ref()))
+        self.relaxed(by_row(&self.damping(self.stiffness), self.seen()))
     }
 
     /// `X'` for the derivatives `dx` of `x` and `slope` of `k`.
     fn springs_slope(&self, dx: f64, slope: &[f64]) -> Mat<f64> {
-        let mut change = by_row(slope, self.seen().as_ref());
+        let mut change = by_row(slope, self.seen());
         if let Some(flexible) = self.flexible.as_ref().filter(|_| dx != 0.0) {
             let moved = product(flexible.sliding.as_ref(), self.springs.as_ref());
-            change -= faer::Scale(dx) * by_row(self.stiffness, moved.as_ref());
+            change -= faer::Scale(dx) * by_row(self.stiffness, &moved);
         }
         self.relaxed(change)
     }
 
     /// `Y'` for the derivatives `dx` of `x`, `slope` of `k` and `damping` of `C_c`; `dampers` is `Y`.
     fn dampers_slope(&self, dx: f64, slope: &[f64], damping: &[f64], dampers: &Mat<f64>) -> Mat<f64> {
-        let mut change = by_row(damping, self.seen().as_ref());
+        let mut change = by_row(damping, self.seen());
         if let Some(flexible) = &self.flexible {
             let Flexible { sliding, flexibility, .. } = flexible;
             // `R' m` and `R m`.
             let turned = |m: &Mat<f64>| faer::Scale(dx) * product(sliding.as_ref(), m.as_ref());
             let bent = |m: &Mat<f64>| product(flexibility.as_ref(), m.as_ref());
-            let pushed =
-                turned(&by_row(self.stiffness, self.seen().as_ref())) + bent(&by_row(slope, self.seen().as_ref()));
-            let relaxed = flexible.solve(&by_row(self.stiffness, pushed.as_ref()));
+            let pushed = turned(&by_row(self.stiffness, self.seen())) + bent(&by_row(slope, self.seen()));
+            let relaxed = flexible.solve(&by_row(self.stiffness, &pushed));
             let seen_slope = bent(&relaxed) - pushed;
-            change += by_row(&self.damping(self.stiffness), seen_slope.as_ref());
-            change -= by_row(slope, bent(dampers).as_ref()) + by_row(self.stiffness, turned(dampers).as_ref());
+            change += by_row(&self.damping(self.stiffness), &seen_slope);
+            change -= by_row(slope, &bent(dampers)) + by_row(self.stiffness, &turned(dampers));
         }
         self.relaxed(change)
     }
 }
 
 /// `diag(d) m`.
-fn by_row(d: &[f64], m: MatRef<'_, f64>) -> Mat<f64> {
-    Mat::from_fn(m.nrows(), m.ncols(), |i, j| d[i] * m[(i, j)])
+fn by_row(d: &[f64], m: &Mat<f64>) -> Mat<f64> {
+    let mut out = m.clone();
+    for j in 0..out.ncols() {
+        out.col_as_slice_mut(j).iter_mut().zip(d).for_each(|(entry, d)| *entry *= d);
+    }
+    out
 }
 
 /// `a b`, on the calling thread only.
@@ -514,9 +518,13 @@ fn product(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
 /// Adds `m` to `out`, its upper triangle mirrored if it is known to be symmetric: exactly, because the choice of the
 /// solver depends on it.
 fn add(out: &mut Mat<f64>, m: &Mat<f64>, symmetric: bool) {
+    if !symmetric {
+        *out += m;
+        return;
+    }
     for j in 0..out.ncols() {
         for i in 0..out.nrows() {
-            out[(i, j)] += if symmetric { m[(i.min(j), i.max(j))] } else { m[(i, j)] };
+            out[(i, j)] += m[(i.min(j), i.max(j))];
         }
     }
 }
