@@ -379,9 +379,12 @@ fn may_diverge<'a>(spectra: impl Iterator<Item = &'a Spectrum>) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use faer::Mat;
 
     use super::*;
+    use crate::contact::PressureLaw;
     use crate::physics::chart::NotCharted;
     use crate::physics::law::{ContactLaw, Law};
     use crate::physics::model::Term;
@@ -389,7 +392,7 @@ mod tests {
     use crate::physics::stribeck::Stribeck;
     use crate::physics::test_models::nine_dof;
     use crate::proof::held_out::{HoldOut, hold_out};
-    use crate::proof::synthetic::{Synthetic, Uniform, rig};
+    use crate::proof::synthetic::{Synthetic, Uniform, rig, statics, turning_parts};
 
     fn options(low: (f64, f64, f64), high: (f64, f64, f64), band_max_hz: Option<f64>) -> ChartOptions {
         let point = |(friction_coefficient, normal_load_n, disc_speed_rad_s)| OperatingPoint {
@@ -573,6 +576,26 @@ mod tests {
             assert!(!begun.is_complete());
             let resumed = resume(&model, &options, Some(begun), &mut |_| true).expect("the chart can be built");
             assert_eq!(resumed.words(), whole.words());
+        }
+    }
+
+    /// The matrix `C` of a disc that turns without damping is skew: its trace vanishes, and so does the sum of all roots.
+    /// Such rigs are charted over the speed like damped ones, with springs that are always closed and about a contact state.
+    #[test]
+    fn a_disc_that_turns_without_damping_is_charted() {
+        let synthetic =
+            Synthetic { modes: 8, pairs: 6, damping_ratio: 0.0, contact_law: ContactLaw::default(), seed: 1 };
+        let parts = turning_parts(&synthetic).unwrap();
+        let closed = parts.free.clone().with_contact(&parts.pairs).unwrap();
+        let law = PressureLaw::Exponential { pressure: 10.0, roughness_m: 1e-5 };
+        let statics = Arc::new(statics(&parts, law, 0.0).unwrap());
+        let about_a_state = parts.free.clone().with_steady_contact(&parts.pairs, statics, None).unwrap();
+        for (model, axes) in [(closed, 2), (about_a_state, 3)] {
+            let options = options((0.0, 400.0, 5.0), (0.4, 600.0, 15.0), None);
+            let chart = build(&model, &options, &|_| true).unwrap();
+            assert_eq!(chart.axes.len(), axes);
+            let found = held_out(&model, &options, 500);
+            assert_eq!(found.charted, 500, "{found:?}");
         }
     }
 }

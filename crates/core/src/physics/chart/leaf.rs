@@ -271,7 +271,7 @@ impl Builder<'_> {
     }
 
     /// What both traces and their derivatives leave after the charted roots, with a column for each trace, and the
-    /// largest magnitude of each trace.
+    /// largest magnitude of each trace; at least `|C|` for the first one, because that of a gyroscopic matrix vanishes.
     fn remainders(&self, branches: &Branches<'_>, settled: &[(Vec<usize>, Expansion)]) -> (Mat<f64>, [f64; 2]) {
         let axes = self.chart.axes.len();
         let weight = if branches.undamped { 1.0 } else { 2.0 };
@@ -280,6 +280,8 @@ impl Builder<'_> {
         let mut largest = [0.0f64; 2];
         for (node, sample) in branches.samples.iter().enumerate() {
             let row = node * per_point;
+            let [_, damping, _] = sample.totals.norms;
+            largest[0] = largest[0].max(damping);
             for k in 0..2 {
                 largest[k] = largest[k].max(sample.totals.powers[k].abs());
                 rest[(row, k)] = sample.totals.powers[k];

@@ -23,7 +23,8 @@ const QUANTITIES: usize = 4;
 const NODES: [usize; MAX_AXES + 1] = [1, 17, 13, 9];
 /// Largest number of nodes along an axis.
 const MOST_NODES: usize = 17;
-/// Largest estimated error of an expansion, relative to the quantity.
+/// Largest estimated error of an expansion, relative to the quantity; of the first sum, to `|C|` if that is larger: the sum
+/// of a gyroscopic matrix vanishes.
 const TOLERANCE: f64 = 1e-10;
 /// Factor by which error bounds exceed estimated errors.
 const SAFETY: f64 = 4.0;
@@ -225,6 +226,8 @@ impl Domain<'_> {
                 largest[k] = largest[k].max(value.abs());
             }
         }
+        let [first, _, damping, _] = &mut largest;
+        *first = first.max(*damping);
         transform(&mut values, count, axes);
         // Terms of the two highest degrees along an axis.
         let tail = |quantity: usize, axis: usize| -> f64 {
