@@ -23,7 +23,7 @@ use crate::physics::{
 };
 use crate::proof::held_out::hold_out;
 use crate::proof::reference::{self, Refined};
-use crate::proof::synthetic::{STIFFNESS_N_PER_M, Synthetic, Uniform, parts, statics};
+use crate::proof::synthetic::{STIFFNESS_N_PER_M, Synthetic, Uniform, parts, statics, turning_parts};
 use lapack::{Lapack, LapackError};
 
 /// Which synthetic rigs are measured.
@@ -42,6 +42,8 @@ pub enum Kind {
     Rough,
     /// The same with springs that only push: roots jump where pairs open and close
     Opening,
+    /// As `rough`, with a disc that turns in the frame of the pad: friction coefficient, load and speed matter
+    Turning,
 }
 
 impl Kind {
@@ -51,7 +53,9 @@ impl Kind {
         let (stiffness, share) = (STIFFNESS_N_PER_M / pairs as f64, 500.0 / pairs as f64);
         match self {
             Self::Undamped | Self::Hertzian | Self::Lateral | Self::Damped => None,
-            Self::Rough => Some(PressureLaw::Exponential { pressure: 0.1 * share, roughness_m: share / stiffness }),
+            Self::Rough | Self::Turning => {
+                Some(PressureLaw::Exponential { pressure: 0.1 * share, roughness_m: share / stiffness })
+            }
             Self::Opening => Some(PressureLaw::Linear { stiffness }),
         }
     }
@@ -362,7 +366,7 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> Result<Model, ModelError> {
         Kind::Undamped => ContactLaw::default(),
         Kind::Hertzian => ContactLaw { exponent: 1.0 / 3.0, ..ContactLaw::default() },
         Kind::Lateral => ContactLaw { lateral_damping: true, ..ContactLaw::default() },
-        Kind::Rough | Kind::Opening => ContactLaw::default(),
+        Kind::Rough | Kind::Opening | Kind::Turning => ContactLaw::default(),
         Kind::Damped => ContactLaw {
             exponent: 1.0 / 3.0,
             reference_n: 500.0,
@@ -372,7 +376,8 @@ fn model(modes: usize, plan: &Plan, seed: u64) -> Result<Model, ModelError> {
         },
     };
     let damping_ratio = if matches!(plan.kind, Kind::Damped | Kind::Lateral) { 5e-3 } else { 0.0 };
-    let parts = parts(&Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed })?;
+    let synthetic = Synthetic { modes, pairs: plan.pairs, damping_ratio, contact_law, seed };
+    let parts = if plan.kind == Kind::Turning { turning_parts(&synthetic)? } else { parts(&synthetic)? };
     let Some(law) = plan.kind.contact_state(plan.pairs) else { return parts.free.with_contact(&parts.pairs) };
     let statics = statics(&parts, law, GAP_M).map_err(ModelError::State)?;
     let [loads, frictions] = ANCHORS.map(|count| (0..count).map(move |k| f64::from(k) / f64::from(count - 1)));

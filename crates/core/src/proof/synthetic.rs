@@ -71,6 +71,41 @@ pub fn rig(synthetic: &Synthetic) -> Result<Model, ModelError> {
 /// # Errors
 /// [`ModelError`] if `contact_law` is not valid.
 pub fn parts(synthetic: &Synthetic) -> Result<Parts, ModelError> {
+    build(synthetic, false)
+}
+
+/// Builds the parts of the rig with a disc that turns in the frame of the pad. In this frame, a shape `q` of a doublet of
+/// `m` waves changes at the rate `q̇ + Ω P q` with `P = [0 m; -m 0]`, so its frequencies are `ω ± m Ω`:
+///
+/// ```text
+/// q̈ + 2 Ω P q̇ + (Ω² P² + ω²) q = 0
+/// ```
+///
+/// # Errors
+/// [`ModelError`] if `contact_law` is not valid.
+pub fn turning_parts(synthetic: &Synthetic) -> Result<Parts, ModelError> {
+    build(synthetic, true)
+}
+
+/// Number of waves around the disc of its `k`-th shape; two shapes in a row are a doublet.
+fn waves(k: usize) -> f64 {
+    1.0 + (k / 2 % 9) as f64
+}
+
+/// The terms of a disc of `disc` shapes that turns, after the `pad` shapes of the pad: of stiffness and of damping.
+fn turning(pad: usize, disc: usize) -> [Term; 2] {
+    let n = pad + disc;
+    let (mut spin, mut gyroscopic) = (Mat::zeros(n, n), Mat::zeros(n, n));
+    for k in (0..disc.saturating_sub(1)).step_by(2) {
+        let (one, other, m) = (pad + k, pad + k + 1, waves(k));
+        (spin[(one, one)], spin[(other, other)]) = (-m * m, -m * m);
+        (gyroscopic[(one, other)], gyroscopic[(other, one)]) = (2.0 * m, -2.0 * m);
+    }
+    let by_speed = |matrix, power| Term { matrix, law: Law::DiscSpeed { power } };
+    [by_speed(spin, 2), by_speed(gyroscopic, 1)]
+}
+
+fn build(synthetic: &Synthetic, turns: bool) -> Result<Parts, ModelError> {
     let Synthetic { modes, pairs: count, damping_ratio, contact_law, seed } = *synthetic;
     let mut uniform = Uniform::new(seed);
     let pad = modes / 2;
@@ -90,7 +125,7 @@ pub fn parts(synthetic: &Synthetic) -> Result<Parts, ModelError> {
         (Mat::zeros(count, modes), Mat::zeros(count, modes), Mat::zeros(count, modes));
     for k in 0..modes {
         let on_disc = k >= pad;
-        let wave = if on_disc { 1.0 + ((k - pad) / 2) as f64 % 9.0 } else { 2.0 + 6.0 * uniform.draw().abs() };
+        let wave = if on_disc { waves(k - pad) } else { 2.0 + 6.0 * uniform.draw().abs() };
         let phase = if on_disc && (k - pad) % 2 == 1 { 0.5 * std::f64::consts::PI } else { 0.0 };
         let (tilt, turn) = (uniform.draw(), if on_disc { 0.0 } else { uniform.draw() });
         let (along_t, along_b) = (0.6 * uniform.draw(), 0.4 * uniform.draw());
@@ -114,8 +149,13 @@ pub fn parts(synthetic: &Synthetic) -> Result<Parts, ModelError> {
         damping_n_s_per_m: vec![0.0; count],
         radius_m: place.iter().map(|&(_, radius)| radius).collect(),
     };
-    let stiffness = vec![diagonal(&|w| w * w)];
-    let damping = vec![diagonal(&|w| 2.0 * damping_ratio * w)];
+    let mut stiffness = vec![diagonal(&|w| w * w)];
+    let mut damping = vec![diagonal(&|w| 2.0 * damping_ratio * w)];
+    if turns {
+        let [spin, gyroscopic] = turning(pad, disc);
+        stiffness.push(spin);
+        damping.push(gyroscopic);
+    }
     let free = Model::new(modes, stiffness, damping, contact_law, Some(pad))?;
     Ok(Parts { free, pairs, omega })
 }
