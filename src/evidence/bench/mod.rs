@@ -661,6 +661,9 @@ fn chart(model: &Model, plan: &Plan, options: &ChartOptions, say: &dyn Fn(&str))
 
 /// Nearest roots whose relative distance is below this are compared as a pair.
 const NEARLY_MERGED: f64 = 1e-2;
+/// The next root must be this many times as far from such a pair as its roots are from each other: the reference expands about
+/// their mean to the seventh order.
+const NEXT_ROOT: f64 = 50.0;
 
 /// Refines a few modes of the band to thirty digits, each with the modes it merges with. The nearest pair is among them
 /// if it is close to merging. `None` for a cluster whose refinement did not converge.
@@ -685,9 +688,17 @@ fn refined(
         let (a, b) = (reference::solved_for(spectrum, single[i][0]), reference::solved_for(spectrum, single[j][0]));
         (a - b).norm() / a.norm()
     };
+    let is_apart = |i: usize, j: usize| {
+        let pair = [single[i][0], single[j][0]];
+        let [a, b] = pair.map(|k| reference::solved_for(spectrum, k));
+        let others = (0..spectrum.mode_count).filter(|k| !pair.contains(k));
+        let next =
+            others.map(|k| (reference::solved_for(spectrum, k) - 0.5 * (a + b)).norm()).fold(f64::INFINITY, f64::min);
+        next > NEXT_ROOT * (a - b).norm()
+    };
     let pairs = (0..single.len()).flat_map(|j| (0..j).map(move |i| (i, j)));
     let nearest = pairs.min_by(|a, b| gap(a.0, a.1).total_cmp(&gap(b.0, b.1)));
-    if let Some((i, j)) = nearest.filter(|&(i, j)| gap(i, j) < NEARLY_MERGED) {
+    if let Some((i, j)) = nearest.filter(|&(i, j)| gap(i, j) < NEARLY_MERGED && is_apart(i, j)) {
         let pair = [single.swap_remove(j), single.swap_remove(i)].concat(); // the later one first: the other keeps its place
         chosen.push(pair);
     }
