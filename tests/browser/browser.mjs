@@ -51,8 +51,9 @@ export async function picture(page, folder, name) {
   await page.screenshot({ path: `${folder}/${name}.png`, fullPage: true });
 }
 
-/** axe-core's violations, each in a line. */
+/** axe-core's violations, each in a line; colours that are changing are judged when they have changed. */
 export async function violations(page) {
+  await page.evaluate(() => Promise.allSettled(document.getAnimations().map((animation) => animation.finished)));
   await page.evaluate(require("node:fs").readFileSync(require.resolve("axe-core/axe.min.js"), "utf8"));
   const { violations } = await page.evaluate(() => window.axe.run());
   return violations.map((found) => `${found.id} (${found.impact}): ${found.help}: ${found.nodes.slice(0, 4).map((node) => `${node.html} ${node.any[0]?.message ?? ""}`).join(" | ")}`);
