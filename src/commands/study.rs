@@ -124,15 +124,11 @@ impl Options {
             memory,
             retry_failed: self.retry_failed,
         };
-        // A case that breaks off is a row with its reason, which the default hook would print as well.
-        let hook = std::panic::take_hook();
-        std::panic::set_hook(Box::new(|_| {}));
         let mut steps = self.progress.steps(1);
         let ended = run(&study, output, running, &stopped, &mut |done, of| {
             steps.at(0, &study.name, done as usize, of as usize);
         });
         drop(steps);
-        std::panic::set_hook(hook);
         let ended = ended.with_context(|| match stopped.load(Ordering::Relaxed) {
             true => format!("{}: started again, it goes on with the other cases", output.display()),
             false => String::new(),

@@ -4,7 +4,6 @@
 //! files, and no column can hold more than the file is long. Only such files are read back: what a file claims is checked
 //! against its length before it is decoded.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -22,6 +21,7 @@ use parquet::schema::types::{Type, TypePtr};
 
 use super::table::{Cells, Column, Kind, Table};
 use crate::files::input_file;
+use crate::system::panics::caught;
 
 /// Why a table cannot be written or read.
 #[derive(Debug, thiserror::Error)]
@@ -391,7 +391,7 @@ fn column_of(field: &Type) -> Result<Column, String> {
 /// The result of a work of the library, whose panics on damaged files become errors.
 fn guarded<T>(name: &str, work: impl FnOnce() -> Result<T, ParquetError>) -> Result<T, TableError> {
     let refuse = |reason: String| TableError::Unreadable { file: name.to_owned(), reason };
-    match catch_unwind(AssertUnwindSafe(work)) {
+    match caught(work) {
         Ok(done) => done.map_err(|error| refuse(error.to_string())),
         Err(_) => Err(refuse("it is damaged".to_owned())),
     }

@@ -1,10 +1,8 @@
 //! Computes the cases of a study on all cores. Each thread takes the next part, computes its cases and writes them as one file,
 //! which appears whole or not at all. A study that was stopped, however, goes on with the parts that are not there.
 
-use std::any::Any;
 use std::fs;
 use std::io::Write;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -17,6 +15,7 @@ use super::plan::{Plan, Shard};
 use super::table::{Cell, Column, Kind, Table};
 use super::{CASE, DONE, FAILED, Identity, REASON, STATUS, StudyError, TIME};
 use crate::files::whole_file::write_whole;
+use crate::system::panics::caught;
 
 /// The table that a whole study ends with.
 pub const TABLE: &str = "table.parquet";
@@ -102,7 +101,7 @@ impl Study {
         let begun = Instant::now();
         let values = self.values(case);
         let work = || self.subject.compute(case, &self.parameters, &values, folder, memory);
-        let computed = catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| Err(panic_words(panic.as_ref())));
+        let computed = caught(work).unwrap_or_else(|panic| Err(format!("the computation broke off: {panic}")));
         let mut row = vec![Cell::Whole(case as i64)];
         row.extend(self.subject.own_cells(case));
         row.extend(values.iter().map(|value| Cell::Number(value.value())));
@@ -120,12 +119,6 @@ impl Study {
         row.push(Cell::Number(begun.elapsed().as_secs_f64()));
         (row, failed)
     }
-}
-
-fn panic_words(panic: &(dyn Any + Send)) -> String {
-    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
-    let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
-    format!("the computation broke off: {}", text.unwrap_or_else(|| "no reason was given".to_owned()))
 }
 
 /// Whether the file of a part is there. One that cannot be read is not: it is written again.
