@@ -8,7 +8,7 @@ use std::path::Path;
 use squealcast::physics::chart::BUILDER;
 
 /// Rooms of `crates/core/src`, from the inside out.
-const CORE: &[&str] = &["chebyshev", "sampling", "spoil", "contact", "physics", "reduction", "fem", "proof"];
+const CORE: &[&str] = &["chebyshev", "product", "sampling", "spoil", "contact", "physics", "reduction", "fem", "proof"];
 
 /// Rooms of `src`, from the inside out, after the libraries that `src/lib.rs` passes on.
 const PROGRAM: &[&str] = &[
@@ -72,7 +72,10 @@ const CIRCLES: &[(&[&str], &str)] = &[
         "a map holds its windows and its numbering of modes, both made from its nodes",
     ),
     (&["contact::law", "contact::spline"], "a law may be a table, and a table gives the values of a law"),
-    (&["contact::path", "contact::statics"], "statics are solved along a path, whose steps are states of the statics"),
+    (
+        &["contact::anchors", "contact::equations", "contact::newton", "contact::path", "contact::statics"],
+        "statics are solved along a path or from anchors, whose states are states of the statics",
+    ),
     (
         &["physics::chart::build", "physics::chart::leaf"],
         "a build makes leaves, and a leaf reads the options of its build",

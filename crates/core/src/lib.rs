@@ -133,6 +133,7 @@ mod chebyshev;
 pub mod contact;
 pub mod fem;
 pub mod physics;
+mod product;
 #[cfg(any(test, feature = "proof"))]
 pub mod proof;
 pub mod reduction;

@@ -10,8 +10,11 @@
 //! [`PressureLaw`] is `p`, [`Statics`] holds the rest, [`Statics::state`] solves for the closures `δ`, the contact forces
 //! `N`, the rigid motions `ρ` and, where the contact force is what a rig measures, the force `F` on the pad's back.
 
+mod anchors;
+mod equations;
 mod factors;
 mod law;
+mod newton;
 mod path;
 mod response;
 mod shape;

@@ -4,6 +4,7 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 
 use faer::Mat;
 
+use super::anchors::{self, Anchor, Work};
 use super::law::{LawError, LawValue, PressureLaw};
 use super::path;
 use super::response::StaticResponse;
@@ -41,13 +42,13 @@ pub struct Statics {
     /// Loads (N) and `s_mu` at which anchors are computed.
     anchored_at: [Vec<f64>; 2],
     /// Computed with the first state.
-    anchors: OnceLock<Vec<path::Anchor>>,
+    anchors: OnceLock<Vec<Anchor>>,
     spare: Spare,
 }
 
 /// Work arrays that wait for the next state; a copy has none.
 #[derive(Debug, Default)]
-struct Spare(Mutex<Vec<path::Work>>);
+struct Spare(Mutex<Vec<Work>>);
 
 impl Clone for Spare {
     fn clone(&self) -> Self {
@@ -57,7 +58,7 @@ impl Clone for Spare {
 
 impl Spare {
     /// What `solve` returns with work arrays of its own.
-    fn with<T>(&self, solve: impl FnOnce(&mut path::Work) -> T) -> T {
+    fn with<T>(&self, solve: impl FnOnce(&mut Work) -> T) -> T {
         let mut work = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
         let found = solve(&mut work);
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(work);
@@ -279,9 +280,9 @@ impl Statics {
         self.known_anchors().len()
     }
 
-    fn known_anchors(&self) -> &[path::Anchor] {
+    fn known_anchors(&self) -> &[Anchor] {
         let [loads_n, s_mus] = &self.anchored_at;
-        self.anchors.get_or_init(|| path::anchors(self, loads_n, s_mus))
+        self.anchors.get_or_init(|| anchors::anchors(self, loads_n, s_mus))
     }
 
     /// Number of contact pairs, `c`.
@@ -312,7 +313,7 @@ impl Statics {
             return Err(StaticsError::Condition { what: "load", value: load_n, limit: "more than 0" });
         }
         let anchors = if load_n > 0.0 { self.known_anchors() } else { &[] };
-        let near = self.spare.with(|work| path::from_anchor(self, anchors, load_n, s_mu, work));
+        let near = self.spare.with(|work| anchors::from_anchor(self, anchors, load_n, s_mu, work));
         let found = near.map_or_else(|| path::follow(self, load_n, s_mu), Ok)?;
         if let PressureLaw::Table(table) = &self.parts.law {
             let limit_m = table.last_closure_m();

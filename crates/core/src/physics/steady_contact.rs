@@ -23,9 +23,8 @@
 
 use std::sync::Arc;
 
-use faer::linalg::matmul::matmul;
 use faer::linalg::solvers::{PartialPivLu, Solve};
-use faer::{Accum, Mat, MatRef, Par, c64};
+use faer::{Mat, c64};
 
 use super::flexible_contact::ResidualFlexibility;
 use super::law::{ContactLaw, Parameter};
@@ -35,6 +34,7 @@ use super::operating_point::{ContactState, OperatingPoint};
 use super::spectrum::Spectrum;
 use super::stribeck::Stribeck;
 use crate::contact::{Smoothness, Statics, SteadyState};
+use crate::product::product;
 
 /// The contact of a model whose springs follow the state of steady sliding.
 #[derive(Clone, Debug)]
@@ -505,13 +505,6 @@ fn by_row(d: &[f64], m: &Mat<f64>) -> Mat<f64> {
     for j in 0..out.ncols() {
         out.col_as_slice_mut(j).iter_mut().zip(d).for_each(|(entry, d)| *entry *= d);
     }
-    out
-}
-
-/// `a b`, on the calling thread only.
-fn product(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
-    let mut out = Mat::zeros(a.nrows(), b.ncols());
-    matmul(&mut out, Accum::Replace, a, b, 1.0, Par::Seq);
     out
 }
 

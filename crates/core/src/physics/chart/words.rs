@@ -10,7 +10,7 @@ pub const FORMAT: u64 = 6;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 36] = [
+pub const BUILDER: [&str; 40] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
@@ -36,9 +36,12 @@ pub const BUILDER: [&str; 36] = [
     include_str!("../steady_contact.rs"),
     include_str!("../stribeck.rs"),
     include_str!("../traces.rs"),
+    include_str!("../../contact/anchors.rs"),
+    include_str!("../../contact/equations.rs"),
     include_str!("../../contact/factors.rs"),
     include_str!("../../contact/law.rs"),
     include_str!("../../contact/mod.rs"),
+    include_str!("../../contact/newton.rs"),
     include_str!("../../contact/path.rs"),
     include_str!("../../contact/response.rs"),
     include_str!("../../contact/shape.rs"),
@@ -46,6 +49,7 @@ pub const BUILDER: [&str; 36] = [
     include_str!("../../contact/statics.rs"),
     include_str!("../tracking.rs"),
     include_str!("../../chebyshev.rs"),
+    include_str!("../../product.rs"),
     include_str!("../../sampling.rs"),
 ];
 
