@@ -443,6 +443,18 @@ mod tests {
         }
     }
 
+    /// Three axes down to low speeds, where `μN/ω` moves the roots far: split along the axis along which roots curve most,
+    /// nearly all conditions are charted after this number of solves; split by the last coefficients, half of them.
+    #[test]
+    fn three_axes_down_to_low_speeds() {
+        let contact_law =
+            ContactLaw { exponent: 1.0 / 3.0, slope_s_per_m: -0.02, lateral_damping: true, ..Default::default() };
+        let model = rig(&Synthetic { modes: 24, pairs: 48, damping_ratio: 5e-3, contact_law, seed: 1 }).unwrap();
+        let options = ChartOptions { max_solves: 3500, ..options((0.0, 50.0, 1.0), (1.0, 2000.0, 60.0), Some(5000.0)) };
+        let found = held_out(&model, &options, 300);
+        assert!(found.charted > 270, "{found:?}");
+    }
+
     /// Friction that falls with speed: the damping of each of 48 pairs at different radii follows the disc speed. On the
     /// reciprocal of the speed, which is the coordinate of a chart, the slope is a function with every derivative 0 at
     /// infinite speed.

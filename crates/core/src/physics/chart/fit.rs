@@ -88,15 +88,6 @@ impl Basis {
         out.clear();
         out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| tables[k][usize::from(d[k])]).product::<f64>()));
     }
-
-    /// The axis along which the coefficients of the two highest degrees are largest.
-    fn worst_axis(&self, coefficients: impl Iterator<Item = f64>) -> usize {
-        let mut by_axis = [0.0; MAX_AXES];
-        for (d, c) in self.degrees.iter().zip(coefficients).filter(|(d, _)| total(d) + 1 >= self.degree) {
-            by_axis.iter_mut().zip(d).for_each(|(sum, &degree)| *sum += f64::from(degree) * c.abs());
-        }
-        (0..self.axes).max_by(|&a, &b| by_axis[a].total_cmp(&by_axis[b])).unwrap_or(0)
-    }
 }
 
 fn total(degrees: &[u8; MAX_AXES]) -> usize {
@@ -130,7 +121,9 @@ pub struct Fitted {
     /// scaled to the value that the first omitted degree would have. The tail is the largest value of the terms of
     /// one of the two highest total degrees, over the points; the highest alone may be small by accident.
     pub missing: f64,
-    /// The axis along which the expansion converges worst.
+    /// The axis along which the function curves most: that of the largest second derivative with respect to the unit
+    /// coordinates, over the points. Next to a singularity second derivatives are unbounded, and largest along the axis
+    /// along which it is nearest. The coefficients of an expansion that is far from converging do not tell.
     pub worst_axis: usize,
 }
 
@@ -185,6 +178,7 @@ impl Fit {
 
     /// Expansions of the columns of `data`, with rows in the order given at [`Fit::new`].
     pub fn expand(&self, mut data: Mat<f64>) -> Vec<Fitted> {
+        let worst_axes: Vec<usize> = (0..data.ncols()).map(|column| self.most_curved(&data, column)).collect();
         for (row, &weight) in self.weights.iter().enumerate() {
             for column in 0..data.ncols() {
                 // Omitted data may be NaN.
@@ -208,9 +202,21 @@ impl Fit {
                 let coefficients: Vec<f64> = (0..self.basis.len()).map(|row| coefficients[(row, column)]).collect();
                 // `f64::max` ignores NaN, so NaN data must be reported explicitly.
                 let missing = if coefficients[0].is_nan() { f64::NAN } else { misfit + tail };
-                Fitted { worst_axis: self.basis.worst_axis(coefficients.iter().copied()), coefficients, missing }
+                Fitted { worst_axis: worst_axes[column], coefficients, missing }
             })
             .collect()
+    }
+
+    /// The axis along which a column of the data curves most.
+    fn most_curved(&self, data: &Mat<f64>, column: usize) -> usize {
+        let axes = self.basis.axes;
+        let curvature = |axis: usize| -> f64 {
+            let twice = Basis::orders(axes).iter().position(|order| order[axis] == 2).unwrap_or(0);
+            let rows = (twice..data.nrows()).step_by(self.per_point).filter(|&row| self.weights[row] > 0.0);
+            rows.map(|row| data[(row, column)].abs()).fold(0.0, f64::max)
+        };
+        let curvatures: Vec<f64> = (0..axes).map(curvature).collect();
+        (0..axes).max_by(|&a, &b| curvatures[a].total_cmp(&curvatures[b])).unwrap_or(0)
     }
 }
 
@@ -251,6 +257,32 @@ mod tests {
             let sum: f64 = fitted.coefficients.iter().zip(&values).map(|(c, v)| c * v).sum();
             let bound = 4.0 * fitted.missing;
             assert!((sum - f(unit)).abs() < bound && bound < 1e-2, "{sum} is not {}: {bound:e}", f(unit));
+        }
+    }
+
+    /// A function with a pole next to the box along one axis, and a basis far too small for it: it is the axis to split along,
+    /// though it varies as much along another one.
+    #[test]
+    fn the_worst_axis_is_that_of_the_nearest_singularity() {
+        let units = spread(3, &[], 25);
+        let fit = Fit::new(&Basis::new(3, 8), &units, &[true; 25]).expect("the points determine it");
+        let orders = Basis::orders(3);
+        for pole in 0..3 {
+            let steady = (pole + 1) % 3;
+            // `1 / (1.02 - x) + 100 y`
+            let data = Mat::from_fn(250, 1, |row, _| {
+                let (unit, order) = (units[row / 10], orders[row % 10]);
+                let away = 1.02 - unit[pole];
+                let along = |times: usize| (0..3).all(|k| order[k] == if k == pole { times } else { 0 });
+                match order.iter().sum::<usize>() {
+                    0 => 1.0 / away + 100.0 * unit[steady],
+                    1 if order[steady] == 1 => 100.0,
+                    1 if along(1) => away.powi(-2),
+                    2 if along(2) => 2.0 * away.powi(-3),
+                    _ => 0.0,
+                }
+            });
+            assert_eq!(fit.expand(data)[0].worst_axis, pole);
         }
     }
 }

@@ -6,7 +6,7 @@ use super::totals::Totals;
 use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
 /// Format version: incremented when the meaning of the words or the result of a build changes.
-pub const FORMAT: u64 = 6;
+pub const FORMAT: u64 = 7;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
