@@ -635,7 +635,7 @@ fn chart_options(plan: &Plan) -> ChartOptions {
         high: corner(2000.0, 60.0, 1.0),
         band_max_hz: Some(plan.band_max_hz),
         tolerance: plan.tolerance,
-        smallest_share: 1e-4,
+        smallest_share: 1e-6,
         max_solves: usize::MAX,
         threads: plan.threads,
     }
