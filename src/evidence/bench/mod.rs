@@ -630,12 +630,17 @@ fn chart_options(plan: &Plan) -> ChartOptions {
         disc_speed_rad_s,
         friction_coefficient,
     };
+    let smallest_share = match plan.kind {
+        // Low speeds, where roots move most, are few of the conditions.
+        Kind::Lateral | Kind::Damped => 1e-6,
+        Kind::Undamped | Kind::Hertzian | Kind::Rough | Kind::Opening | Kind::Turning => 1e-4,
+    };
     ChartOptions {
         low: corner(50.0, 1.0, 0.0),
         high: corner(2000.0, 60.0, 1.0),
         band_max_hz: Some(plan.band_max_hz),
         tolerance: plan.tolerance,
-        smallest_share: 1e-6,
+        smallest_share,
         max_solves: usize::MAX,
         threads: plan.threads,
     }
