@@ -88,6 +88,15 @@ impl Basis {
         out.clear();
         out.extend(self.degrees.iter().map(|d| (0..self.axes).map(|k| tables[k][usize::from(d[k])]).product::<f64>()));
     }
+
+    /// The axis along which the coefficients of the two highest degrees are largest.
+    fn highest_axis(&self, coefficients: &[f64]) -> usize {
+        let mut by_axis = [0.0; MAX_AXES];
+        for (d, c) in self.degrees.iter().zip(coefficients).filter(|(d, _)| total(d) + 1 >= self.degree) {
+            by_axis.iter_mut().zip(d).for_each(|(sum, &degree)| *sum += f64::from(degree) * c.abs());
+        }
+        (0..self.axes).max_by(|&a, &b| by_axis[a].total_cmp(&by_axis[b])).unwrap_or(0)
+    }
 }
 
 fn total(degrees: &[u8; MAX_AXES]) -> usize {
@@ -121,9 +130,10 @@ pub struct Fitted {
     /// scaled to the value that the first omitted degree would have. The tail is the largest value of the terms of
     /// one of the two highest total degrees, over the points; the highest alone may be small by accident.
     pub missing: f64,
-    /// The axis along which the function curves most: that of the largest second derivative with respect to the unit
-    /// coordinates, over the points. Next to a singularity second derivatives are unbounded, and largest along the axis
-    /// along which it is nearest. The coefficients of an expansion that is far from converging do not tell.
+    /// The axis to split along. On three axes that of the largest second derivative with respect to the unit coordinates, over
+    /// the points: next to a singularity second derivatives are unbounded, and largest along the axis along which it is nearest;
+    /// the coefficients of an expansion that is far from converging do not tell. On fewer axes they do: the axis along which
+    /// those of the two highest degrees are largest.
     pub worst_axis: usize,
 }
 
@@ -178,7 +188,9 @@ impl Fit {
 
     /// Expansions of the columns of `data`, with rows in the order given at [`Fit::new`].
     pub fn expand(&self, mut data: Mat<f64>) -> Vec<Fitted> {
-        let worst_axes: Vec<usize> = (0..data.ncols()).map(|column| self.most_curved(&data, column)).collect();
+        let curved: Vec<Option<usize>> = (0..data.ncols())
+            .map(|column| (self.basis.axes == MAX_AXES).then(|| self.most_curved(&data, column)))
+            .collect();
         for (row, &weight) in self.weights.iter().enumerate() {
             for column in 0..data.ncols() {
                 // Omitted data may be NaN.
@@ -202,7 +214,8 @@ impl Fit {
                 let coefficients: Vec<f64> = (0..self.basis.len()).map(|row| coefficients[(row, column)]).collect();
                 // `f64::max` ignores NaN, so NaN data must be reported explicitly.
                 let missing = if coefficients[0].is_nan() { f64::NAN } else { misfit + tail };
-                Fitted { worst_axis: worst_axes[column], coefficients, missing }
+                let worst_axis = curved[column].unwrap_or_else(|| self.basis.highest_axis(&coefficients));
+                Fitted { coefficients, missing, worst_axis }
             })
             .collect()
     }
