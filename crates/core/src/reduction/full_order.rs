@@ -48,6 +48,10 @@ const MOST_KEPT: usize = 4;
 const WORKING: usize = 12;
 /// Number of complex vectors of length `n` held while residuals are computed.
 const CHECKING: usize = 64;
+/// Number of roots sought where one is wanted.
+const FEW: usize = 6;
+/// Shift, relative to the frequency of a root that is sought: on the root, the matrix to be factorised would be singular.
+const BESIDE: f64 = 1.001;
 /// Below this many degrees of freedom a dense solve is faster.
 const DENSE_BELOW: usize = 240;
 
@@ -268,9 +272,9 @@ impl<'a> FullSolver<'a> {
         if self.model.dimension() < DENSE_BELOW {
             return self.dense(p, band_rad_s, vectors);
         }
-        let (here, by_parts) = (self.model.at(p)?, self.parts.is_some());
+        let (what, here, by_parts) = (self.what.clone(), self.model.at(p)?, self.parts.is_some());
         let mut problem =
-            Problem::new(&self.what, self.model, here.clone(), vectors, by_parts, self.is_real(), GROWTH * band_rad_s)?;
+            Problem::new(&what, self.model, here.clone(), vectors, by_parts, self.is_real(), GROWTH * band_rad_s)?;
         let mut found: Vec<Found> = vec![];
         while let Some(gap) = first_gap(&found, band_rad_s) {
             #[cfg(not(test))]
@@ -282,13 +286,7 @@ impl<'a> FullSolver<'a> {
             }
             let [low, high] = gap;
             let middle = if problem.undamped { (0.5 * (low * low + high * high)).sqrt() } else { 0.5 * (low + high) };
-            let new = match &self.parts {
-                Some(parts) => {
-                    let index = Self::factored(&mut self.kept, parts, &problem, middle, self.most_kept, progress)?;
-                    problem.around_parts(&self.kept[index], gap, progress)?
-                }
-                None => problem.around_system(self.engine, middle, gap, progress)?,
-            };
+            let new = self.around(&mut problem, middle, gap, progress)?;
             progress(FullProgress::Covered { disc: new.disc, roots: new.roots.len() });
             found.push(new);
             found.sort_by(|a, b| a.disc.shift_rad_s.total_cmp(&b.disc.shift_rad_s));
@@ -299,6 +297,38 @@ impl<'a> FullSolver<'a> {
         }
         agree(&self.what, &found)?;
         Ok(assemble(here, &found, band_rad_s))
+    }
+
+    /// The root at `p` nearest to `iω` and perhaps others around it; for a model solved densely, all up to twice `ω`.
+    ///
+    /// # Errors
+    /// As [`Self::roots`].
+    pub(super) fn nearest(&mut self, p: &OperatingPoint, omega: f64) -> Result<Vec<FullRoot>, ReductionError> {
+        if self.model.dimension() < DENSE_BELOW {
+            return Ok(self.dense(p, 2.0 * omega, FullVectors::None)?.roots);
+        }
+        let (what, here, by_parts) = (self.what.clone(), self.model.at(p)?, self.parts.is_some());
+        let mut problem = Problem::new(&what, self.model, here, FullVectors::None, by_parts, self.is_real(), 0.0)?;
+        problem.wanted = FEW;
+        let shift = BESIDE * omega;
+        Ok(self.around(&mut problem, shift, [omega, shift], &mut |_| {})?.roots)
+    }
+
+    /// The roots around `iω` until they cover `gap`, or as many as the problem wants.
+    fn around(
+        &mut self,
+        problem: &mut Problem<'_>,
+        omega: f64,
+        gap: [f64; 2],
+        progress: &mut dyn FnMut(FullProgress),
+    ) -> Result<Found, ReductionError> {
+        match &self.parts {
+            Some(parts) => {
+                let index = Self::factored(&mut self.kept, parts, problem, omega, self.most_kept, progress)?;
+                problem.around_parts(&self.kept[index], gap, progress)
+            }
+            None => problem.around_system(self.engine, omega, gap, progress),
+        }
     }
 
     /// Index in `kept` of the factors at the shift: `ω` itself or, if solves there are inaccurate because a root is too
@@ -554,6 +584,16 @@ pub(super) mod tests {
                 left.swap_remove(index);
             }
             vectors_belong(&model, &p, &found);
+            for root in found.roots.iter().filter(|root| root.lambda.im > 0.0).step_by(7) {
+                let omega = root.lambda.im;
+                let distance = |roots: &[FullRoot]| {
+                    let distances = roots.iter().map(|other| (other.lambda - c64::new(0.0, omega)).norm());
+                    distances.fold(f64::INFINITY, f64::min)
+                };
+                let nearest = solver.nearest(&p, omega).unwrap();
+                let off = (distance(&nearest) - distance(&found.roots)).abs();
+                assert!(off < 1e-6 && nearest.len() < 20, "{} off by {off:e}", root.lambda);
+            }
             // Open contact, and another operating point with the same factors.
             let open = OperatingPoint { normal_load_n: 0.0, ..p };
             assert!(solver.roots(&open, band, FullVectors::None, &mut |_| {}).unwrap().roots.len() > 60);

@@ -50,6 +50,8 @@ pub(super) struct Problem<'a> {
     norms: [f64; 3],
     /// Magnitude of growth rate that the discs must cover, 1/s.
     growth_per_s: f64,
+    /// Number of roots sought around a shift.
+    pub wanted: usize,
 }
 
 impl<'a> Problem<'a> {
@@ -62,6 +64,7 @@ impl<'a> Problem<'a> {
         undamped: bool,
         growth_per_s: f64,
     ) -> Result<Self, ReductionError> {
+        let wanted = WANTED;
         if by_parts {
             let low_rank = model.low_rank(&here);
             let largest = |matrix: &dyn Fn(usize) -> f64| (0..model.parts.len()).map(matrix).fold(0.0, f64::max);
@@ -81,7 +84,18 @@ impl<'a> Problem<'a> {
                 largest(&|part| one_norm(&model.parts[part].stiffness)) + pairs(&low_rank.stiffness),
             ];
             let undamped = low_rank.damping.iter().all(|value| *value == 0.0);
-            return Ok(Self { what, model, here, vectors, undamped, low_rank, matrices: None, norms, growth_per_s });
+            return Ok(Self {
+                what,
+                model,
+                here,
+                vectors,
+                undamped,
+                low_rank,
+                matrices: None,
+                norms,
+                growth_per_s,
+                wanted,
+            });
         }
         let matrices = model.matrices_in(&here)?;
         // Upper bound of the 1-norm of `W diag(r) Wᵀ`: the largest sum over its columns.
@@ -91,7 +105,18 @@ impl<'a> Problem<'a> {
         let of_modes = (0..modes.nrows()).map(column).fold(0.0, f64::max);
         let norms = [one_norm(&matrices[0]), one_norm(&matrices[1]) + of_modes, one_norm(&matrices[2])];
         let low_rank = LowRank::default();
-        Ok(Self { what, model, here, vectors, undamped, low_rank, matrices: Some(matrices), norms, growth_per_s })
+        Ok(Self {
+            what,
+            model,
+            here,
+            vectors,
+            undamped,
+            low_rank,
+            matrices: Some(matrices),
+            norms,
+            growth_per_s,
+            wanted,
+        })
     }
 
     /// `(a M + b C + c K) X`, or `(a M + b C + c K)ᵀ X` if `transposed`.
@@ -328,7 +353,7 @@ impl<'a> Problem<'a> {
             let vectors = if T::REAL { vectors } else { vectors.subrows(0, n).to_owned() };
             Ok::<_, ReductionError>(Largest { theta, vectors })
         };
-        let found = run(false, WANTED.min(dimension / 4))?;
+        let found = run(false, self.wanted.min(dimension / 4))?;
         let disc = disc_of(&found.theta);
         let left = match self.vectors {
             FullVectors::Both => Some(run(true, found.theta.len())?),

@@ -36,6 +36,7 @@ mod full_order;
 mod full_problem;
 mod full_root;
 mod full_state;
+mod full_windows;
 mod krylov;
 mod krylov_schur;
 mod lanczos;
@@ -57,9 +58,7 @@ mod substructures;
 mod test_models;
 
 pub(crate) use balance::balanced_displacement;
-pub use compare::{
-    CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, full_windows, reduced_roots,
-};
+pub use compare::{CompareError, Comparison, Judged, WindowComparison, compare_roots, compare_windows, reduced_roots};
 pub use dense::{ModeSelection, Modes, Whitening, free_interface_modes, whiten};
 pub use engine::{ComplexSparseMatrix, CountedBy, Eigenpairs, Engine, Factor, Lowest, Progress};
 pub use error::{GIB, ReductionError};
@@ -69,6 +68,7 @@ pub use full_model::{
 };
 pub use full_order::FullSolver;
 pub use full_root::{CoveredDisc, FullProgress, FullRoot, FullSpectrum, FullVectors};
+pub use full_windows::full_windows;
 pub use matching::{Counted, RootMatch, match_roots};
 pub use normal_modes::{Analysed, SparseModes, Wanted, lowest_modes, normal_modes};
 pub use operating_box::OperatingBox;
