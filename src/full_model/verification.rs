@@ -9,8 +9,8 @@ use crate::full_model::FullModelFile;
 use crate::physics::{MapError, MapOptions, OperatingPoint, SolveError, Solver, StabilityMap, Window};
 use crate::random::Random;
 use crate::reduction::{
-    CompareError, FullProgress, FullSolver, FullVectors, Judged, ReductionError, compare_roots, compare_windows,
-    full_windows, reduced_roots,
+    CompareError, FullProgress, FullSolver, FullVectors, Judged, ReductionError, WindowComparison, compare_roots,
+    compare_windows, full_windows, on_threads, reduced_roots, threads_for,
 };
 use crate::rig::{Certificate, Rig};
 
@@ -57,6 +57,18 @@ pub enum VerificationError {
     /// The windows of instability of the rig were not found.
     #[error(transparent)]
     Map(#[from] MapError),
+}
+
+impl VerificationError {
+    /// Whether memory did not suffice.
+    fn is_of_memory(&self) -> bool {
+        match self {
+            Self::Full { source, .. } | Self::Windows(CompareError::Full(source)) => {
+                matches!(source, ReductionError::Memory { .. })
+            }
+            Self::Windows(_) | Self::NoPoints | Self::ContactState { .. } | Self::Rig { .. } | Self::Map(_) => false,
+        }
+    }
 }
 
 /// Options of a comparison.
@@ -165,36 +177,9 @@ pub fn verify_against(
     let band_hz = against.band_hz.or(rig.band_max_hz).or(full.settings.band_max_hz).unwrap_or(DEFAULT_BAND_HZ);
     let band_rad_s = std::f64::consts::TAU * band_hz;
     let judged = Judged { band_rad_s, instability_threshold: rig.instability_threshold, decay_per_s: DECAY_PER_S };
-    let mut solver = Solver::new(rig.model.dimension());
-    let (mut points, mut states) = (vec![], StatesOfOne::default());
-    for (index, p) in held_out(rig, against).into_iter().enumerate() {
-        let label = format!("point {} of {}", index + 1, against.points);
-        if states.miss(rig, full, &p) {
-            continue;
-        }
-        let found = full_solver
-            .roots(&p, band_rad_s, FullVectors::None, &mut |step| progress(&label, step))
-            .map_err(|source| VerificationError::Full { point: p, source })?;
-        let lambdas: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
-        let failed = |source| VerificationError::Rig { point: p, source };
-        let reduced = reduced_roots(&rig.model, &mut solver, &p).map_err(failed)?;
-        let here = rig.model.at(&p).map_err(|error| failed(error.into()))?;
-        let comparison = compare_roots(&lambdas, &reduced, &judged);
-        let listed = |roots: &[c64]| roots.iter().map(|l| [l.re, l.im / std::f64::consts::TAU]).collect();
-        points.push(PointReport {
-            normal_load_n: p.normal_load_n,
-            disc_speed_rad_s: p.disc_speed_rad_s,
-            friction_coefficient: p.friction_coefficient,
-            modes: comparison.pairs.len(),
-            max_frequency_error: comparison.frequency_error(),
-            max_growth_error_per_s: comparison.growth_error_per_s(),
-            max_relative_error: comparison.relative_error(),
-            missed: listed(&comparison.missed),
-            invented: listed(&comparison.invented),
-            unpaired: comparison.unpaired,
-            contact: found.here.state().zip(here.state()).map(|(full, rig)| ContactDifference::new(full, rig)),
-        });
-    }
+    let mut states = StatesOfOne::default();
+    let held_out: Vec<(usize, OperatingPoint)> =
+        held_out(rig, against).into_iter().enumerate().filter(|(_, p)| !states.miss(rig, full, p)).collect();
     let options = MapOptions {
         mu_min: 0.0,
         mu_max: rig.mu_max.min(rig.limits.friction_coefficient[1]),
@@ -202,15 +187,31 @@ pub fn verify_against(
         instability_threshold: rig.instability_threshold,
         windows: true,
     };
-    let (mut windows, mut critical, mut missed, mut invented) = (vec![], None::<f64>, 0, 0);
     let places = if against.windows { places(rig) } else { vec![] };
-    let windows_compared_at = places.len();
-    for p in places {
-        let label = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
-        let of_full =
-            full_windows(&full.model, full_solver, &p, band_rad_s, &options, &mut |step| progress(&label, step))?;
-        let of_rig = StabilityMap::build(&rig.model, &mut solver, &p, &options)?.windows;
-        let compared = compare_windows(&of_full, &of_rig);
+    let compared = Compared { rig, full, judged, options };
+    let mut both = |solvers: &mut [FullSolver<'_>]| -> Result<_, VerificationError> {
+        let mut workers: Vec<_> =
+            solvers.iter_mut().map(|full| Solvers { full, reduced: Solver::new(rig.model.dimension()) }).collect();
+        let mut report = |(what, step): (String, FullProgress)| progress(&what, step);
+        let points = on_threads(&mut workers, &held_out, &mut report, &|solvers, (index, p), report| {
+            let what = format!("point {} of {}", index + 1, against.points);
+            compared.roots(solvers, p, &mut |step| report((what.clone(), step)))
+        })?;
+        let windows = on_threads(&mut workers, &places, &mut report, &|solvers, p, report| {
+            let what = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
+            compared.windows(solvers, p, &mut |step| report((what.clone(), step)))
+        })?;
+        Ok((points, windows))
+    };
+    let mut solvers = full_solver.for_threads(threads_for(held_out.len().max(places.len())));
+    let at_once = if solvers.is_empty() { None } else { Some(both(&mut solvers)) };
+    let (points, of_places) = match at_once {
+        Some(found) if !found.as_ref().is_err_and(VerificationError::is_of_memory) => found?,
+        // One thread has all of the memory.
+        Some(_) | None => both(std::slice::from_mut(full_solver))?,
+    };
+    let (mut windows, mut critical, mut missed, mut invented) = (vec![], None::<f64>, 0, 0);
+    for (p, compared) in places.iter().zip(&of_places) {
         if !compared.pairs.is_empty() {
             critical = Some(critical.unwrap_or(0.0).max(compared.friction_error(options.mu_max)));
         }
@@ -239,7 +240,7 @@ pub fn verify_against(
         max_frequency_error: largest(|point| point.max_frequency_error),
         max_growth_error_per_s: largest(|point| point.max_growth_error_per_s),
         max_relative_error: largest(|point| point.max_relative_error),
-        windows_compared_at,
+        windows_compared_at: places.len(),
         critical_friction_error: critical,
         max_force_error: contacts().map(|contact| contact.max_force_error).reduce(f64::max),
         pairs_differ: contacts().map(|contact| contact.pairs_differ).reduce(|sum, count| sum + count),
@@ -248,6 +249,68 @@ pub fn verify_against(
         unpaired: points.iter().map(|point| point.unpaired).sum(),
     };
     Ok(Verified { certificate, points, windows })
+}
+
+/// What is compared, and within which scope.
+struct Compared<'a> {
+    rig: &'a Rig,
+    full: &'a FullModelFile,
+    judged: Judged,
+    options: MapOptions,
+}
+
+/// The solvers of one thread.
+struct Solvers<'s, 'a> {
+    full: &'s mut FullSolver<'a>,
+    reduced: Solver,
+}
+
+impl Compared<'_> {
+    /// Compares roots and contact states at `p`.
+    fn roots(
+        &self,
+        solvers: &mut Solvers<'_, '_>,
+        p: &OperatingPoint,
+        progress: &mut dyn FnMut(FullProgress),
+    ) -> Result<PointReport, VerificationError> {
+        let model = &self.rig.model;
+        let found = solvers
+            .full
+            .roots(p, self.judged.band_rad_s, FullVectors::None, progress)
+            .map_err(|source| VerificationError::Full { point: *p, source })?;
+        let lambdas: Vec<c64> = found.roots.iter().map(|root| root.lambda).collect();
+        let failed = |source| VerificationError::Rig { point: *p, source };
+        let reduced = reduced_roots(model, &mut solvers.reduced, p).map_err(failed)?;
+        let here = model.at(p).map_err(|error| failed(error.into()))?;
+        let comparison = compare_roots(&lambdas, &reduced, &self.judged);
+        let listed = |roots: &[c64]| roots.iter().map(|l| [l.re, l.im / std::f64::consts::TAU]).collect();
+        Ok(PointReport {
+            normal_load_n: p.normal_load_n,
+            disc_speed_rad_s: p.disc_speed_rad_s,
+            friction_coefficient: p.friction_coefficient,
+            modes: comparison.pairs.len(),
+            max_frequency_error: comparison.frequency_error(),
+            max_growth_error_per_s: comparison.growth_error_per_s(),
+            max_relative_error: comparison.relative_error(),
+            missed: listed(&comparison.missed),
+            invented: listed(&comparison.invented),
+            unpaired: comparison.unpaired,
+            contact: found.here.state().zip(here.state()).map(|(full, rig)| ContactDifference::new(full, rig)),
+        })
+    }
+
+    /// Compares the windows of instability at the load and speed of `p`.
+    fn windows(
+        &self,
+        solvers: &mut Solvers<'_, '_>,
+        p: &OperatingPoint,
+        progress: &mut dyn FnMut(FullProgress),
+    ) -> Result<WindowComparison, VerificationError> {
+        let Judged { band_rad_s, .. } = self.judged;
+        let of_full = full_windows(&self.full.model, solvers.full, p, band_rad_s, &self.options, progress)?;
+        let of_rig = StabilityMap::build(&self.rig.model, &mut solvers.reduced, p, &self.options)?.windows;
+        Ok(compare_windows(&of_full, &of_rig))
+    }
 }
 
 /// Number of held-out points at which only one of the two has a state of steady sliding.

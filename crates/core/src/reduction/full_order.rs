@@ -110,6 +110,23 @@ impl<'a> FullSolver<'a> {
         Ok(solver)
     }
 
+    /// Solvers of the same model for `threads` threads, each with an equal share of the memory. None where factors are kept,
+    /// which threads cannot share, or are made by a foreign engine, whose ranks need the processors.
+    pub fn for_threads(&self, threads: usize) -> Vec<Self> {
+        let count = if threads < 2 || self.has_parts() || self.engine.foreign() { 0 } else { threads };
+        let solver = |_| Self {
+            engine: self.engine,
+            what: self.what.clone(),
+            model: self.model,
+            parts: None,
+            kept: vec![],
+            memory_limit_bytes: self.memory_limit_bytes.map(|limit| limit / threads),
+            elsewhere_bytes: self.elsewhere_bytes,
+            most_kept: 1,
+        };
+        (0..count).map(solver).collect()
+    }
+
     /// Counts `bytes`, allocated by the caller since the solver was made, towards the memory limit from now on.
     pub fn held_elsewhere(&mut self, bytes: usize) {
         self.elsewhere_bytes = bytes;

@@ -42,6 +42,7 @@ mod krylov_schur;
 mod lanczos;
 mod matching;
 mod normal_modes;
+mod on_threads;
 mod operating_box;
 mod ordering;
 mod own_engine;
@@ -71,6 +72,7 @@ pub use full_root::{CoveredDisc, FullProgress, FullRoot, FullSpectrum, FullVecto
 pub use full_windows::full_windows;
 pub use matching::{Counted, RootMatch, match_roots};
 pub use normal_modes::{Analysed, SparseModes, Wanted, lowest_modes, normal_modes};
+pub use on_threads::{on_threads, threads_for};
 pub use operating_box::OperatingBox;
 pub use own_engine::OwnEngine;
 pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};

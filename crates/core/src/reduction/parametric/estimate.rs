@@ -5,9 +5,10 @@ use faer::{Mat, c64};
 use super::super::ReductionError;
 use super::super::checked::definite;
 use super::super::full_model::Projected;
+use super::super::threads_for;
 use super::condition::slope;
 use super::request::ParametricStep;
-use super::sampling::{Building, Estimates, ROOTS_TOGETHER};
+use super::sampling::{Building, Estimates, ROOTS_TOGETHER, on_points, solve_failed};
 use crate::physics::{Model, OperatingPoint, Spectrum, Vectors};
 
 /// `S⁻¹ B`.
@@ -46,13 +47,19 @@ impl Building<'_, '_> {
             (None, None) => unreachable!("a model without parts has a pencil"),
         };
         let mut worst: Option<(OperatingPoint, Estimates, f64)> = None;
-        for (done, point) in points.iter().enumerate() {
+        // As many spectra are in memory as there are threads.
+        for (chunk, points_of_chunk) in points.chunks(threads_for(points.len())).enumerate() {
+            let done = chunk * threads_for(points.len());
             progress(ParametricStep::Estimating { done, of: points.len() });
-            let spectrum = self.solve(model, point, Vectors::Both)?;
-            let estimates = self.estimates(&inverse, projected, &spectrum)?;
-            let largest = estimates.iter().map(|(_, estimate)| *estimate).fold(0.0, f64::max);
-            if worst.as_ref().is_none_or(|(_, _, before)| largest > *before) {
-                worst = Some((*point, estimates, largest));
+            let spectra = on_points(model, points_of_chunk, &|solver, point| {
+                solver.solve(model, point, Vectors::Both).map_err(solve_failed)
+            })?;
+            for (point, spectrum) in points_of_chunk.iter().zip(spectra) {
+                let estimates = self.estimates(&inverse, projected, &spectrum)?;
+                let largest = estimates.iter().map(|(_, estimate)| *estimate).fold(0.0, f64::max);
+                if worst.as_ref().is_none_or(|(_, _, before)| largest > *before) {
+                    worst = Some((*point, estimates, largest));
+                }
             }
         }
         Ok(worst)

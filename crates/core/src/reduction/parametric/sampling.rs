@@ -7,7 +7,7 @@ use super::super::dense::symmetric_eigen;
 use super::super::full_model::{FullModel, Projected};
 use super::super::matching::Counted;
 use super::super::pencil::Pencil;
-use super::super::{FullSolver, FullSpectrum, FullVectors, ReductionError};
+use super::super::{FullSolver, FullSpectrum, FullVectors, ReductionError, on_threads, threads_for};
 use super::condition::Condition;
 use super::metric::Metric;
 use super::request::{ParametricRequest, ParametricStep};
@@ -221,16 +221,27 @@ impl Building<'_, '_> {
         count: usize,
     ) -> Result<Vec<OperatingPoint>, ReductionError> {
         let model = self.model(wide)?;
-        let mut solver = Solver::new(model.dimension());
-        let mut ranked = vec![];
-        for point in points {
+        let mut ranked = on_points(&model, points, &|solver, point| {
             let spectrum = solver.solve(&model, point, Vectors::Both).map_err(solve_failed)?;
             let conditions = self.counted(&spectrum).into_iter().map(|root| Condition::of(&spectrum, root).relative);
-            ranked.push((conditions.fold(0.0, f64::max), *point));
-        }
+            Ok((conditions.fold(0.0, f64::max), *point))
+        })?;
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         Ok(ranked.into_iter().take(count).map(|(_, point)| point).collect())
     }
+}
+
+/// Work on one item, with a dense solver of its thread.
+type AtPoint<'a, T, R> = dyn Fn(&mut Solver, &T) -> Result<R, ReductionError> + Sync + 'a;
+
+/// Applies `work` to all items, each thread with a solver of the size of `model`. Results are in the order of the items.
+pub fn on_points<T: Sync, R: Send>(
+    model: &Model,
+    items: &[T],
+    work: &AtPoint<'_, T, R>,
+) -> Result<Vec<R>, ReductionError> {
+    let mut solvers: Vec<Solver> = (0..threads_for(items.len())).map(|_| Solver::new(model.dimension())).collect();
+    on_threads(&mut solvers, items, &mut |()| (), &|solver, item, _| work(solver, item))
 }
 
 /// The roots with `ω > 0`, and static ones that grow.

@@ -6,11 +6,11 @@ use faer::{Mat, c64};
 use super::super::ReductionError;
 use super::super::dense::symmetric_eigen;
 use super::super::full_model::Projected;
-use super::super::matching::match_roots;
+use super::super::matching::{RootMatch, match_roots};
 use super::condition::Condition;
 use super::request::ParametricStep;
-use super::sampling::{Building, comparable_of, solve_failed};
-use crate::physics::{OperatingPoint, Situation, Solver, Vectors};
+use super::sampling::{Building, comparable_of, on_points, solve_failed};
+use crate::physics::{OperatingPoint, Situation, Vectors};
 
 /// Fraction of the tolerance by which the roots may differ from those of the wide model.
 const SHARE: f64 = 0.5;
@@ -106,8 +106,7 @@ impl Building<'_, '_> {
         turn: &Mat<f64>,
     ) -> Result<Vec<Target>, ReductionError> {
         let model = self.model(wide)?;
-        let mut solver = Solver::new(model.dimension());
-        let target = |point: &OperatingPoint| {
+        on_points(&model, points, &|solver, point| {
             let spectrum = solver.solve(&model, point, Vectors::Both).map_err(solve_failed)?;
             let chosen = self.counted(&spectrum);
             let mut vectors = Mat::zeros(model.dimension(), 4 * chosen.len());
@@ -127,22 +126,18 @@ impl Building<'_, '_> {
                 counted: chosen.iter().map(|&k| (spectrum.roots[k].lambda, 1.0)).collect(),
                 vectors: turn * vectors,
             })
-        };
-        points.iter().map(target).collect()
+        })
     }
 
     /// Largest error of a root of `smaller` at the targets. Every root whose error exceeds `limit` gains weight.
     fn weigh(&self, smaller: &Projected, targets: &mut [Target], limit: f64) -> Result<f64, ReductionError> {
         let model = self.model(smaller)?;
-        let mut solver = Solver::new(model.dimension());
-        let mut worst = 0.0_f64;
-        for target in targets {
+        let comparisons = on_points(&model, targets, &|solver, target| {
             let reduced = solver.solve_in(&model, &target.here, Vectors::None).map_err(solve_failed)?;
-            let comparison = match_roots(&target.roots, &comparable_of(&reduced), self.request.counted);
-            worst = worst.max(comparison.worst());
-            if worst == f64::INFINITY {
-                break;
-            }
+            Ok(match_roots(&target.roots, &comparable_of(&reduced), self.request.counted))
+        })?;
+        let worst = comparisons.iter().map(RootMatch::worst).fold(0.0, f64::max);
+        for (target, comparison) in targets.iter_mut().zip(comparisons).filter(|_| worst < f64::INFINITY) {
             for (lambda, error) in comparison.errors {
                 let of_root = target.counted.iter_mut().filter(|(of, _)| *of == lambda);
                 of_root.for_each(|(_, weight)| *weight *= (error / limit).max(1.0));
