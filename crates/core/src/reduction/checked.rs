@@ -6,7 +6,7 @@ use faer::Mat;
 use super::ReductionError;
 use super::engine::{Eigenpairs, Engine, Factor};
 use super::pencil::Pencil;
-use super::sparse::{one_norm, times};
+use super::sparse::{one_norm, symmetric_times};
 
 /// Largest `|A x - b|` of a solve, relative to `|A| |x| + |b|`.
 const SOLVE_LIMIT: f64 = 1e-13;
@@ -43,8 +43,7 @@ impl Factor<f64> for Checked<'_> {
     fn solve(&self, rhs: &mut Mat<f64>, transposed: bool) -> Result<(), ReductionError> {
         let b = rhs.clone();
         self.factor.solve(rhs, transposed)?;
-        let mut r = times(self.pencil.stiffness, rhs.as_ref()) - &b;
-        r += faer::Scale(self.shift) * times(self.pencil.mass, rhs.as_ref());
+        let r = self.pencil.shifted_times(self.shift, rhs.as_ref()) - &b;
         for column in 0..b.ncols() {
             let parts = self.norm * rhs.col(column).norm_l2() + b.col(column).norm_l2();
             let value = r.col(column).norm_l2() / parts.max(f64::MIN_POSITIVE);
@@ -77,7 +76,7 @@ impl Eigenpairs {
         if !self.omega_squared.is_sorted() || !self.omega_squared.iter().all(|square| square.is_finite()) {
             return wrong("the squares of the frequencies that came back do not ascend".to_owned());
         }
-        let gram = self.phi.transpose() * times(pencil.mass, self.phi.as_ref());
+        let gram = self.phi.transpose() * symmetric_times(pencil.mass, self.phi.as_ref());
         let off = (gram - Mat::<f64>::identity(found, found)).norm_max();
         if off.is_nan() || off > ORTHOGONAL {
             return wrong(format!(

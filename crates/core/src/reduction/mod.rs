@@ -29,8 +29,11 @@ mod compare;
 mod contact_solver;
 mod coverage;
 mod dense;
+mod elimination_tree;
 mod engine;
 mod error;
+mod front_blocks;
+mod fronts;
 mod full_model;
 mod full_order;
 mod full_problem;
@@ -48,11 +51,13 @@ mod ordering;
 mod own_engine;
 mod parametric;
 mod pencil;
+mod probed;
 mod project;
 mod residual;
 mod schur;
 mod sparse;
 mod static_response;
+mod threads;
 
 mod substructures;
 #[cfg(test)]
@@ -79,7 +84,7 @@ pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep
 pub use pencil::Pencil;
 use project::project_dense;
 pub use project::project_sparse;
-pub use residual::{InertiaBy, Residual};
+pub use residual::Residual;
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 
 pub use substructures::{Kept, Substructure, keep_modes};

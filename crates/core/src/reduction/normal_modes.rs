@@ -12,7 +12,7 @@ use super::engine::{CountedBy, Eigenpairs, Engine, GAP, Lowest, Progress, gap_af
 use super::lanczos::capacity;
 use super::own_engine::{OwnEngine, TOGETHER};
 use super::pencil::Pencil;
-use super::sparse::{one_norm, times};
+use super::sparse::{one_norm, symmetric_times};
 use super::{ReductionError, SparseMatrix, whiten};
 
 /// Largest scaled residual `|K φ - ω² M φ| / ((|K| + |ω²| |M|) |φ|)` of a mode, with 1-norms of the matrices.
@@ -92,6 +92,8 @@ pub fn normal_modes(
 pub struct Analysed<'a> {
     pub(super) pencil: Pencil<'a>,
     pub(super) engine: &'a dyn Engine,
+    /// The rows at the contact, each once, eliminated last.
+    pub(super) contact: Vec<usize>,
 }
 
 impl<'a> Analysed<'a> {
@@ -105,7 +107,24 @@ impl<'a> Analysed<'a> {
         mass: &'a SparseMatrix,
         stiffness: &'a SparseMatrix,
     ) -> Result<Self, ReductionError> {
-        Ok(Self { pencil: Pencil::new(what, mass, stiffness)?, engine })
+        Self::with_contact(engine, what, mass, stiffness, &[])
+    }
+
+    /// Like [`Self::new`], ready for [`Self::residual`] between the rows `contact`.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_contact(
+        engine: &'a dyn Engine,
+        what: &'a str,
+        mass: &'a SparseMatrix,
+        stiffness: &'a SparseMatrix,
+        contact: &[Option<usize>],
+    ) -> Result<Self, ReductionError> {
+        let mut contact: Vec<usize> = contact.iter().flatten().copied().collect();
+        contact.sort_unstable();
+        contact.dedup();
+        Ok(Self { pencil: Pencil::with_last(what, mass, stiffness, &contact)?, engine, contact })
     }
 
     /// Bytes held in addition to the two given matrices.
@@ -142,7 +161,7 @@ impl<'a> Analysed<'a> {
         square: f64,
         memory_limit_bytes: Option<usize>,
     ) -> Result<(usize, CountedBy), ReductionError> {
-        let bytes = self.pencil.factor_bytes() + self.pencil.factoring_bytes();
+        let bytes = self.pencil.factoring_bytes();
         if !self.engine.foreign() || memory_limit_bytes.is_none_or(|limit| bytes <= limit) {
             return Ok((self.pencil.count_below(square)?, CountedBy::Us));
         }
@@ -292,8 +311,8 @@ fn finish(pencil: &Pencil<'_>, found: Eigenpairs) -> Result<SparseModes, Reducti
         phi[(0, 0)] += 1e-3 * phi.norm_max();
     }
     let (stiffness, mass) = (one_norm(pencil.stiffness), one_norm(pencil.mass));
-    let mut residual = times(pencil.stiffness, phi.as_ref());
-    let inertia = times(pencil.mass, phi.as_ref());
+    let mut residual = symmetric_times(pencil.stiffness, phi.as_ref());
+    let inertia = symmetric_times(pencil.mass, phi.as_ref());
     let mut residuals = vec![];
     for (mode, &square) in omega_squared.iter().enumerate() {
         let mut column = residual.col_mut(mode);

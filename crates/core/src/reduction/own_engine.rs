@@ -7,7 +7,7 @@ use super::ReductionError;
 use super::engine::{ComplexSparseMatrix, Eigenpairs, Engine, Factor, Lowest, Progress, gap_after};
 use super::lanczos::{Iteration, capacity};
 use super::pencil::{Llt, Pencil};
-use super::sparse::{SparseMatrix, times};
+use super::sparse::{SparseMatrix, symmetric_times};
 
 /// Largest residual of an eigenpair of `C`, relative to its `θ`.
 const RESIDUAL_LIMIT: f64 = 1e-12;
@@ -53,7 +53,7 @@ impl Engine for OwnEngine {
             }
         };
         let largest = iteration.run(
-            &|y| factor.whiten(&times(pencil.mass, factor.unwhiten(y).as_ref())),
+            &|y| factor.whiten(&symmetric_times(pencil.mass, factor.unwhiten(y).as_ref())),
             &enough,
             &mut |vectors, converged| progress(Progress::Iterated { vectors, converged, wanted: count }),
         )?;

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::cholesky::llt::factor::LltError;
 use faer::linalg::matmul::matmul;
 use faer::linalg::triangular_solve::{solve_unit_lower_triangular_in_place, solve_unit_upper_triangular_in_place};
 use faer::perm::Perm;
@@ -16,10 +15,15 @@ use faer::sparse::linalg::cholesky::{
 use faer::sparse::{SparseColMat, SparseColMatRef, SymbolicSparseColMat};
 use faer::{Accum, Conj, Mat, MatMut, Par, Side};
 
+use super::fronts::Fronts;
+use super::krylov::random_block;
 use super::ordering::nested_dissection;
-use super::sparse::{entries, worst_asymmetry};
+use super::sparse::{entries, symmetric_times, worst_asymmetry};
+use super::threads::shared;
 use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
 
+/// Largest number of columns that a thread solves at a time.
+const SOLVED_TOGETHER: usize = 8;
 /// Upper limit of the shifts to try, relative to `tr K / tr M`.
 const LARGEST_SHIFT: f64 = 1e5;
 /// Number of Lanczos steps to estimate the smallest eigenvalue of a scaled mass matrix.
@@ -39,7 +43,7 @@ pub struct Pencil<'a> {
     pattern: SymbolicSparseColMat<usize>,
     lower_mass: Vec<f64>,
     lower_stiffness: Vec<f64>,
-    symbolic: Arc<SymbolicCholesky<usize>>,
+    pub(super) symbolic: Arc<SymbolicCholesky<usize>>,
 }
 
 impl<'a> Pencil<'a> {
@@ -139,9 +143,14 @@ impl<'a> Pencil<'a> {
 
     /// Additional bytes needed while a factor is computed: the shifted matrix and the workspace of faer.
     pub(super) fn factoring_bytes(&self) -> usize {
-        let llt = self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default());
         let ldlt = self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default());
-        size_of::<f64>() * self.lower_mass.len() + llt.size_bytes().max(ldlt.size_bytes())
+        let fronts = Fronts::bytes(supernodal(&self.symbolic), 0, false);
+        fronts.max(size_of::<f64>() * self.lower_mass.len() + ldlt.size_bytes())
+    }
+
+    /// Bytes needed to condense to the last rows with a border of `border` columns.
+    pub(super) fn condensing_bytes(&self, border: usize) -> usize {
+        Fronts::bytes(supernodal(&self.symbolic), border, true)
     }
 
     /// The lower triangle of `k K + m M`.
@@ -149,35 +158,20 @@ impl<'a> Pencil<'a> {
         self.lower_stiffness.iter().zip(&self.lower_mass).map(|(stiffness, mass)| k * stiffness + m * mass).collect()
     }
 
-    /// Cholesky factor `K + s M = L Lᵀ`; `None` if the matrix is not positive definite.
-    pub(super) fn llt(&self, shift: f64) -> Result<Option<Llt<'_>>, ReductionError> {
-        let lower = self.sum(1.0, shift);
-        let mut values = self.room(self.symbolic.len_val())?;
-        let mut memory =
-            MemBuffer::new(self.symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default()));
-        let result = self.symbolic.factorize_numeric_llt(
-            &mut values,
-            SparseColMatRef::new(self.pattern.as_ref(), &lower),
-            Side::Lower,
-            Default::default(),
-            Par::Seq,
-            MemStack::new(&mut memory),
-            Default::default(),
-        );
-        match result.map(|_| ()) {
-            Ok(()) => Ok(Some(Llt { symbolic: &self.symbolic, values })),
-            Err(LltError::NonPositivePivot { .. }) => Ok(None),
-        }
+    /// `K + s M`, to be eliminated front by front.
+    pub(super) fn fronts(&self, shift: f64) -> Fronts<'_> {
+        let order = self.symbolic.perm().expect("a permutation was given").arrays();
+        Fronts { stiffness: self.stiffness, mass: self.mass, shift, supernodes: supernodal(&self.symbolic), order }
     }
 
     /// Number of `ω²` below `square`, rad²/s²: the number of negative pivots of `K - σ M = L D Lᵀ` (Sylvester's law of
     /// inertia).
     pub(super) fn count_below(&self, square: f64) -> Result<usize, ReductionError> {
-        let pivots = self.pivots(&self.sum(1.0, -square))?;
-        match pivots.iter().find(|(_, pivot)| !pivot.is_finite()) {
-            Some((row, pivot)) => Err(self.failed(format!("L D Lᵀ gave the pivot {pivot} at row {row}"))),
-            None => Ok(pivots.iter().filter(|(_, pivot)| *pivot < 0.0).count()),
-        }
+        self.fronts(-square).count_negative().map_err(|_| self.broken())
+    }
+
+    pub(super) fn broken(&self) -> ReductionError {
+        self.failed("a pivot is 0 or not finite".to_owned())
     }
 
     /// Factorises `P (K - σ M) Pᵀ = L D Lᵀ` with `σ = square`. There is no numerical pivoting, so callers must check
@@ -236,7 +230,7 @@ impl<'a> Pencil<'a> {
     }
 
     /// A vector of zeros, or an error if memory is insufficient.
-    fn room(&self, length: usize) -> Result<Vec<f64>, ReductionError> {
+    pub(super) fn room(&self, length: usize) -> Result<Vec<f64>, ReductionError> {
         let mut values = vec![];
         values
             .try_reserve_exact(length)
@@ -245,15 +239,15 @@ impl<'a> Pencil<'a> {
         Ok(values)
     }
 
-    fn failed(&self, reason: String) -> ReductionError {
+    pub(super) fn failed(&self, reason: String) -> ReductionError {
         ReductionError::Factorisation { what: self.what.to_owned(), reason }
     }
 }
 
 /// Cholesky factor `P (K + s M) Pᵀ = L Lᵀ`.
 pub(super) struct Llt<'a> {
-    symbolic: &'a SymbolicCholesky<usize>,
-    values: Vec<f64>,
+    pub(super) symbolic: &'a SymbolicCholesky<usize>,
+    pub(super) values: Vec<f64>,
 }
 
 impl Llt<'_> {
@@ -261,34 +255,41 @@ impl Llt<'_> {
         SupernodalLltRef::new(supernodal(self.symbolic), &self.values)
     }
 
-    fn memory(&self, columns: usize) -> MemBuffer {
-        MemBuffer::new(self.symbolic.solve_in_place_scratch::<f64>(columns, Par::Seq))
+    /// Solves for blocks of columns, on all cores; the blocks do not depend on their number.
+    fn in_blocks(&self, rhs: MatMut<'_, f64>, solve: impl Fn(MatMut<'_, f64>, &mut MemStack) + Sync) {
+        let (mut blocks, mut rest) = (vec![], rhs);
+        let width = rest.ncols().div_ceil(rest.ncols().div_ceil(SOLVED_TOGETHER).max(1));
+        while rest.ncols() > 0 {
+            let at = width.min(rest.ncols());
+            let (block, others) = rest.split_at_col_mut(at);
+            blocks.push(block);
+            rest = others;
+        }
+        shared(blocks, true, |block: MatMut<'_, f64>| {
+            let mut memory = MemBuffer::new(self.symbolic.solve_in_place_scratch::<f64>(block.ncols(), Par::Seq));
+            solve(block, MemStack::new(&mut memory));
+        });
     }
 
     /// `A⁻¹ B` in place.
     pub(super) fn solve(&self, rhs: MatMut<'_, f64>) {
-        let mut memory = self.memory(rhs.ncols());
-        LltRef::new(self.symbolic, &self.values).solve_in_place_with_conj(
-            Conj::No,
-            rhs,
-            Par::Seq,
-            MemStack::new(&mut memory),
-        );
+        let factor = LltRef::new(self.symbolic, &self.values);
+        self.in_blocks(rhs, |block, stack| factor.solve_in_place_with_conj(Conj::No, block, Par::Seq, stack));
     }
 
     /// `L⁻¹ P X`.
     pub(super) fn whiten(&self, x: &Mat<f64>) -> Mat<f64> {
         let forward = forward(self.symbolic);
         let mut y = Mat::from_fn(x.nrows(), x.ncols(), |i, j| x[(forward[i], j)]);
-        let mut memory = self.memory(y.ncols());
-        self.supernodal().l_solve_with_conj(Conj::No, y.as_mut(), Par::Seq, MemStack::new(&mut memory));
+        let factor = self.supernodal();
+        self.in_blocks(y.as_mut(), |block, stack| factor.l_solve_with_conj(Conj::No, block, Par::Seq, stack));
         y
     }
 
     /// `Pᵀ L⁻ᵀ Y`.
     pub(super) fn unwhiten(&self, mut y: Mat<f64>) -> Mat<f64> {
-        let mut memory = self.memory(y.ncols());
-        self.supernodal().l_transpose_solve_with_conj(Conj::No, y.as_mut(), Par::Seq, MemStack::new(&mut memory));
+        let factor = self.supernodal();
+        self.in_blocks(y.as_mut(), |block, stack| factor.l_transpose_solve_with_conj(Conj::No, block, Par::Seq, stack));
         let mut x = Mat::zeros(y.nrows(), y.ncols());
         for (position, &row) in forward(self.symbolic).iter().enumerate() {
             for column in 0..y.ncols() {
@@ -471,13 +472,13 @@ fn merge(
 fn smallest_scaled(matrix: &SparseMatrix, diagonal: &[f64]) -> Option<f64> {
     let n = diagonal.len();
     let scale: Vec<f64> = diagonal.iter().map(|value| value.sqrt().recip()).collect();
-    let mut vector = super::krylov::random_block(n, 1, 1);
+    let mut vector = random_block(n, 1, 1);
     let norm = vector.norm_l2();
     vector *= faer::Scale(1.0 / norm);
     let (mut previous, mut beta) = (Mat::<f64>::zeros(n, 1), 0.0);
     let mut tridiagonal = Mat::<f64>::zeros(0, 0);
     for step in 0..MASS_STEPS.min(n) {
-        let mut next = super::sparse::times(matrix, Mat::from_fn(n, 1, |i, _| scale[i] * vector[(i, 0)]).as_ref());
+        let mut next = symmetric_times(matrix, Mat::from_fn(n, 1, |i, _| scale[i] * vector[(i, 0)]).as_ref());
         for i in 0..n {
             next[(i, 0)] = scale[i] * next[(i, 0)] - beta * previous[(i, 0)];
         }

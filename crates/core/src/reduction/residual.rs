@@ -5,27 +5,35 @@
 //! ```
 //!
 //! The sums are over the truncated modes, with `φ` restricted to the degrees of freedom of the contact. The truncated
-//! modes themselves are not computed. Unit loads `F`, made orthogonal to the kept modes, are applied to `A = K + s M`;
-//! a second solve applies the inertia forces of the responses:
+//! modes themselves are not computed. With `A = K + s M`, `B = M Φ` of the kept modes, and loads `F - B Φ_cᵀ` that the
+//! kept modes do not see, everything but the contact is eliminated from the bordered matrix:
 //!
 //! ```text
-//! X = A⁻¹ (F - M Φ Φᵀ F),   R_s = Fᵀ X,   Q_s = Fᵀ A⁻¹ M X = Xᵀ M X
+//! [A B; Bᵀ 0]  ->  [S D; Dᵀ -E],   J = I - D Φ_cᵀ,   Z = S⁻¹ J
+//! R_s = Φ_c E Φ_cᵀ + Jᵀ Z,   Q_s = -dR_s/ds = Zᵀ S' Z + Zᵀ D' Φ_cᵀ + Φ_c D'ᵀ Z - Φ_c E' Φ_cᵀ
 //! ```
 //!
-//! `Q_s` needs either a second solve per load, or all responses stored in single precision. The latter is faster and
-//! takes 4 bytes times the number of degrees of freedom times the number of loads. `R_s` and `Q_s` differ from `R` and
-//! `Q` by powers of `s/ω²`. With `s` a millionth of the last kept `ω²`, rigid-body modes need no special treatment, and
-//! `R = R_s + s Q_s` is accurate to 1e-12.
+//! The derivatives by `s` are eliminated with the matrix: no factor is stored, and no load is solved alone. `R_s` and
+//! `Q_s` differ from `R` and `Q` by powers of `s/ω²`. With `s` a millionth of the last kept `ω²`, rigid-body modes need no
+//! special treatment, and `R = R_s + s Q_s` is accurate to 1e-12.
+//!
+//! A foreign engine solves for every load instead, once for `R_s` and once more for `Q_s`:
+//!
+//! ```text
+//! X = A⁻¹ (F - M Φ Φᵀ F),   R_s = Fᵀ X,   Q_s = Fᵀ A⁻¹ M X
+//! ```
 //!
 //! Source: MacNeal 1971; Rubin 1975.
 
-use faer::Mat;
+use faer::linalg::solvers::Solve;
+use faer::{Mat, Side};
 
 use super::ReductionError;
 use super::checked::definite;
 use super::engine::Progress;
+use super::fronts::Condensed;
 use super::normal_modes::{Analysed, SparseModes};
-use super::sparse::{SparseMatrix, times};
+use super::sparse::{SparseMatrix, symmetric_times};
 
 /// The shift `s`, relative to the last kept `ω²`.
 const SHIFT: f64 = 1e-6;
@@ -34,18 +42,6 @@ const SHIFT: f64 = 1e-6;
 const RIGID: f64 = 1e-13;
 /// Number of loads solved at a time.
 const TOGETHER: usize = 32;
-/// Number of rows of stored responses multiplied at a time.
-const ROWS_TOGETHER: usize = 4096;
-
-/// Method for the residual inertia.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum InertiaBy {
-    /// `Xᵀ M X` of responses stored in single precision; accurate to 1e-7 of the largest entry.
-    KeptAnswers,
-    /// A second solve per load.
-    SecondSolve,
-}
-
 /// Residuals between degrees of freedom of the contact, in the order requested.
 #[derive(Clone, Debug)]
 pub struct Residual {
@@ -56,23 +52,22 @@ pub struct Residual {
 }
 
 impl Analysed<'_> {
-    /// Estimated bytes that residuals for `loads` loads need in addition to [`Self::held_bytes`], including `count`
-    /// modes.
-    pub fn bytes_for_residual(&self, count: usize, loads: usize, inertia_by: InertiaBy) -> usize {
-        // The modes and their products with M; for one set of loads: loads, responses, products and permuted copies.
-        let columns = 2 * count + 5 * TOGETHER;
-        let kept = if inertia_by == InertiaBy::KeptAnswers { size_of::<f32>() * loads } else { 0 };
-        let vectors = self.pencil.dimension() * (size_of::<f64>() * columns + kept);
-        // Both results and reordered copies of them.
-        let between = 4 * size_of::<f64>() * loads * loads;
+    /// Estimated bytes that residuals need in addition to [`Self::held_bytes`], including `count` modes.
+    pub fn bytes_for_residual(&self, count: usize) -> usize {
+        let (n, loads, float) = (self.pencil.dimension(), self.contact.len(), size_of::<f64>());
+        // Both results, what is condensed, and temporaries.
+        let between = 10 * float * (loads + count).pow(2);
         if self.engine.foreign() {
-            return between + vectors;
+            // The modes and their products with M; for one set of loads: loads, responses, products and permuted copies.
+            return between + n * float * (2 * count + 5 * TOGETHER);
         }
-        self.pencil.factor_bytes() + between + vectors.max(self.pencil.factoring_bytes())
+        // The modes, their products with M, and these as a border.
+        between + n * float * (3 * count + 4) + self.pencil.condensing_bytes(count + 1)
     }
 
-    /// Residual flexibility and inertia of the modes that `modes` omits, between the degrees of freedom `rows`. `None`
-    /// denotes a fixed degree of freedom, whose rows and columns are 0. `progress` receives the progress.
+    /// Residual flexibility and inertia of the modes that `modes` omits, between the degrees of freedom `rows`, those of
+    /// [`Self::with_contact`]. `None` denotes a fixed degree of freedom, whose rows and columns are 0. `progress` receives
+    /// the progress.
     ///
     /// # Errors
     /// [`ReductionError`]: `OnlyRigid` if all kept modes are rigid-body modes, which give no scale for the shift;
@@ -81,18 +76,71 @@ impl Analysed<'_> {
         &self,
         modes: &SparseModes,
         rows: &[Option<usize>],
-        inertia_by: InertiaBy,
         progress: &mut dyn FnMut(Progress),
     ) -> Result<Residual, ReductionError> {
-        let pencil = &self.pencil;
-        let (what, mass, n) = (pencil.what, pencil.mass, pencil.dimension());
         let shift = self.shift(modes)?;
-        let factor = definite(self.engine, pencil, shift)?
-            .ok_or(ReductionError::NoShift { what: what.to_owned(), value: shift })?;
+        let [flexibility, inertia] = if self.engine.foreign() {
+            self.by_solves(modes, shift, progress)?
+        } else {
+            self.by_condensation(modes, shift, progress)?
+        };
+        let shifted = |i: usize, j: usize| flexibility[(i, j)] + shift * inertia[(i, j)];
+        Ok(Residual {
+            flexibility: self.over_rows(rows, &shifted),
+            inertia: self.over_rows(rows, &|i, j| inertia[(i, j)]),
+        })
+    }
+
+    /// `R_s` and `Q_s` between the rows of the contact.
+    fn by_condensation(
+        &self,
+        modes: &SparseModes,
+        shift: f64,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<[Mat<f64>; 2], ReductionError> {
+        let (pencil, c, k) = (&self.pencil, self.contact.len(), modes.phi.ncols());
+        if c == 0 {
+            return Ok([0, 1].map(|_| Mat::zeros(0, 0)));
+        }
+        let indefinite = || ReductionError::NoShift { what: pencil.what.to_owned(), value: shift };
+        let border = symmetric_times(pencil.mass, modes.phi.as_ref());
+        let Condensed { value, slope } =
+            pencil.condense(shift, &self.contact, border.as_ref())?.ok_or_else(indefinite)?;
         progress(Progress::Factored { shift });
-        let free: Vec<usize> = rows.iter().flatten().copied().collect();
+        drop(border);
+        let phi = Mat::from_fn(c, k, |i, mode| modes.phi[(self.contact[i], mode)]);
+        let symmetric = |of: &Mat<f64>, first: usize, size: usize, sign: f64| {
+            Mat::from_fn(size, size, |i, j| sign * of[(first + i.max(j), first + i.min(j))])
+        };
+        let between = |of: &Mat<f64>| of.submatrix(c, 0, k, c).transpose().to_owned();
+        let [s, s_slope] = [&value, &slope].map(|of| symmetric(of, 0, c, 1.0));
+        let [e, e_slope] = [&value, &slope].map(|of| symmetric(of, c, k, -1.0));
+        let [d, d_slope] = [&value, &slope].map(between);
+        let j = Mat::<f64>::identity(c, c) - &d * phi.transpose();
+        let mut z = s.llt(Side::Lower).map_err(|_| indefinite())?.solve(&j);
+        // Removes components of the kept modes that rounding reintroduces, above all rigid-body ones.
+        let back = d.transpose() * &z - &e * phi.transpose();
+        z -= &phi * back;
+        let flexibility = &phi * e * phi.transpose() + j.transpose() * &z;
+        let mixed = z.transpose() * d_slope * phi.transpose();
+        let inertia = z.transpose() * s_slope * &z + &mixed + mixed.transpose() - &phi * e_slope * phi.transpose();
+        progress(Progress::Loaded { solved: c, loads: c });
+        Ok([flexibility, inertia])
+    }
+
+    /// `R_s` and `Q_s` between the rows of the contact, by two solves for each of them.
+    fn by_solves(
+        &self,
+        modes: &SparseModes,
+        shift: f64,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<[Mat<f64>; 2], ReductionError> {
+        let (pencil, free) = (&self.pencil, &self.contact);
+        let factor = definite(self.engine, pencil, shift)?
+            .ok_or(ReductionError::NoShift { what: pencil.what.to_owned(), value: shift })?;
+        progress(Progress::Factored { shift });
         let phi = modes.phi.as_ref();
-        let inertia_of_modes = times(mass, phi);
+        let inertia_of_modes = symmetric_times(pencil.mass, phi);
         // Removes components of the kept modes that rounding reintroduces, above all rigid-body ones.
         let freed = |mut x: Mat<f64>| {
             let back = inertia_of_modes.transpose() * &x;
@@ -107,7 +155,6 @@ impl Analysed<'_> {
                 }
             }
         };
-        let mut answers: Vec<Mat<f32>> = vec![];
         for (chunk, loaded) in free.chunks(TOGETHER).enumerate() {
             let kept = Mat::from_fn(phi.ncols(), loaded.len(), |mode, load| -phi[(loaded[load], mode)]);
             let mut x = &inertia_of_modes * kept;
@@ -117,23 +164,24 @@ impl Analysed<'_> {
             factor.solve(&mut x, false)?;
             x = freed(x);
             seen(&mut flexibility, &x, chunk * TOGETHER);
-            match inertia_by {
-                InertiaBy::KeptAnswers => answers.push(Mat::from_fn(n, x.ncols(), |i, j| x[(i, j)] as f32)),
-                InertiaBy::SecondSolve => {
-                    let mut again = times(mass, x.as_ref());
-                    factor.solve(&mut again, false)?;
-                    seen(&mut inertia, &freed(again), chunk * TOGETHER);
-                }
-            }
+            let mut again = symmetric_times(pencil.mass, x.as_ref());
+            factor.solve(&mut again, false)?;
+            seen(&mut inertia, &freed(again), chunk * TOGETHER);
             let solved = chunk * TOGETHER + loaded.len();
             progress(Progress::Loaded { solved, loads: free.len() });
         }
-        drop(factor);
-        if inertia_by == InertiaBy::KeptAnswers {
-            inertia = inertia_of_answers(mass, &answers, free.len());
-        }
-        let shifted = |i: usize, j: usize| flexibility[(i, j)] + shift * inertia[(i, j)];
-        Ok(Residual { flexibility: over_rows(rows, &shifted), inertia: over_rows(rows, &|i, j| inertia[(i, j)]) })
+        Ok([flexibility, inertia])
+    }
+
+    /// The symmetric part of `entry` between the degrees of freedom `rows`; 0 for fixed ones (`None`), which have no
+    /// entry.
+    fn over_rows(&self, rows: &[Option<usize>], entry: &dyn Fn(usize, usize) -> f64) -> Mat<f64> {
+        let place: Vec<Option<usize>> =
+            rows.iter().map(|row| row.and_then(|row| self.contact.binary_search(&row).ok())).collect();
+        Mat::from_fn(rows.len(), rows.len(), |i, j| match (place[i], place[j]) {
+            (Some(i), Some(j)) => 0.5 * (entry(i, j) + entry(j, i)),
+            (None, _) | (_, None) => 0.0,
+        })
     }
 
     /// The shift of the factor, from the highest of the kept modes.
@@ -154,58 +202,11 @@ impl Analysed<'_> {
     }
 }
 
-/// Residual inertia between `loads` loads from the answers to them, `Xᵀ M X`.
-fn inertia_of_answers(mass: &SparseMatrix, answers: &[Mat<f32>], loads: usize) -> Mat<f64> {
-    let mut inertia = Mat::zeros(loads, loads);
-    for (chunk, right) in answers.iter().enumerate() {
-        let right = times(mass, Mat::from_fn(mass.nrows(), right.ncols(), |i, j| f64::from(right[(i, j)])).as_ref());
-        for (other, left) in answers.iter().enumerate().skip(chunk) {
-            let product = product_of(left, &right);
-            for j in 0..product.ncols() {
-                for i in 0..product.nrows() {
-                    let (i, j, value) = (other * TOGETHER + i, chunk * TOGETHER + j, product[(i, j)]);
-                    inertia[(i, j)] = value;
-                    inertia[(j, i)] = value;
-                }
-            }
-        }
-    }
-    inertia
-}
-
-/// The symmetric part of `entry` between the degrees of freedom `rows`; 0 for fixed ones (`None`), which have no entry.
-fn over_rows(rows: &[Option<usize>], entry: &dyn Fn(usize, usize) -> f64) -> Mat<f64> {
-    let mut position = 0;
-    let place: Vec<Option<usize>> = rows
-        .iter()
-        .map(|row| {
-            row.map(|_| {
-                position += 1;
-                position - 1
-            })
-        })
-        .collect();
-    Mat::from_fn(rows.len(), rows.len(), |i, j| match (place[i], place[j]) {
-        (Some(i), Some(j)) => 0.5 * (entry(i, j) + entry(j, i)),
-        (None, _) | (_, None) => 0.0,
-    })
-}
-
-/// `leftᵀ right`, computed in double precision.
-fn product_of(left: &Mat<f32>, right: &Mat<f64>) -> Mat<f64> {
-    let mut product = Mat::zeros(left.ncols(), right.ncols());
-    for first in (0..left.nrows()).step_by(ROWS_TOGETHER) {
-        let rows = ROWS_TOGETHER.min(left.nrows() - first);
-        let part = Mat::from_fn(rows, left.ncols(), |i, j| f64::from(left[(first + i, j)]));
-        product += part.transpose() * right.subrows(first, rows);
-    }
-    product
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::{ModeSelection, OwnEngine, SparseMatrix, free_interface_modes, lowest_modes};
+    use super::super::{ModeSelection, OwnEngine, SparseMatrix, Wanted, free_interface_modes, lowest_modes};
     use super::*;
+    use crate::spoil::{Spoil, with};
     use faer::sparse::Triplet;
 
     /// A free chain of masses with springs that vary along it.
@@ -228,13 +229,34 @@ mod tests {
     #[test]
     fn nothing_but_rigid_motions_leaves_no_residual() {
         let (mass, stiffness) = chain(420);
-        let analysed = Analysed::new(&OwnEngine, "pad", &mass, &stiffness).unwrap();
+        let rows = [Some(3)];
+        let analysed = Analysed::with_contact(&OwnEngine, "pad", &mass, &stiffness, &rows).unwrap();
         let residual = |count: usize| {
             let kept = lowest_modes("pad", &mass, &stiffness, count).unwrap();
-            analysed.residual(&kept, &[Some(3)], InertiaBy::SecondSolve, &mut |_| {})
+            analysed.residual(&kept, &rows, &mut |_| {})
         };
         assert_eq!(residual(1).unwrap_err(), ReductionError::OnlyRigid { what: "pad".to_owned(), modes: 1 });
         residual(2).unwrap();
+    }
+
+    /// What is left after elimination is used only if it holds for a vector whose product is known.
+    #[test]
+    fn a_spoilt_factor_or_derivative_is_refused_by_its_probe() {
+        let (mass, stiffness) = chain(420);
+        let rows = [Some(3), Some(200)];
+        let analysed = Analysed::with_contact(&OwnEngine, "pad", &mass, &stiffness, &rows).unwrap();
+        let kept = analysed.modes(Wanted::Lowest(9), None, &mut |_| {}).unwrap();
+        let shift = analysed.shift(&kept).unwrap();
+        let refused = |error: ReductionError| match error {
+            ReductionError::Factorisation { what, reason } => what == "pad" && reason.contains("limit"),
+            _ => false,
+        };
+        for spoilt in [Spoil::Factor, Spoil::Slope] {
+            let found = with(spoilt, || analysed.residual(&kept, &rows, &mut |_| {}));
+            assert!(refused(found.unwrap_err()), "{spoilt:?}");
+        }
+        assert!(refused(with(Spoil::Factor, || analysed.pencil.llt(shift)).err().unwrap()));
+        analysed.residual(&kept, &rows, &mut |_| {}).unwrap();
     }
 
     #[test]
@@ -243,12 +265,14 @@ mod tests {
         let (mass, stiffness) = chain(n);
         let kept = lowest_modes("pad", &mass, &stiffness, 20).unwrap();
         let rows = [Some(3), None, Some(200), Some(n - 1)];
-        let analysed = Analysed::new(&OwnEngine, "pad", &mass, &stiffness).unwrap();
-        let by = |way| analysed.residual(&kept, &rows, way, &mut |_| {}).unwrap();
-        let [found, faster] = [InertiaBy::SecondSolve, InertiaBy::KeptAnswers].map(by);
-        // `R` depends on the method for `Q` only through `s Q`, a relative 1e-12.
-        assert!((&found.flexibility - &faster.flexibility).norm_max() < 1e-12 * found.flexibility.norm_max());
-        assert!((&found.inertia - &faster.inertia).norm_max() < 1e-6 * found.inertia.norm_max());
+        let analysed = Analysed::with_contact(&OwnEngine, "pad", &mass, &stiffness, &rows).unwrap();
+        let found = analysed.residual(&kept, &rows, &mut |_| {}).unwrap();
+        let shift = analysed.shift(&kept).unwrap();
+        let [solved, again] = [Analysed::by_solves, Analysed::by_condensation]
+            .map(|way| way(&analysed, &kept, shift, &mut |_| {}).unwrap());
+        for (solved, condensed) in solved.iter().zip(&again) {
+            assert!((solved - condensed).norm_max() < 1e-10 * solved.norm_max());
+        }
         // Expected: the sum over the other 400 modes of a dense solve. Errors of 1e-12 of a kept mode enter squared.
         // The lowest truncated ω², 1e-2 of the largest (500), is accurate to 1e-11 in the dense solve.
         let all =

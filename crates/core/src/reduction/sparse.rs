@@ -1,8 +1,9 @@
 //! Sparse matrices: sums, products, norms and symmetry.
 
 use faer::sparse::{SparseColMat, Triplet};
-use faer::{Mat, MatRef};
+use faer::{Mat, MatMut, MatRef};
 
+use super::threads::shared;
 use super::{ReductionError, SYMMETRY_TOLERANCE};
 
 /// Sparse matrix in compressed columns; both triangles of a symmetric matrix are stored.
@@ -10,6 +11,8 @@ pub type SparseMatrix = SparseColMat<usize, f64>;
 
 /// Number of dense columns multiplied at a time, so that each sparse entry is read once for all of them.
 const TOGETHER: usize = 16;
+/// Number of rows of a product that a thread computes at a time.
+const ROWS_TOGETHER: usize = 16384;
 
 /// Every entry of a sparse matrix as `(row, column, value)`.
 pub(super) fn entries(matrix: &SparseMatrix) -> impl Iterator<Item = (usize, usize, f64)> + '_ {
@@ -81,12 +84,55 @@ pub(super) fn times(matrix: &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
     product
 }
 
-/// `Aᵀ X`, `A` sparse.
+/// `A X`, `A` sparse and symmetric with both triangles.
+pub(super) fn symmetric_times(matrix: &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
+    times_transposed(matrix, x)
+}
+
+/// `Aᵀ X`, `A` sparse; on all cores.
 pub(super) fn times_transposed(matrix: &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
-    let view = matrix.as_ref();
-    Mat::from_fn(matrix.ncols(), x.ncols(), |column, j| {
-        view.row_idx_of_col(column).zip(view.val_of_col(column)).map(|(row, value)| value * x[(row, j)]).sum()
-    })
+    let mut product = Mat::zeros(matrix.ncols(), x.ncols());
+    let mut first = 0;
+    while first < x.ncols() {
+        let left = x.ncols() - first;
+        let width = [TOGETHER, 8, 4, 1].into_iter().find(|width| *width <= left).unwrap_or(1);
+        let (from, to) = (x.subcols(first, width), product.subcols_mut(first, width));
+        match width {
+            TOGETHER => gather::<TOGETHER>(matrix, from, to),
+            8 => gather::<8>(matrix, from, to),
+            4 => gather::<4>(matrix, from, to),
+            _ => gather::<1>(matrix, from, to),
+        }
+        first += width;
+    }
+    product
+}
+
+/// `Aᵀ X` of `W` columns.
+fn gather<const W: usize>(matrix: &SparseMatrix, x: MatRef<'_, f64>, product: MatMut<'_, f64>) {
+    // Stored row by row, so that the innermost loop runs over adjacent memory.
+    let mut from = vec![[0.0; W]; x.nrows()];
+    for k in 0..W {
+        from.iter_mut().zip(x.col(k).iter()).for_each(|(row, value)| row[k] = *value);
+    }
+    let (starts, rows, values) = (matrix.col_ptr(), matrix.row_idx(), matrix.val());
+    let (mut blocks, mut rest, mut first) = (vec![], product, 0);
+    while rest.nrows() > 0 {
+        let size = ROWS_TOGETHER.min(rest.nrows());
+        let (block, others) = rest.split_at_row_mut(size);
+        blocks.push((first, block));
+        (first, rest) = (first + size, others);
+    }
+    shared(blocks, true, |(first, mut block): (usize, MatMut<'_, f64>)| {
+        for j in 0..block.nrows() {
+            let entries = starts[first + j]..starts[first + j + 1];
+            let mut sum = [0.0; W];
+            for (&row, value) in rows[entries.clone()].iter().zip(&values[entries]) {
+                sum.iter_mut().zip(&from[row]).for_each(|(sum, factor)| *sum += value * factor);
+            }
+            sum.iter().enumerate().for_each(|(k, value)| block[(j, k)] = *value);
+        }
+    });
 }
 
 /// `Aᵀ`.

@@ -19,7 +19,7 @@ use super::checked::definite;
 use super::engine::Engine;
 use super::full_model::{FullModel, SparseRow};
 use super::normal_modes::{Analysed, Wanted};
-use super::sparse::{SparseMatrix, times};
+use super::sparse::{SparseMatrix, symmetric_times};
 use super::{FullPart, ReductionError};
 use crate::contact::{RigidMotions, StaticResponse};
 
@@ -108,7 +108,7 @@ fn add_part(
     let along = |row: &SparseRow, x: &Mat<f64>, j: usize| -> f64 {
         row.iter().map(|&(index, weight)| weight * x[(index, j)]).sum()
     };
-    let inertia_of_modes = times(&part.mass, modes.as_ref());
+    let inertia_of_modes = symmetric_times(&part.mass, modes.as_ref());
     // Removes components of the rigid motions that rounding reintroduces.
     let freed = |mut x: Mat<f64>| {
         let back = inertia_of_modes.transpose() * &x;
@@ -130,7 +130,7 @@ fn add_part(
         factor.solve(&mut x, false)?;
         if free > 0 {
             x = freed(x);
-            let mut again = times(&part.mass, x.as_ref());
+            let mut again = symmetric_times(&part.mass, x.as_ref());
             factor.solve(&mut again, false)?;
             x += faer::Scale(shift) * freed(again);
         }

@@ -4,7 +4,7 @@ use std::sync::mpsc;
 
 use super::engine::{Engine, Progress};
 use super::normal_modes::{Analysed, SparseModes, Wanted};
-use super::{InertiaBy, ReductionError, Residual, SparseMatrix};
+use super::{ReductionError, Residual, SparseMatrix};
 
 /// A substructure with its contact interface free.
 #[derive(Clone, Copy, Debug)]
@@ -33,8 +33,7 @@ pub struct Kept {
 /// Computes the modes of every part by `engine` and, if `with_residual`, the residuals of the truncated modes.
 ///
 /// The parts run in parallel, one thread each, if all of them together fit in `memory_limit_bytes` in addition to the
-/// given matrices; otherwise one after the other. Responses to contact forces are stored if memory allows, see
-/// [`InertiaBy::KeptAnswers`]. These choices change the result by rounding only: 1e-7 of the residual inertia.
+/// given matrices; otherwise one after the other. The result is the same.
 ///
 /// `progress` receives the index of a part and its progress.
 ///
@@ -49,49 +48,41 @@ pub fn keep_modes(
 ) -> Result<Vec<Kept>, ReductionError> {
     let analysed: Vec<Analysed<'_>> = side_by_side(parts, true, progress, &|part, report| {
         report(Progress::Analysing);
-        Analysed::new(engine, part.name, part.mass, part.stiffness)
+        let contact = if with_residual { part.rows } else { &[] };
+        Analysed::with_contact(engine, part.name, part.mass, part.stiffness, contact)
     })?;
     let held: usize = analysed.iter().map(Analysed::held_bytes).sum();
-    let work = |index: usize, wanted: Wanted, inertia_by: InertiaBy| {
-        let count = count_of(wanted);
-        let (one, loads) = (&analysed[index], parts[index].rows.iter().flatten().count());
-        one.bytes_for(count).max(if with_residual { one.bytes_for_residual(count, loads, inertia_by) } else { 0 })
+    let work = |index: usize, wanted: Wanted| {
+        let (count, one) = (count_of(wanted), &analysed[index]);
+        one.bytes_for(count).max(if with_residual { one.bytes_for_residual(count) } else { 0 })
     };
-    let plan = |wanted: &[Wanted], progress: &mut dyn FnMut(usize, Progress)| -> Result<Plan, ReductionError> {
-        let needs = |inertia_by: InertiaBy| -> Vec<usize> {
-            wanted.iter().enumerate().map(|(index, &wanted)| work(index, wanted, inertia_by)).collect()
-        };
-        // A foreign engine solves one after the other: its ranks need the memory.
-        let ways = [true, false].into_iter().filter(|at_once| !(*at_once && engine.foreign())).flat_map(|at_once| {
-            [InertiaBy::KeptAnswers, InertiaBy::SecondSolve].map(|inertia_by| Plan { at_once, inertia_by })
-        });
-        let bytes = |way: &Plan| -> usize {
-            let needs = needs(way.inertia_by);
-            if way.at_once {
-                return held + needs.iter().sum::<usize>();
-            }
-            // Modes of finished parts stay in memory.
-            let modes = |index: usize| size_of::<f64>() * parts[index].mass.nrows() * count_of(wanted[index]);
-            held + needs.iter().copied().max().unwrap_or(0) + (0..parts.len()).map(modes).sum::<usize>()
-        };
-        let way = ways.into_iter().find(|way| memory_limit_bytes.is_none_or(|limit| bytes(way) <= limit));
-        let plan = way.unwrap_or(Plan { at_once: false, inertia_by: InertiaBy::SecondSolve });
-        for (index, need) in needs(plan.inertia_by).into_iter().enumerate() {
+    // Whether the parts are solved at once: if they fit in memory.
+    let plan = |wanted: &[Wanted], progress: &mut dyn FnMut(usize, Progress)| -> Result<bool, ReductionError> {
+        let needs: Vec<usize> = wanted.iter().enumerate().map(|(index, &wanted)| work(index, wanted)).collect();
+        for (index, need) in needs.iter().enumerate() {
             let factor_entries = analysed[index].factor_entries();
             progress(index, Progress::Analysed { factor_entries, bytes: held + need });
         }
-        way.ok_or_else(|| {
-            let needs = needs(plan.inertia_by);
-            let largest = (0..needs.len()).max_by_key(|&index| needs[index]).unwrap_or(0);
-            let what = parts[largest].name.to_owned();
-            ReductionError::Memory { what, bytes: bytes(&plan), limit: memory_limit_bytes.unwrap_or(usize::MAX) }
-        })
+        let fits = |bytes: usize| memory_limit_bytes.is_none_or(|limit| bytes <= limit);
+        // A foreign engine solves one after the other: its ranks need the memory.
+        if !engine.foreign() && fits(held + needs.iter().sum::<usize>()) {
+            return Ok(true);
+        }
+        // Modes of finished parts stay in memory.
+        let modes = |index: usize| size_of::<f64>() * parts[index].mass.nrows() * count_of(wanted[index]);
+        let largest = (0..needs.len()).max_by_key(|&index| needs[index]).unwrap_or(0);
+        let bytes = held + needs.get(largest).unwrap_or(&0) + (0..parts.len()).map(modes).sum::<usize>();
+        if fits(bytes) {
+            return Ok(false);
+        }
+        let what = parts[largest].name.to_owned();
+        Err(ReductionError::Memory { what, bytes, limit: memory_limit_bytes.unwrap_or(usize::MAX) })
     };
     let mut wanted: Vec<Wanted> = parts.iter().map(|part| part.wanted).collect();
-    let mut way = plan(&wanted, progress)?;
+    let mut at_once = plan(&wanted, progress)?;
     if wanted.iter().any(|wanted| matches!(wanted, Wanted::Below(_))) {
         let indices: Vec<usize> = (0..parts.len()).collect();
-        wanted = side_by_side(&indices, way.at_once, progress, &|&index, report| match parts[index].wanted {
+        wanted = side_by_side(&indices, at_once, progress, &|&index, report| match parts[index].wanted {
             Wanted::Below(below_rad_s) => {
                 let below = below_rad_s * below_rad_s;
                 let (modes, by) = analysed[index].count_below(below, memory_limit_bytes)?;
@@ -100,10 +91,10 @@ pub fn keep_modes(
             }
             wanted => Ok(wanted),
         })?;
-        way = plan(&wanted, progress)?;
+        at_once = plan(&wanted, progress)?;
     }
     let indices: Vec<usize> = (0..parts.len()).collect();
-    side_by_side(&indices, way.at_once, progress, &|&index, report| {
+    side_by_side(&indices, at_once, progress, &|&index, report| {
         // Its memory need has been reported already.
         let mut report = |p: Progress| {
             if !matches!(p, Progress::Analysed { .. }) {
@@ -112,11 +103,8 @@ pub fn keep_modes(
         };
         let limit = memory_limit_bytes.filter(|_| engine.foreign());
         let modes = analysed[index].modes(wanted[index], limit, &mut report)?;
-        let residual = if with_residual {
-            Some(analysed[index].residual(&modes, parts[index].rows, way.inertia_by, &mut report)?)
-        } else {
-            None
-        };
+        let residual =
+            if with_residual { Some(analysed[index].residual(&modes, parts[index].rows, &mut report)?) } else { None };
         Ok(Kept { modes, residual })
     })
 }
@@ -127,13 +115,6 @@ fn count_of(wanted: Wanted) -> usize {
         Wanted::Lowest(count) | Wanted::Counted { modes: count, .. } => count,
         Wanted::Below(_) => 0,
     }
-}
-
-/// A strategy that fits in memory.
-#[derive(Clone, Copy, Debug)]
-struct Plan {
-    at_once: bool,
-    inertia_by: InertiaBy,
 }
 
 /// Work on one item, which reports its progress to a callback.
@@ -215,7 +196,7 @@ mod tests {
         })
         .unwrap();
         assert_eq!(together.iter().map(|kept| kept.modes.omega_squared.len()).collect::<Vec<_>>(), [9, 12]);
-        // Each part fits alone with stored responses; both together do not.
+        // Each part fits alone; both together do not.
         let limit = needs.iter().copied().max().unwrap() + 200_000;
         let mut order = vec![];
         let apart = keep_modes(&OwnEngine, &parts, true, Some(limit), &mut |part, p| {

@@ -1,0 +1,415 @@
+//! Multifrontal elimination of `A = K + s M`: dense fronts along the elimination tree, on all cores.
+//!
+//! ```text
+//! front = [A₁₁ A₂₁ᵀ; A₂₁ U],   A₁₁ = L₁₁ L₁₁ᵀ,   L₂₁ = A₂₁ L₁₁⁻ᵀ,   U ← U - L₂₁ L₂₁ᵀ
+//! G = L₂₁ L₁₁⁻¹,   Z = A₂₁' - ½ G A₁₁',   U' ← U' - G Zᵀ - Z Gᵀ        (derivative by s, A' = M)
+//! ```
+//!
+//! The update `U` of a front is added to the front of its parent. Disjoint subtrees are eliminated by different threads;
+//! large fronts above them are divided into blocks. The blocks do not depend on the number of threads, and updates are
+//! added in a fixed order: the result is the same on any number of cores.
+//!
+//! Source: Duff, Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM Trans. Math.
+//! Softw. 9 (1983) 302-325; Smith, "Differentiation of the Cholesky algorithm", J. Comput. Graph. Stat. 4 (1995) 134-147.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
+use faer::{Mat, MatMut, MatRef};
+
+use super::SparseMatrix;
+use super::elimination_tree::Tree;
+use super::front_blocks::{differentiate, positive, signed, subtract_lower};
+use super::threads::shared;
+
+/// Number of rows of a front below which it is not divided among threads.
+const DIVIDED: usize = 768;
+
+/// Why a matrix could not be eliminated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Broken {
+    /// It is not positive definite.
+    Indefinite,
+    /// A pivot is zero or not finite.
+    Pivot,
+}
+
+/// Dense rows appended to the matrix and never eliminated: `B`, `n×k`, and the derivative of its last column; that of
+/// the others is 0.
+pub(super) struct Border<'a> {
+    pub(super) value: MatRef<'a, f64>,
+    pub(super) last_slope: MatRef<'a, f64>,
+}
+
+/// What is left of `[A B; Bᵀ 0]` and its derivative when all rows but the last are eliminated: lower triangles.
+pub(super) struct Condensed {
+    pub(super) value: Mat<f64>,
+    pub(super) slope: Mat<f64>,
+}
+
+/// A matrix `K + s M` with the structure of its factor.
+pub(super) struct Fronts<'a> {
+    pub(super) stiffness: &'a SparseMatrix,
+    pub(super) mass: &'a SparseMatrix,
+    pub(super) shift: f64,
+    pub(super) supernodes: &'a SymbolicSupernodalCholesky<usize>,
+    /// The row eliminated at each position, and the position of each row.
+    pub(super) order: (&'a [usize], &'a [usize]),
+}
+
+/// How the pivots of a front are eliminated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Pivots {
+    /// `L Lᵀ`.
+    Positive,
+    /// `L D Lᵀ`, whose negative pivots are counted.
+    Signed,
+}
+
+/// The rows of a front: `columns` that it eliminates, from position `start` on, then `rest`.
+#[derive(Clone, Copy)]
+struct Shape<'a> {
+    start: usize,
+    columns: usize,
+    rest: &'a [usize],
+    border: usize,
+}
+
+impl Shape<'_> {
+    /// Number of rows that remain.
+    fn remaining(&self) -> usize {
+        self.rest.len() + self.border
+    }
+}
+
+/// What a front leaves to its parent: lower triangles over the rows that remain.
+struct Update {
+    supernode: usize,
+    value: Mat<f64>,
+    slope: Mat<f64>,
+}
+
+/// One sweep through the tree.
+struct Sweep<'a, 'f> {
+    fronts: &'f Fronts<'a>,
+    tree: &'f Tree,
+    pivots: Pivots,
+    border: Option<&'f Border<'f>>,
+    /// The factor to be filled, by supernodes.
+    factor: Option<Vec<Mutex<&'f mut [f64]>>>,
+    pending: Vec<Mutex<Vec<Update>>>,
+    negative: AtomicUsize,
+    indefinite: AtomicBool,
+    broken: AtomicBool,
+}
+
+impl Fronts<'_> {
+    /// Fills `values` with the factor `L` in the layout of the supernodes.
+    pub(super) fn cholesky(&self, values: &mut [f64]) -> Result<(), Broken> {
+        let tree = Tree::new(self.supernodes, self.supernodes.n_supernodes(), 0);
+        let mut rest = values;
+        let mut of_supernode = vec![];
+        for ends in self.supernodes.col_ptr_for_val().windows(2) {
+            let (mine, others) = std::mem::take(&mut rest).split_at_mut(ends[1] - ends[0]);
+            of_supernode.push(Mutex::new(mine));
+            rest = others;
+        }
+        self.sweep(&tree, Pivots::Positive, None, Some(of_supernode)).map(|_| ())
+    }
+
+    /// The number of negative pivots of `L D Lᵀ`. Nothing of the factor is kept.
+    pub(super) fn count_negative(&self) -> Result<usize, Broken> {
+        let tree = Tree::new(self.supernodes, self.supernodes.n_supernodes(), 0);
+        Ok(self.sweep(&tree, Pivots::Signed, None, None)?.0)
+    }
+
+    /// Eliminates all but the `last` rows of `[A B; Bᵀ 0]`, with the derivative by `s`. Nothing of the factor is kept.
+    pub(super) fn condense(&self, last: usize, border: &Border<'_>) -> Result<Condensed, Broken> {
+        let (n, count) = (self.order.0.len(), self.supernodes.n_supernodes());
+        let eliminated = self.supernodes.supernode_end().iter().take_while(|end| **end <= n - last).count();
+        let tree = Tree::new(self.supernodes, eliminated, border.value.ncols());
+        let (_, pending) = self.sweep(&tree, Pivots::Positive, Some(border), None)?;
+        let start = if eliminated == count { n } else { self.supernodes.supernode_begin()[eliminated] };
+        let rest: Vec<usize> = (n - last..n).collect();
+        let shape = Shape { start, columns: n - last - start, rest: &rest, border: border.value.ncols() };
+        let sweep = Sweep::new(self, &tree, Pivots::Positive, Some(border), None);
+        let mut place = vec![0; n];
+        let Update { value, slope, .. } = sweep.front(eliminated, shape, pending, &mut place, true);
+        sweep.outcome()?;
+        Ok(Condensed { value, slope })
+    }
+
+    /// Estimated bytes that [`Self::condense`] takes, or, without a derivative and border, the other sweeps.
+    pub(super) fn bytes(supernodes: &SymbolicSupernodalCholesky<usize>, border: usize, derivative: bool) -> usize {
+        let tree = Tree::new(supernodes, supernodes.n_supernodes(), border);
+        size_of::<f64>() * tree.peak_entries() * if derivative { 2 } else { 1 }
+    }
+
+    /// Eliminates the supernodes of `tree`. Returns the number of negative pivots, and the updates for what follows.
+    fn sweep<'f>(
+        &'f self,
+        tree: &'f Tree,
+        pivots: Pivots,
+        border: Option<&'f Border<'f>>,
+        factor: Option<Vec<Mutex<&'f mut [f64]>>>,
+    ) -> Result<(usize, Vec<Update>), Broken> {
+        let sweep = Sweep::new(self, tree, pivots, border, factor);
+        shared(tree.subtrees.iter().collect(), true, |subtree: &Vec<usize>| {
+            let mut place = vec![0; self.order.0.len()];
+            subtree.iter().for_each(|&s| sweep.supernode(s, &mut place, false));
+        });
+        let mut place = vec![0; self.order.0.len()];
+        tree.above.iter().for_each(|&s| sweep.supernode(s, &mut place, true));
+        sweep.outcome()?;
+        let Sweep { negative, mut pending, .. } = sweep;
+        let last = pending.pop().map(|last| last.into_inner().unwrap_or_default()).unwrap_or_default();
+        Ok((negative.into_inner(), last))
+    }
+}
+
+impl<'a, 'f> Sweep<'a, 'f> {
+    fn new(
+        fronts: &'f Fronts<'a>,
+        tree: &'f Tree,
+        pivots: Pivots,
+        border: Option<&'f Border<'f>>,
+        factor: Option<Vec<Mutex<&'f mut [f64]>>>,
+    ) -> Self {
+        let pending = (0..=tree.parents.len()).map(|_| Mutex::new(vec![])).collect();
+        let (negative, indefinite, broken) = (AtomicUsize::new(0), AtomicBool::new(false), AtomicBool::new(false));
+        Self { fronts, tree, pivots, border, factor, pending, negative, indefinite, broken }
+    }
+
+    fn outcome(&self) -> Result<(), Broken> {
+        if self.broken.load(Ordering::Relaxed) {
+            return Err(Broken::Pivot);
+        }
+        if self.indefinite.load(Ordering::Relaxed) { Err(Broken::Indefinite) } else { Ok(()) }
+    }
+
+    /// Eliminates supernode `s`, whose children are eliminated. `place` is memory for the places of rows.
+    fn supernode(&self, s: usize, place: &mut [u32], parallel: bool) {
+        if self.outcome().is_err() {
+            return;
+        }
+        let supernodes = self.fronts.supernodes;
+        let start = supernodes.supernode_begin()[s];
+        let shape = Shape {
+            start,
+            columns: supernodes.supernode_end()[s] - start,
+            rest: supernodes.supernode(s).pattern(),
+            border: self.border.map_or(0, |border| border.value.ncols()),
+        };
+        let children = self.pending[s].lock().map(|mut children| std::mem::take(&mut *children)).unwrap_or_default();
+        let update = self.front(s, shape, children, place, parallel);
+        if shape.remaining() > 0
+            && let Ok(mut of_parent) = self.pending[self.tree.parents[s]].lock()
+        {
+            of_parent.push(update);
+        }
+    }
+
+    /// Assembles a front and eliminates its columns.
+    fn front(
+        &self,
+        s: usize,
+        shape: Shape<'_>,
+        mut children: Vec<Update>,
+        place: &mut [u32],
+        parallel: bool,
+    ) -> Update {
+        let (columns, remaining, derivative) = (shape.columns, shape.remaining(), self.border.is_some());
+        let rows = columns + remaining;
+        let own = (shape.start..shape.start + columns).chain(shape.rest.iter().copied());
+        own.enumerate().for_each(|(local, row)| place[row] = local as u32);
+        let mut memory;
+        let mut kept = self.factor.as_ref().and_then(|factor| factor[s].lock().ok());
+        let panel = match &mut kept {
+            Some(values) => &mut ***values,
+            None => {
+                memory = vec![0.0; rows * columns];
+                &mut memory[..]
+            }
+        };
+        let mut panel = MatMut::from_column_major_slice_mut(panel, rows, columns);
+        let mut update = Mat::<f64>::zeros(remaining, remaining);
+        let size = |wanted: usize| if derivative { wanted } else { 0 };
+        let mut panel_slope = Mat::<f64>::zeros(size(rows), size(columns));
+        let mut update_slope = Mat::<f64>::zeros(size(remaining), size(remaining));
+        let mut value = Lower { panel: panel.as_mut(), update: update.as_mut(), columns };
+        let mut slope = Lower { panel: panel_slope.as_mut(), update: update_slope.as_mut(), columns };
+        self.assemble(shape, s == self.tree.parents.len(), place, &mut value, derivative.then_some(&mut slope));
+        children.sort_unstable_by_key(|child| child.supernode);
+        for child in children {
+            let rest = self.fronts.supernodes.supernode(child.supernode).pattern();
+            let local: Vec<u32> = rest
+                .iter()
+                .map(|&row| place[row])
+                .chain((0..shape.border).map(|k| (columns + shape.rest.len() + k) as u32))
+                .collect();
+            value.add(&child.value, &local);
+            if derivative {
+                slope.add(&child.slope, &local);
+            }
+        }
+        let parallel = parallel && rows >= DIVIDED;
+        match self.pivots {
+            Pivots::Positive => {
+                if positive(panel.as_mut(), parallel).is_err() {
+                    self.indefinite.store(true, Ordering::Relaxed);
+                } else {
+                    let below = panel.as_ref().subrows(columns, remaining);
+                    subtract_lower(update.as_mut(), &[(below, below)], parallel);
+                    if derivative {
+                        let top = panel.as_ref().subrows(0, columns);
+                        differentiate(top, below, panel_slope.as_ref(), update_slope.as_mut(), parallel);
+                    }
+                }
+            }
+            Pivots::Signed => match signed(panel.as_mut(), update.as_mut(), parallel) {
+                Some(negative) => drop(self.negative.fetch_add(negative, Ordering::Relaxed)),
+                None => self.broken.store(true, Ordering::Relaxed),
+            },
+        }
+        Update { supernode: s, value: update, slope: update_slope }
+    }
+
+    /// Adds the entries of the matrix and the border that belong to a front. The last front has those between its
+    /// remaining rows, too.
+    fn assemble(
+        &self,
+        shape: Shape<'_>,
+        last: bool,
+        place: &[u32],
+        value: &mut Lower<'_>,
+        mut slope: Option<&mut Lower<'_>>,
+    ) {
+        let Fronts { stiffness, mass, shift, order: (forward, inverse), supernodes: _ } = *self.fronts;
+        let through = if last { forward.len() } else { shape.start + shape.columns };
+        for position in shape.start..through {
+            let (row, column) = (forward[position], place[position] as usize);
+            let (stiffness, mass) = (stiffness.as_ref(), mass.as_ref());
+            for (other, entry) in stiffness.row_idx_of_col(row).zip(stiffness.val_of_col(row)) {
+                if inverse[other] >= position {
+                    *value.at(place[inverse[other]] as usize, column) += entry;
+                }
+            }
+            for (other, entry) in mass.row_idx_of_col(row).zip(mass.val_of_col(row)) {
+                if inverse[other] >= position {
+                    let local = place[inverse[other]] as usize;
+                    *value.at(local, column) += shift * entry;
+                    if let Some(slope) = &mut slope {
+                        *slope.at(local, column) += entry;
+                    }
+                }
+            }
+            if let Some(border) = self.border {
+                for k in 0..shape.border {
+                    let local = shape.columns + shape.rest.len() + k;
+                    *value.at(local, column) += border.value[(row, k)];
+                }
+                if let Some(slope) = &mut slope {
+                    *slope.at(shape.columns + shape.remaining() - 1, column) += border.last_slope[(row, 0)];
+                }
+            }
+        }
+    }
+}
+
+/// The lower triangle of a front: the columns to eliminate, and what remains.
+struct Lower<'a> {
+    panel: MatMut<'a, f64>,
+    update: MatMut<'a, f64>,
+    columns: usize,
+}
+
+impl Lower<'_> {
+    fn at(&mut self, row: usize, column: usize) -> &mut f64 {
+        match column.checked_sub(self.columns) {
+            None => &mut self.panel[(row, column)],
+            Some(column) => &mut self.update[(row - self.columns, column)],
+        }
+    }
+
+    /// Adds the lower triangle of the update of a child, whose rows have the places `local`, ascending.
+    fn add(&mut self, child: &Mat<f64>, local: &[u32]) {
+        for (j, &column) in local.iter().enumerate() {
+            let from = &child.col_as_slice(j)[j..];
+            let (to, first) = match (column as usize).checked_sub(self.columns) {
+                None => (self.panel.as_mut().col_mut(column as usize), 0),
+                Some(column) => (self.update.as_mut().col_mut(column), self.columns),
+            };
+            let Some(to) = to.try_as_col_major_mut() else { continue };
+            let to = to.as_slice_mut();
+            local[j..].iter().zip(from).for_each(|(&row, value)| to[row as usize - first] += value);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::pencil::Pencil;
+    use super::*;
+    use faer::linalg::solvers::Solve;
+    use faer::sparse::Triplet;
+
+    /// A cube of `side³` masses with springs between neighbours along its edges and diagonals, held at one corner.
+    fn cube(side: usize) -> [SparseMatrix; 2] {
+        let at = |x: usize, y: usize, z: usize| (x * side + y) * side + z;
+        let n = side * side * side;
+        let (mut mass, mut stiffness) = (vec![], vec![Triplet::new(0, 0, 10.0)]);
+        for i in 0..n {
+            let [x, y, z] = [i / (side * side), i / side % side, i % side];
+            mass.push(Triplet::new(i, i, 2.0 + (i as f64).sin()));
+            for [a, b, c] in [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1], [1, 1, 1]] {
+                let [x2, y2, z2] = [x + a, y + b, z + c];
+                if x2 < side && y2 < side && z2 < side {
+                    let (other, spring) = (at(x2, y2, z2), 100.0 + 30.0 * (0.3 * i as f64).cos());
+                    for (row, column, sign) in [(i, i, 1.0), (other, other, 1.0), (i, other, -1.0), (other, i, -1.0)] {
+                        stiffness.push(Triplet::new(row, column, sign * spring));
+                        mass.push(Triplet::new(row, column, if row == column { 0.3 } else { 0.1 }));
+                    }
+                }
+            }
+        }
+        [mass, stiffness].map(|triplets| SparseMatrix::try_new_from_triplets(n, n, &triplets).unwrap())
+    }
+
+    /// The matrix and its derivative condensed to the last rows, against dense elimination.
+    #[test]
+    fn condensed_to_some_rows_against_a_dense_elimination() {
+        let [mass, stiffness] = cube(9);
+        let (n, shift) = (mass.nrows(), 3.0);
+        let last: Vec<usize> = (0..n).filter(|i| i % 31 == 7 || (300..330).contains(i)).collect();
+        let pencil = Pencil::with_last("cube", &mass, &stiffness, &last).unwrap();
+        let border = Mat::from_fn(n, 3, |i, j| ((i * (j + 2)) as f64).sin());
+        let found = pencil.condense(shift, &last, border.as_ref()).unwrap().unwrap();
+        let (c, k) = (last.len(), 3);
+        let others: Vec<usize> = (0..n).filter(|i| !last.contains(i)).collect();
+        let dense = |s: f64| {
+            let a = stiffness.to_dense() + faer::Scale(s) * mass.to_dense();
+            let entry = |i: usize, j: usize| if j < n { a[(i, j)] } else { border[(i, j - n)] };
+            let kept: Vec<usize> = last.iter().copied().chain(n..n + k).collect();
+            let inner = Mat::from_fn(others.len(), others.len(), |i, j| a[(others[i], others[j])]);
+            let right = Mat::from_fn(others.len(), c + k, |i, j| entry(others[i], kept[j]));
+            let corner = Mat::from_fn(c + k, c + k, |i, j| match (kept[i] < n, kept[j] < n) {
+                (true, _) => entry(kept[i], kept[j]),
+                (false, true) => entry(kept[j], kept[i]),
+                (false, false) => 0.0,
+            });
+            corner - right.transpose() * inner.partial_piv_lu().solve(&right)
+        };
+        let step = 1e-3;
+        let slope = (dense(shift + step) - dense(shift - step)) * faer::Scale(0.5 / step);
+        for (found, expected, tolerance) in [(found.value, dense(shift), 1e-12), (found.slope, slope, 1e-6)] {
+            let most = expected.norm_max();
+            for i in 0..c + k {
+                for j in 0..=i {
+                    let difference = (found[(i, j)] - expected[(i, j)]).abs();
+                    assert!(difference < tolerance * most, "{i} {j} of {c}: {} {}", found[(i, j)], expected[(i, j)]);
+                }
+            }
+        }
+    }
+}
