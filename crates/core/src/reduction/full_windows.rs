@@ -19,7 +19,7 @@ use crate::sampling::radical_inverse;
 
 /// Length, relative to the vector, of its component outside the basis below which it is not added. With right and left
 /// vectors in the basis the error of a root is of the order of the square of this.
-const NEW: f64 = 1e-6;
+const NEW: f64 = 1e-5;
 /// Damping ratio above which a root is assumed unable to become unstable; its vectors are not added.
 const DAMPED: f64 = 0.05;
 /// Change of the friction coefficient of a window end below which it is converged.

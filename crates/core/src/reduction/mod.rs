@@ -45,7 +45,6 @@ mod krylov_schur;
 mod lanczos;
 mod matching;
 mod normal_modes;
-mod on_threads;
 mod operating_box;
 mod ordering;
 mod own_engine;
@@ -77,7 +76,6 @@ pub use full_root::{CoveredDisc, FullProgress, FullRoot, FullSpectrum, FullVecto
 pub use full_windows::full_windows;
 pub use matching::{Counted, RootMatch, match_roots};
 pub use normal_modes::{Analysed, SparseModes, Wanted, lowest_modes, normal_modes};
-pub use on_threads::{on_threads, threads_for};
 pub use operating_box::OperatingBox;
 pub use own_engine::OwnEngine;
 pub use parametric::{HeldOut, ParametricBasis, ParametricRequest, ParametricStep, parametric_basis};
@@ -88,6 +86,7 @@ pub use residual::Residual;
 pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
 
 pub use substructures::{Kept, Substructure, keep_modes};
+pub use threads::{on_threads, threads_for};
 
 /// Largest difference of two mirrored entries of a symmetric matrix, relative to its largest entry; it allows for
 /// matrices printed with 13 digits. Such matrices are replaced by the mean of both triangles.

@@ -1,9 +1,8 @@
 //! Modes and residuals of several substructures, in parallel if memory allows.
 
-use std::sync::mpsc;
-
 use super::engine::{Engine, Progress};
 use super::normal_modes::{Analysed, SparseModes, Wanted};
+use super::threads::on_threads;
 use super::{ReductionError, Residual, SparseMatrix};
 
 /// A substructure with its contact interface free.
@@ -127,30 +126,11 @@ fn side_by_side<T: Sync, R: Send>(
     progress: &mut dyn FnMut(usize, Progress),
     work: &Work<'_, T, R>,
 ) -> Result<Vec<R>, ReductionError> {
-    if !at_once {
-        return items.iter().enumerate().map(|(index, item)| work(item, &mut |p| progress(index, p))).collect();
-    }
-    std::thread::scope(|scope| {
-        let (sender, receiver) = mpsc::channel();
-        let workers: Vec<_> = items
-            .iter()
-            .enumerate()
-            .map(|(index, item)| {
-                let sender = sender.clone();
-                // A closed channel means that progress is no longer received; ignore it.
-                scope.spawn(move || {
-                    work(item, &mut |p| {
-                        let _ = sender.send((index, p));
-                    })
-                })
-            })
-            .collect();
-        drop(sender);
-        receiver.iter().for_each(|(index, p)| progress(index, p));
-        workers
-            .into_iter()
-            .map(|worker| worker.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
-            .collect()
+    let numbered: Vec<(usize, &T)> = items.iter().enumerate().collect();
+    let mut threads = vec![(); if at_once { items.len() } else { 1 }];
+    let mut report = |(index, step): (usize, Progress)| progress(index, step);
+    on_threads(&mut threads, &numbered, &mut report, &|(), (index, item), report| {
+        work(item, &mut |step| report((*index, step)))
     })
 }
 
