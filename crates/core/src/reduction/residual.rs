@@ -42,6 +42,7 @@ const SHIFT: f64 = 1e-6;
 const RIGID: f64 = 1e-13;
 /// Number of loads solved at a time.
 const TOGETHER: usize = 32;
+
 /// Residuals between degrees of freedom of the contact, in the order requested.
 #[derive(Clone, Debug)]
 pub struct Residual {
