@@ -9,11 +9,19 @@ use faer::linalg::triangular_solve::{
 use faer::linalg::{cholesky::ldlt, cholesky::llt};
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 
-use super::fronts::Broken;
 use super::threads::shared;
 
 /// Number of columns of a block of a front.
 const BLOCK: usize = 192;
+
+/// Why a matrix could not be eliminated.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Broken {
+    /// It is not positive definite.
+    Indefinite,
+    /// A pivot is zero or not finite.
+    Pivot,
+}
 
 /// Factorises the columns of a front: the top becomes `L₁₁`, the rest `L₂₁`.
 pub(super) fn positive(mut panel: MatMut<'_, f64>, parallel: bool) -> Result<(), Broken> {

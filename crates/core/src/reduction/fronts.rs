@@ -20,20 +20,13 @@ use faer::{Mat, MatMut, MatRef};
 
 use super::SparseMatrix;
 use super::elimination_tree::Tree;
-use super::front_blocks::{differentiate, positive, signed, subtract_lower};
+use super::front_blocks::{Broken, differentiate, positive, signed, subtract_lower};
 use super::threads::shared;
 
 /// Number of rows of a front below which it is not divided among threads.
 const DIVIDED: usize = 768;
-
-/// Why a matrix could not be eliminated.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Broken {
-    /// It is not positive definite.
-    Indefinite,
-    /// A pivot is zero or not finite.
-    Pivot,
-}
+/// The place of a row that a front does not have.
+const ABSENT: u32 = u32::MAX;
 
 /// Dense rows appended to the matrix and never eliminated: `B`, `n×k`, and the derivative of its last column; that of
 /// the others is 0.
@@ -134,7 +127,7 @@ impl Fronts<'_> {
         let rest: Vec<usize> = (n - last..n).collect();
         let shape = Shape { start, columns: n - last - start, rest: &rest, border: border.value.ncols() };
         let sweep = Sweep::new(self, &tree, Pivots::Positive, Some(border), None);
-        let mut place = vec![0; n];
+        let mut place = vec![ABSENT; n];
         let Update { value, slope, .. } = sweep.front(eliminated, shape, pending, &mut place, true);
         sweep.outcome()?;
         Ok(Condensed { value, slope })
@@ -156,10 +149,10 @@ impl Fronts<'_> {
     ) -> Result<(usize, Vec<Update>), Broken> {
         let sweep = Sweep::new(self, tree, pivots, border, factor);
         shared(tree.subtrees.iter().collect(), true, |subtree: &Vec<usize>| {
-            let mut place = vec![0; self.order.0.len()];
+            let mut place = vec![ABSENT; self.order.0.len()];
             subtree.iter().for_each(|&s| sweep.supernode(s, &mut place, false));
         });
-        let mut place = vec![0; self.order.0.len()];
+        let mut place = vec![ABSENT; self.order.0.len()];
         tree.above.iter().for_each(|&s| sweep.supernode(s, &mut place, true));
         sweep.outcome()?;
         let Sweep { negative, mut pending, .. } = sweep;
@@ -221,8 +214,8 @@ impl<'a, 'f> Sweep<'a, 'f> {
     ) -> Update {
         let (columns, remaining, derivative) = (shape.columns, shape.remaining(), self.border.is_some());
         let rows = columns + remaining;
-        let own = (shape.start..shape.start + columns).chain(shape.rest.iter().copied());
-        own.enumerate().for_each(|(local, row)| place[row] = local as u32);
+        let own = || (shape.start..shape.start + columns).chain(shape.rest.iter().copied());
+        own().enumerate().for_each(|(local, row)| place[row] = local as u32);
         let mut memory;
         let mut kept = self.factor.as_ref().and_then(|factor| factor[s].lock().ok());
         let panel = match &mut kept {
@@ -253,6 +246,7 @@ impl<'a, 'f> Sweep<'a, 'f> {
                 slope.add(&child.slope, &local);
             }
         }
+        own().for_each(|row| place[row] = ABSENT);
         let parallel = parallel && rows >= DIVIDED;
         match self.pivots {
             Pivots::Positive => {
@@ -276,7 +270,8 @@ impl<'a, 'f> Sweep<'a, 'f> {
     }
 
     /// Adds the entries of the matrix and the border that belong to a front. The last front has those between its
-    /// remaining rows, too.
+    /// remaining rows, too. A front has the rows of the lower triangle; an entry that only the upper triangle stores is
+    /// 0 within [`SYMMETRY_TOLERANCE`](super::SYMMETRY_TOLERANCE) and left out.
     fn assemble(
         &self,
         shape: Shape<'_>,
@@ -290,14 +285,17 @@ impl<'a, 'f> Sweep<'a, 'f> {
         for position in shape.start..through {
             let (row, column) = (forward[position], place[position] as usize);
             let (stiffness, mass) = (stiffness.as_ref(), mass.as_ref());
+            let below = |other: usize| {
+                let local = place[inverse[other]];
+                (inverse[other] >= position && local != ABSENT).then_some(local as usize)
+            };
             for (other, entry) in stiffness.row_idx_of_col(row).zip(stiffness.val_of_col(row)) {
-                if inverse[other] >= position {
-                    *value.at(place[inverse[other]] as usize, column) += entry;
+                if let Some(local) = below(other) {
+                    *value.at(local, column) += entry;
                 }
             }
             for (other, entry) in mass.row_idx_of_col(row).zip(mass.val_of_col(row)) {
-                if inverse[other] >= position {
-                    let local = place[inverse[other]] as usize;
+                if let Some(local) = below(other) {
                     *value.at(local, column) += shift * entry;
                     if let Some(slope) = &mut slope {
                         *slope.at(local, column) += entry;
@@ -374,6 +372,37 @@ mod tests {
             }
         }
         [mass, stiffness].map(|triplets| SparseMatrix::try_new_from_triplets(n, n, &triplets).unwrap())
+    }
+
+    /// Entries that one triangle stores and the other does not, which must be 0 within the tolerance of symmetry.
+    #[test]
+    fn entries_of_one_triangle_alone_change_nothing() {
+        let [mass, stiffness] = cube(6);
+        let n = mass.nrows();
+        let alone = |matrix: &SparseMatrix, value: f64| {
+            let view = matrix.as_ref();
+            let stored = (0..n).flat_map(|column| {
+                view.row_idx_of_col(column)
+                    .zip(view.val_of_col(column))
+                    .map(move |(row, v)| Triplet::new(row, column, *v))
+            });
+            let far =
+                (0..n).flat_map(|i| [Triplet::new(i, (5 * i + 90) % n, value), Triplet::new(i, n - 1 - i, value)]);
+            SparseMatrix::try_new_from_triplets(n, n, &stored.chain(far).collect::<Vec<_>>()).unwrap()
+        };
+        let solved = |mass: &SparseMatrix, stiffness: &SparseMatrix| {
+            let pencil = Pencil::new("cube", mass, stiffness).unwrap();
+            let mut x = Mat::<f64>::ones(n, 1);
+            pencil.llt(3.0).unwrap().unwrap().solve(x.as_mut());
+            (x, pencil.count_below(150.0).unwrap())
+        };
+        let (expected, count) = solved(&mass, &stiffness);
+        assert!(0 < count && count < n);
+        for value in [0.0, 1e-11] {
+            let (found, counted) = solved(&alone(&mass, 0.0), &alone(&stiffness, value));
+            assert!((found - &expected).norm_max() < 1e-10 * expected.norm_max());
+            assert_eq!(counted, count);
+        }
     }
 
     /// The matrix and its derivative condensed to the last rows, against dense elimination.

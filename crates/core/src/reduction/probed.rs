@@ -3,7 +3,8 @@
 use faer::{Mat, MatRef};
 
 use super::ReductionError;
-use super::fronts::{Border, Broken, Condensed};
+use super::front_blocks::Broken;
+use super::fronts::{Border, Condensed};
 use super::krylov::random_block;
 use super::pencil::{Llt, Pencil};
 use super::sparse::{one_norm, symmetric_times};
