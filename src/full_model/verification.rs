@@ -189,7 +189,8 @@ pub fn verify_against(
     };
     let places = if against.windows { places(rig) } else { vec![] };
     let compared = Compared { rig, full, judged, options };
-    let mut both = |solvers: &mut [FullSolver<'_>]| -> Result<_, VerificationError> {
+    let threads = threads_for(held_out.len().max(places.len()));
+    let (points, of_places) = full_solver.for_threads(threads, VerificationError::is_of_memory, |solvers| {
         let mut workers: Vec<_> =
             solvers.iter_mut().map(|full| Solvers { full, reduced: Solver::new(rig.model.dimension()) }).collect();
         let mut report = |(what, step): (String, FullProgress)| progress(&what, step);
@@ -202,14 +203,7 @@ pub fn verify_against(
             compared.windows(solvers, p, &mut |step| report((what.clone(), step)))
         })?;
         Ok((points, windows))
-    };
-    let mut solvers = full_solver.for_threads(threads_for(held_out.len().max(places.len())));
-    let at_once = if solvers.is_empty() { None } else { Some(both(&mut solvers)) };
-    let (points, of_places) = match at_once {
-        Some(found) if !found.as_ref().is_err_and(VerificationError::is_of_memory) => found?,
-        // One thread has all of the memory.
-        Some(_) | None => both(std::slice::from_mut(full_solver))?,
-    };
+    })?;
     let (mut windows, mut critical, mut missed, mut invented) = (vec![], None::<f64>, 0, 0);
     for (p, compared) in places.iter().zip(&of_places) {
         if !compared.pairs.is_empty() {

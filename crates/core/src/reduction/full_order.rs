@@ -110,21 +110,36 @@ impl<'a> FullSolver<'a> {
         Ok(solver)
     }
 
-    /// Solvers of the same model for `threads` threads, each with an equal share of the memory. None where factors are kept,
-    /// which threads cannot share, or are made by a foreign engine, whose ranks need the processors.
-    pub fn for_threads(&self, threads: usize) -> Vec<Self> {
-        let count = if threads < 2 || self.has_parts() || self.engine.foreign() { 0 } else { threads };
-        let solver = |_| Self {
-            engine: self.engine,
-            what: self.what.clone(),
-            model: self.model,
-            parts: None,
-            kept: vec![],
-            memory_limit_bytes: self.memory_limit_bytes.map(|limit| limit / threads),
-            elsewhere_bytes: self.elsewhere_bytes,
-            most_kept: 1,
-        };
-        (0..count).map(solver).collect()
+    /// Calls `work` with a solver for each of up to `threads` threads, which share the memory equally, and, where that is
+    /// too little as `is_of_memory` tells of an error, again with this solver alone. At once with this one where factors
+    /// are kept, which threads cannot share, or are made by a foreign engine, whose ranks need the processors.
+    ///
+    /// # Errors
+    /// Those of `work`.
+    pub fn for_threads<R, E>(
+        &mut self,
+        threads: usize,
+        is_of_memory: impl Fn(&E) -> bool,
+        mut work: impl FnMut(&mut [Self]) -> Result<R, E>,
+    ) -> Result<R, E> {
+        if threads > 1 && !self.has_parts() && !self.engine.foreign() {
+            let solver = |_| Self {
+                engine: self.engine,
+                what: self.what.clone(),
+                model: self.model,
+                parts: None,
+                kept: vec![],
+                memory_limit_bytes: self.memory_limit_bytes.map(|limit| limit / threads),
+                elsewhere_bytes: self.elsewhere_bytes,
+                most_kept: 1,
+            };
+            let mut solvers: Vec<Self> = (0..threads).map(solver).collect();
+            let found = work(&mut solvers);
+            if !found.as_ref().is_err_and(is_of_memory) {
+                return found;
+            }
+        }
+        work(std::slice::from_mut(self))
     }
 
     /// Counts `bytes`, allocated by the caller since the solver was made, towards the memory limit from now on.

@@ -43,11 +43,11 @@ use faer::Mat;
 use super::full_model::{FullModel, Projected};
 use super::matching::{RootMatch, match_roots};
 use super::pencil::Pencil;
-use super::{FullSolver, FullVectors, ReductionError};
-use crate::physics::{Model, OperatingPoint, Vectors};
+use super::{FullSolver, FullVectors, ReductionError, on_threads, threads_for};
+use crate::physics::{Model, OperatingPoint, Solver, Vectors};
 use metric::Metric;
 pub use request::{ParametricRequest, ParametricStep};
-use sampling::{BAND_MARGIN, Building, comparable, comparable_of};
+use sampling::{BAND_MARGIN, Building, comparable, comparable_of, solve_failed};
 
 /// Largest number of rounds of validation.
 const MOST_ROUNDS: usize = 4;
@@ -171,19 +171,26 @@ impl Building<'_, '_> {
         points: &[OperatingPoint],
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<Vec<HeldOut>, ReductionError> {
-        let band_rad_s = BAND_MARGIN * self.request.counted.band_rad_s;
-        let mut held_out = vec![];
-        for &point in points {
-            let report = &mut |step| progress(ParametricStep::Solving(step));
-            let full = self.solver.roots(&point, band_rad_s, FullVectors::None, report)?;
-            let roots = comparable(full.roots.iter().map(|root| root.lambda));
-            let reduced = comparable_of(&self.solve(model, &point, Vectors::None)?);
-            let comparison = match_roots(&roots, &reduced, self.request.counted);
-            let (done, of, worst) = (held_out.len() + 1, points.len(), comparison.worst());
-            progress(ParametricStep::HeldOut { point, worst, done, of });
-            held_out.push(HeldOut { point, comparison });
-        }
-        Ok(held_out)
+        let counted = self.request.counted;
+        let held = size_of::<f64>() * self.full.dimension() * (self.span.ncols() + model.dimension());
+        let (most_roots, of) = (self.most_roots, points.len());
+        let points: Vec<(usize, OperatingPoint)> = points.iter().copied().enumerate().collect();
+        let is_of_memory = |error: &ReductionError| matches!(error, ReductionError::Memory { .. });
+        self.solver.for_threads(threads_for(of), is_of_memory, |solvers| {
+            for solver in &mut *solvers {
+                solver.make_room(FullVectors::None, most_roots, held, 0)?;
+            }
+            on_threads(solvers, &points, progress, &|solver, &(index, point), report| {
+                let solving = &mut |step| report(ParametricStep::Solving(step));
+                let full = solver.roots(&point, BAND_MARGIN * counted.band_rad_s, FullVectors::None, solving)?;
+                let roots = comparable(full.roots.iter().map(|root| root.lambda));
+                let reduced =
+                    Solver::new(model.dimension()).solve(model, &point, Vectors::None).map_err(solve_failed)?;
+                let comparison = match_roots(&roots, &comparable_of(&reduced), counted);
+                report(ParametricStep::HeldOut { point, worst: comparison.worst(), done: index + 1, of });
+                Ok(HeldOut { point, comparison })
+            })
+        })
     }
 }
 
@@ -199,7 +206,7 @@ mod tests {
 
     use super::super::{Counted, OperatingBox, SparseMatrix};
     use super::*;
-    use crate::physics::{ContactLaw, Solver};
+    use crate::physics::ContactLaw;
     use crate::reduction::PartTurning;
     use crate::reduction::test_models::chains;
 

@@ -56,10 +56,6 @@ impl Building<'_, '_> {
         projected.model(self.full.contact_law).map_err(|error| solve_failed(error.into()))
     }
 
-    pub fn solve(&self, model: &Model, p: &OperatingPoint, vectors: Vectors) -> Result<Spectrum, ReductionError> {
-        Solver::new(model.dimension()).solve(model, p, vectors).map_err(solve_failed)
-    }
-
     /// Checks the memory limit for one more sample; returns the bytes needed in all.
     ///
     /// A sample adds four columns per root: real and imaginary parts of the right and the left vector. During a solve
