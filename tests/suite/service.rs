@@ -7,6 +7,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use squealcast::recording::message::Payload;
+use squealcast::recording::reader::{Entry, Recording};
 
 use crate::domain::Domain;
 use crate::program::{self, PATIENCE, Running, folder, run, text};
@@ -59,10 +60,10 @@ fn node(file: &Path, folder: &Path, watchdog: Duration) -> Command {
     command
 }
 
-/// The settings that a recording holds, in order, after those of its start.
-fn changed_settings(folder: &Path) -> Vec<(String, f64)> {
+/// The settings in the recordings that `open` reads from a folder, in order, after those of their start.
+fn changed_settings(folder: &Path, open: impl Fn(&Path) -> Vec<Entry>) -> Vec<(String, f64)> {
     let sessions = fs::read_dir(folder).expect("recorded").map(|entry| entry.expect("a session").path());
-    let entries: Vec<_> = sessions.flat_map(|session| read(&session)).collect();
+    let entries: Vec<_> = sessions.flat_map(|session| open(&session)).collect();
     let settings = entries.iter().filter_map(|entry| match known(entry) {
         Some(Payload::SessionEvent(event)) if !event.name.is_empty() => Some((event.name.clone(), event.value)),
         _ => None,
@@ -111,6 +112,11 @@ fn a_configuration_is_read_again_at_sighup() {
     assert_eq!(client.get("warn_margin"), 0.2);
     // A value that a peer has set gives way to the file's.
     assert_eq!(client.set("warn_margin", 0.4), Ok(()));
+    // The ROS 2 side answers before the node has it.
+    let so_far = |session: &Path| Recording::open(session).map_or(vec![], |recording| recording.messages().collect());
+    program::until("the node has the peer's value", || {
+        changed_settings(&records, so_far).last().is_some_and(|(_, value)| *value == 0.4)
+    });
     reload();
     program::until("ROS 2 has the file's value again", || client.get("warn_margin") == 0.2);
     let ended = running.signal("TERM").exits(0);
@@ -141,7 +147,7 @@ fn a_configuration_is_read_again_at_sighup() {
         ("warn_margin", 0.4),
         ("warn_margin", 0.2),
     ];
-    assert_eq!(changed_settings(&records), expected.map(|(name, value)| (name.to_owned(), value)));
+    assert_eq!(changed_settings(&records, read), expected.map(|(name, value)| (name.to_owned(), value)));
 }
 
 #[test]
