@@ -74,7 +74,7 @@ impl<'a> Parts<'a> {
     pub(super) fn at(&self, square: f64) -> Result<Shifted, ReductionError> {
         let mut parts = vec![];
         for (index, pencil) in self.pencils.iter().enumerate() {
-            parts.push(PartFactor::new(pencil.ldlt(square)?, self.offsets[index], self.touched[index].len()));
+            parts.push(PartFactor::new(pencil.ldlt(-square)?, self.offsets[index], self.touched[index].len()));
         }
         Ok(Shifted { square, parts })
     }
@@ -235,7 +235,7 @@ where
         for (part, right) in self.shifted.parts.iter().zip(&self.right) {
             let (order, n) = (part.ldlt.order(), part.pivots.len());
             let mut z = Mat::from_fn(n, real, |i, j| component(b[(part.offset + order[i], j % columns)], j));
-            part.ldlt.forward(&mut z);
+            part.ldlt.triangle().forward(z.as_mut());
             let touched = part.last.nrows();
             let mut x = Mat::from_fn(touched, real, |i, j| z[(part.first() + i, j)] / part.pivots[part.first() + i]);
             solve_unit_upper_triangular_in_place(part.last.transpose(), x.as_mut(), Par::Seq);
@@ -266,7 +266,7 @@ where
             for j in 0..real {
                 z.col_as_slice_mut(j).iter_mut().zip(&part.pivots).for_each(|(value, pivot)| *value /= pivot);
             }
-            part.ldlt.backward(&mut z);
+            part.ldlt.triangle().backward(z.as_mut());
             for j in 0..columns {
                 for (i, &row) in order.iter().enumerate() {
                     let im = if T::REAL { 0.0 } else { z[(i, columns + j)] };

@@ -9,7 +9,7 @@ use faer::linalg::triangular_solve::{
 use faer::linalg::{cholesky::ldlt, cholesky::llt};
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 
-use super::threads::shared;
+use super::threads::{row_blocks, shared};
 
 /// Number of columns of a block of a front.
 const BLOCK: usize = 192;
@@ -42,7 +42,7 @@ pub(super) fn positive(mut panel: MatMut<'_, f64>, parallel: bool) -> Result<(),
         )
         .map_err(|_| Broken::Indefinite)?;
         let top = top.as_ref();
-        shared(row_blocks(below.as_mut()), parallel, |rows: MatMut<'_, f64>| {
+        shared(row_blocks(below.as_mut(), BLOCK), parallel, |(_, rows): (usize, MatMut<'_, f64>)| {
             solve_lower_triangular_in_place(top, rows.transpose_mut(), Par::Seq);
         });
         let below = below.as_ref();
@@ -84,7 +84,7 @@ pub(super) fn signed(mut panel: MatMut<'_, f64>, update: MatMut<'_, f64>, parall
         negative += pivots.iter().filter(|pivot| **pivot < 0.0).count();
         let product = scaled.submatrix_mut(first + width, first, height - first - width, width);
         // `L₂₁ D` is kept beside `L₂₁`.
-        let pairs = row_blocks(below.as_mut()).into_iter().zip(row_blocks(product)).collect();
+        let pairs = blocks_of_two(below.as_mut(), product);
         shared(pairs, parallel, |(mut rows, mut product): (MatMut<'_, f64>, MatMut<'_, f64>)| {
             solve_unit_lower_triangular_in_place(top, rows.as_mut().transpose_mut(), Par::Seq);
             product.copy_from(rows.as_ref());
@@ -118,7 +118,7 @@ pub(super) fn differentiate(
     let of_top = Mat::from_fn(columns, columns, |i, j| slope[(i.max(j), i.min(j))]);
     let mut g = below.to_owned();
     let mut z = slope.subrows(columns, remaining).to_owned();
-    let pairs = row_blocks(g.as_mut()).into_iter().zip(row_blocks(z.as_mut())).collect();
+    let pairs = blocks_of_two(g.as_mut(), z.as_mut());
     shared(pairs, parallel, |(mut g, z): (MatMut<'_, f64>, MatMut<'_, f64>)| {
         solve_upper_triangular_in_place(top.transpose(), g.as_mut().transpose_mut(), Par::Seq);
         matmul(z, Accum::Add, g.as_ref(), of_top.as_ref(), -0.5, Par::Seq);
@@ -127,18 +127,10 @@ pub(super) fn differentiate(
     subtract_lower(update, &[(g, z), (z, g)], parallel);
 }
 
-/// Divides a matrix into blocks of rows.
-fn row_blocks(mut matrix: MatMut<'_, f64>) -> Vec<MatMut<'_, f64>> {
-    let mut blocks = vec![];
-    while matrix.nrows() > 0 {
-        let (block, rest) = {
-            let at = BLOCK.min(matrix.nrows());
-            matrix.split_at_row_mut(at)
-        };
-        blocks.push(block);
-        matrix = rest;
-    }
-    blocks
+/// Divides two matrices into the same blocks of rows.
+fn blocks_of_two<'m>(a: MatMut<'m, f64>, b: MatMut<'m, f64>) -> Vec<(MatMut<'m, f64>, MatMut<'m, f64>)> {
+    let blocks = row_blocks(a, BLOCK).into_iter().zip(row_blocks(b, BLOCK));
+    blocks.map(|((_, a), (_, b))| (a, b)).collect()
 }
 
 /// `U ← U - Σ a bᵀ` in the lower triangle of a square matrix, or of the first columns of one.

@@ -41,12 +41,14 @@ pub(super) struct Condensed {
     pub(super) slope: Mat<f64>,
 }
 
-/// A matrix `K + s M` with the structure of its factor.
+/// A matrix `K + s M` with the structure of its factor. `K` is called `matrix`, since the mass matrix may stand for it.
 pub(super) struct Fronts<'a> {
-    pub(super) stiffness: &'a SparseMatrix,
+    pub(super) matrix: &'a SparseMatrix,
     pub(super) mass: &'a SparseMatrix,
     pub(super) shift: f64,
     pub(super) supernodes: &'a SymbolicSupernodalCholesky<usize>,
+    /// The tree of all supernodes.
+    pub(super) tree: &'a Tree,
     /// The row eliminated at each position, and the position of each row.
     pub(super) order: (&'a [usize], &'a [usize]),
 }
@@ -98,23 +100,30 @@ struct Sweep<'a, 'f> {
 }
 
 impl Fronts<'_> {
-    /// Fills `values` with the factor `L` in the layout of the supernodes.
+    /// Fills `values` with the factor `L` of `L Lᵀ` in the layout of the supernodes.
     pub(super) fn cholesky(&self, values: &mut [f64]) -> Result<(), Broken> {
-        let tree = Tree::new(self.supernodes, self.supernodes.n_supernodes(), 0);
-        let mut rest = values;
-        let mut of_supernode = vec![];
-        for ends in self.supernodes.col_ptr_for_val().windows(2) {
-            let (mine, others) = std::mem::take(&mut rest).split_at_mut(ends[1] - ends[0]);
-            of_supernode.push(Mutex::new(mine));
-            rest = others;
-        }
-        self.sweep(&tree, Pivots::Positive, None, Some(of_supernode)).map(|_| ())
+        self.sweep(self.tree, Pivots::Positive, None, Some(self.divided(values))).map(|_| ())
+    }
+
+    /// Fills `values` with the factor `L` of `L D Lᵀ` in the layout of the supernodes, `D` on its diagonal.
+    pub(super) fn ldlt(&self, values: &mut [f64]) -> Result<(), Broken> {
+        self.sweep(self.tree, Pivots::Signed, None, Some(self.divided(values))).map(|_| ())
     }
 
     /// The number of negative pivots of `L D Lᵀ`. Nothing of the factor is kept.
     pub(super) fn count_negative(&self) -> Result<usize, Broken> {
-        let tree = Tree::new(self.supernodes, self.supernodes.n_supernodes(), 0);
-        Ok(self.sweep(&tree, Pivots::Signed, None, None)?.0)
+        Ok(self.sweep(self.tree, Pivots::Signed, None, None)?.0)
+    }
+
+    /// The parts of `values` that belong to each supernode.
+    fn divided<'v>(&self, values: &'v mut [f64]) -> Vec<Mutex<&'v mut [f64]>> {
+        let mut rest = values;
+        let part = |ends: &[usize]| {
+            let (mine, others) = std::mem::take(&mut rest).split_at_mut(ends[1] - ends[0]);
+            rest = others;
+            Mutex::new(mine)
+        };
+        self.supernodes.col_ptr_for_val().windows(2).map(part).collect()
     }
 
     /// Eliminates all but the `last` rows of `[A B; Bᵀ 0]`, with the derivative by `s`. Nothing of the factor is kept.
@@ -280,16 +289,16 @@ impl<'a, 'f> Sweep<'a, 'f> {
         value: &mut Lower<'_>,
         mut slope: Option<&mut Lower<'_>>,
     ) {
-        let Fronts { stiffness, mass, shift, order: (forward, inverse), supernodes: _ } = *self.fronts;
+        let Fronts { matrix, mass, shift, order: (forward, inverse), supernodes: _, tree: _ } = *self.fronts;
         let through = if last { forward.len() } else { shape.start + shape.columns };
         for position in shape.start..through {
             let (row, column) = (forward[position], place[position] as usize);
-            let (stiffness, mass) = (stiffness.as_ref(), mass.as_ref());
+            let (matrix, mass) = (matrix.as_ref(), mass.as_ref());
             let below = |other: usize| {
                 let local = place[inverse[other]];
                 (inverse[other] >= position && local != ABSENT).then_some(local as usize)
             };
-            for (other, entry) in stiffness.row_idx_of_col(row).zip(stiffness.val_of_col(row)) {
+            for (other, entry) in matrix.row_idx_of_col(row).zip(matrix.val_of_col(row)) {
                 if let Some(local) = below(other) {
                     *value.at(local, column) += entry;
                 }
@@ -346,14 +355,14 @@ impl Lower<'_> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::super::pencil::Pencil;
     use super::*;
     use faer::linalg::solvers::Solve;
     use faer::sparse::Triplet;
 
     /// A cube of `side³` masses with springs between neighbours along its edges and diagonals, held at one corner.
-    fn cube(side: usize) -> [SparseMatrix; 2] {
+    pub(in crate::reduction) fn cube(side: usize) -> [SparseMatrix; 2] {
         let at = |x: usize, y: usize, z: usize| (x * side + y) * side + z;
         let n = side * side * side;
         let (mut mass, mut stiffness) = (vec![], vec![Triplet::new(0, 0, 10.0)]);

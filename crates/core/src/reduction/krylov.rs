@@ -1,14 +1,19 @@
 //! What the Lanczos and the Krylov-Schur iteration share: an orthonormal basis `V` that grows by blocks, the
 //! orthogonalisation of new vectors against it, and its replacement by linear combinations of its vectors.
 
+use std::convert::Infallible;
+
 use faer::traits::ComplexField;
-use faer::{Mat, MatRef, c64};
+use faer::{Mat, MatMut, MatRef, c64};
 
 use super::ReductionError;
 use super::dense::symmetric_eigen;
+use super::threads::{on_threads, row_blocks, shared, threads_for};
 
-/// Number of rows of a basis recombined at a time, which bounds the memory taken besides the basis.
+/// Number of rows of a basis worked on at a time, which bounds the memory taken besides the basis.
 const ROWS_TOGETHER: usize = 4096;
+/// Number of entries of a basis below which threads do not share an orthogonalisation.
+const DIVIDED: usize = 1 << 22;
 
 /// Scalar type of a basis: real or complex.
 pub(super) trait Number: ComplexField<Real = f64> + Copy + std::ops::Mul<Output = Self> {
@@ -101,8 +106,20 @@ impl<T: Number> Basis<T> {
     /// Orthogonalises vectors against the basis from column `from` on; returns the coefficients.
     pub(super) fn make_orthogonal(&self, vectors: &mut Mat<T>, from: usize) -> Mat<T> {
         let held = self.vectors.subcols(from, self.size - from);
-        let coefficients = T::inner(held, vectors.as_ref());
-        *vectors -= T::product(held, coefficients.as_ref());
+        let n = held.nrows();
+        let firsts: Vec<usize> = (0..n).step_by(ROWS_TOGETHER).collect();
+        let parallel = n * held.ncols() >= DIVIDED;
+        let mut threads = vec![(); if parallel { threads_for(firsts.len()) } else { 1 }];
+        let products = on_threads(&mut threads, &firsts, &mut |()| (), &|(), &first, _| {
+            let rows = ROWS_TOGETHER.min(n - first);
+            Ok::<_, Infallible>(T::inner(held.subrows(first, rows), vectors.subrows(first, rows)))
+        });
+        let Ok(products) = products;
+        let zero = Mat::zeros(held.ncols(), vectors.ncols());
+        let coefficients = products.into_iter().fold(zero, |sum, product| sum + product);
+        shared(row_blocks(vectors.as_mut(), ROWS_TOGETHER), parallel, |(first, mut rows): (usize, MatMut<'_, T>)| {
+            rows -= T::product(held.subrows(first, rows.nrows()), coefficients.as_ref());
+        });
         coefficients
     }
 
@@ -120,11 +137,12 @@ impl<T: Number> Basis<T> {
 
     /// Replaces the basis by `V S`; the columns of `S` are orthonormal, and at most as many as the vectors.
     pub(super) fn recombine(&mut self, s: MatRef<'_, T>) {
-        for first in (0..self.vectors.nrows()).step_by(ROWS_TOGETHER) {
-            let rows = ROWS_TOGETHER.min(self.vectors.nrows() - first);
-            let recombined = T::product(self.vectors.submatrix(first, 0, rows, self.size), s);
-            self.vectors.submatrix_mut(first, 0, rows, s.ncols()).copy_from(&recombined);
-        }
+        let vectors = self.vectors.subcols_mut(0, self.size);
+        let parallel = vectors.nrows() * vectors.ncols() >= DIVIDED;
+        shared(row_blocks(vectors, ROWS_TOGETHER), parallel, |(_, rows): (usize, MatMut<'_, T>)| {
+            let recombined = T::product(rows.as_ref(), s);
+            rows.subcols_mut(0, s.ncols()).copy_from(&recombined);
+        });
         self.size = s.ncols();
     }
 
@@ -132,12 +150,13 @@ impl<T: Number> Basis<T> {
     pub(super) fn combined(&self, s: MatRef<'_, c64>) -> Mat<c64> {
         let n = self.vectors.nrows();
         let mut vectors = Mat::zeros(n, s.ncols());
-        for first in (0..n).step_by(ROWS_TOGETHER) {
-            let rows = ROWS_TOGETHER.min(n - first);
-            let part = self.vectors.submatrix(first, 0, rows, self.size);
-            let part = Mat::from_fn(rows, self.size, |i, j| part[(i, j)].complex());
-            vectors.subrows_mut(first, rows).copy_from(part * s);
-        }
+        let parallel = n * self.size >= DIVIDED;
+        let blocks = row_blocks(vectors.as_mut(), ROWS_TOGETHER);
+        shared(blocks, parallel, |(first, mut rows): (usize, MatMut<'_, c64>)| {
+            let part = self.vectors.submatrix(first, 0, rows.nrows(), self.size);
+            let part = Mat::from_fn(rows.nrows(), self.size, |i, j| part[(i, j)].complex());
+            rows.copy_from(part * s);
+        });
         vectors
     }
 

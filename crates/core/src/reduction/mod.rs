@@ -57,6 +57,7 @@ mod schur;
 mod sparse;
 mod static_response;
 mod threads;
+mod triangle;
 
 mod substructures;
 #[cfg(test)]

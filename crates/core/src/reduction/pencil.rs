@@ -2,28 +2,23 @@
 
 use std::sync::Arc;
 
-use faer::dyn_stack::{MemBuffer, MemStack};
-use faer::linalg::matmul::matmul;
-use faer::linalg::triangular_solve::{solve_unit_lower_triangular_in_place, solve_unit_upper_triangular_in_place};
 use faer::perm::Perm;
+use faer::sparse::SymbolicSparseColMat;
 use faer::sparse::linalg::SupernodalThreshold;
-use faer::sparse::linalg::cholesky::supernodal::{SupernodalLdltRef, SupernodalLltRef, SymbolicSupernodalCholesky};
+use faer::sparse::linalg::cholesky::supernodal::{SupernodalLdltRef, SymbolicSupernodalCholesky};
 use faer::sparse::linalg::cholesky::{
-    CholeskySymbolicParams, LltRef, SymbolicCholesky, SymbolicCholeskyRaw, SymmetricOrdering,
-    factorize_symbolic_cholesky,
+    CholeskySymbolicParams, SymbolicCholesky, SymbolicCholeskyRaw, SymmetricOrdering, factorize_symbolic_cholesky,
 };
-use faer::sparse::{SparseColMat, SparseColMatRef, SymbolicSparseColMat};
-use faer::{Accum, Conj, Mat, MatMut, Par, Side};
+use faer::{Mat, MatMut, Side};
 
+use super::elimination_tree::Tree;
 use super::fronts::Fronts;
 use super::krylov::random_block;
 use super::ordering::nested_dissection;
 use super::sparse::{entries, symmetric_times, worst_asymmetry};
-use super::threads::shared;
+use super::triangle::Triangle;
 use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
 
-/// Largest number of columns that a thread solves at a time.
-const SOLVED_TOGETHER: usize = 8;
 /// Upper limit of the shifts to try, relative to `tr K / tr M`.
 const LARGEST_SHIFT: f64 = 1e5;
 /// Number of Lanczos steps to estimate the smallest eigenvalue of a scaled mass matrix.
@@ -32,7 +27,7 @@ const MASS_STEPS: usize = 40;
 /// factorisation.
 const CLEARLY_DEFINITE: f64 = 1e-3;
 
-/// A symmetric pencil `K - σ M`: the lower triangles on a common pattern, ordered and symbolically analysed.
+/// A symmetric pencil `K - σ M`, ordered and symbolically analysed.
 pub struct Pencil<'a> {
     /// Names the system in errors.
     pub what: &'a str,
@@ -40,10 +35,8 @@ pub struct Pencil<'a> {
     pub mass: &'a SparseMatrix,
     /// `K`, N/m, both triangles.
     pub stiffness: &'a SparseMatrix,
-    pattern: SymbolicSparseColMat<usize>,
-    lower_mass: Vec<f64>,
-    lower_stiffness: Vec<f64>,
-    pub(super) symbolic: Arc<SymbolicCholesky<usize>>,
+    symbolic: Arc<SymbolicCholesky<usize>>,
+    tree: Arc<Tree>,
 }
 
 impl<'a> Pencil<'a> {
@@ -68,15 +61,8 @@ impl<'a> Pencil<'a> {
         check("mass", what, mass, n)?;
         check("stiffness", what, stiffness, n)?;
         let (mut starts, mut rows) = (vec![0], vec![]);
-        let (mut lower_mass, mut lower_stiffness) = (vec![], vec![]);
         for column in 0..n {
-            merge(mass, stiffness, column, |row, m, k| {
-                if row >= column {
-                    rows.push(row);
-                    lower_mass.push(m);
-                    lower_stiffness.push(k);
-                }
-            });
+            merge(mass, stiffness, column, |row| rows.extend((row >= column).then_some(row)));
             starts.push(rows.len());
         }
         let pattern = SymbolicSparseColMat::new_checked(n, n, starts, None, rows);
@@ -92,8 +78,9 @@ impl<'a> Pencil<'a> {
             },
         )
         .map_err(|error| failed(format!("symbolic analysis failed: {error:?}")))?;
-        let symbolic = Arc::new(symbolic);
-        let pencil = Self { what, mass, stiffness, pattern, lower_mass, lower_stiffness, symbolic };
+        let supernodes = supernodal(&symbolic);
+        let tree = Arc::new(Tree::new(supernodes, supernodes.n_supernodes(), 0));
+        let pencil = Self { what, mass, stiffness, symbolic: Arc::new(symbolic), tree };
         pencil.check_mass()?;
         Ok(pencil)
     }
@@ -125,15 +112,11 @@ impl<'a> Pencil<'a> {
         self.symbolic.len_val()
     }
 
-    /// Bytes held after the analysis in addition to the two given matrices: their lower triangles and the symbolic
-    /// factor.
+    /// Bytes held after the analysis in addition to the two given matrices: the symbolic factor.
     pub(super) fn held_bytes(&self) -> usize {
-        let (index, float) = (size_of::<usize>(), size_of::<f64>());
-        let supernodes = supernodal(&self.symbolic);
         // Row indices of the supernodes, by columns and by rows; the permutation and its inverse; offsets of columns
         // and supernodes.
-        let analysis = 2 * supernodes.row_idx().len() + 6 * self.dimension();
-        (index + 2 * float) * self.lower_mass.len() + index * analysis
+        size_of::<usize>() * (2 * supernodal(&self.symbolic).row_idx().len() + 6 * self.dimension())
     }
 
     /// Bytes of one factor.
@@ -141,11 +124,9 @@ impl<'a> Pencil<'a> {
         size_of::<f64>() * self.factor_entries()
     }
 
-    /// Additional bytes needed while a factor is computed: the shifted matrix and the workspace of faer.
+    /// Additional bytes needed while a factor is computed: the fronts.
     pub(super) fn factoring_bytes(&self) -> usize {
-        let ldlt = self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default());
-        let fronts = Fronts::bytes(supernodal(&self.symbolic), 0, false);
-        fronts.max(size_of::<f64>() * self.lower_mass.len() + ldlt.size_bytes())
+        Fronts::bytes(supernodal(&self.symbolic), 0, false)
     }
 
     /// Bytes needed to condense to the last rows with a border of `border` columns.
@@ -153,15 +134,14 @@ impl<'a> Pencil<'a> {
         Fronts::bytes(supernodal(&self.symbolic), border, true)
     }
 
-    /// The lower triangle of `k K + m M`.
-    fn sum(&self, k: f64, m: f64) -> Vec<f64> {
-        self.lower_stiffness.iter().zip(&self.lower_mass).map(|(stiffness, mass)| k * stiffness + m * mass).collect()
-    }
-
     /// `K + s M`, to be eliminated front by front.
     pub(super) fn fronts(&self, shift: f64) -> Fronts<'_> {
+        self.fronts_of(self.stiffness, shift)
+    }
+
+    fn fronts_of<'f>(&'f self, matrix: &'f SparseMatrix, shift: f64) -> Fronts<'f> {
         let order = self.symbolic.perm().expect("a permutation was given").arrays();
-        Fronts { stiffness: self.stiffness, mass: self.mass, shift, supernodes: supernodal(&self.symbolic), order }
+        Fronts { matrix, mass: self.mass, shift, supernodes: supernodal(&self.symbolic), tree: &self.tree, order }
     }
 
     /// Number of `ω²` below `square`, rad²/s²: the number of negative pivots of `K - σ M = L D Lᵀ` (Sylvester's law of
@@ -174,34 +154,15 @@ impl<'a> Pencil<'a> {
         self.failed("a pivot is 0 or not finite".to_owned())
     }
 
-    /// Factorises `P (K - σ M) Pᵀ = L D Lᵀ` with `σ = square`. There is no numerical pivoting, so callers must check
-    /// the accuracy of solves.
-    pub(super) fn ldlt(&self, square: f64) -> Result<Ldlt, ReductionError> {
-        self.factor_ldlt(&self.sum(1.0, -square))
-    }
-
-    fn factor_ldlt(&self, lower: &[f64]) -> Result<Ldlt, ReductionError> {
+    /// The factor `L D Lᵀ` of a matrix on the pattern of the pencil, not probed.
+    pub(super) fn factored(&self, fronts: &Fronts<'_>) -> Result<Ldlt, ReductionError> {
         let mut values = self.room(self.symbolic.len_val())?;
-        let mut memory =
-            MemBuffer::new(self.symbolic.factorize_numeric_ldlt_scratch::<f64>(Par::Seq, Default::default()));
-        self.symbolic
-            .factorize_numeric_ldlt(
-                &mut values,
-                SparseColMatRef::new(self.pattern.as_ref(), lower),
-                Side::Lower,
-                Default::default(),
-                Par::Seq,
-                MemStack::new(&mut memory),
-                Default::default(),
-            )
-            .map_err(|error| self.failed(format!("L D Lᵀ met a zero pivot: {error:?}")))?;
-        Ok(Ldlt { symbolic: self.symbolic.clone(), values })
-    }
-
-    /// The pivots of `L D Lᵀ`, each with its row.
-    fn pivots(&self, lower: &[f64]) -> Result<Vec<(usize, f64)>, ReductionError> {
-        let factor = self.factor_ldlt(lower)?;
-        Ok(forward(&self.symbolic).iter().copied().zip(factor.pivots()).collect())
+        fronts.ldlt(&mut values).map_err(|_| self.broken())?;
+        #[cfg(test)]
+        if crate::spoil::spoilt(crate::spoil::Spoil::Factor) {
+            values[1] *= 1.0 + 1e-6;
+        }
+        Ok(Ldlt { symbolic: self.symbolic.clone(), tree: self.tree.clone(), values })
     }
 
     /// Checks that `M` is positive semidefinite with a positive diagonal. The mass matrix of a mesh, scaled to a unit
@@ -218,13 +179,15 @@ impl<'a> Pencil<'a> {
         if smallest_scaled(self.mass, &diagonal).is_some_and(|smallest| smallest > CLEARLY_DEFINITE) {
             return Ok(());
         }
-        let mut raised = self.sum(0.0, 1.0);
-        for (column, &start) in self.pattern.col_ptr()[..self.dimension()].iter().enumerate() {
-            // The first entry of a column of the lower triangle is its diagonal.
-            raised[start] += SEMIDEFINITE_TOLERANCE * diagonal[column];
+        let mut raised = self.mass.clone();
+        for (row, value) in diagonal.iter().enumerate() {
+            if let Some(entry) = raised.get_mut(row, row) {
+                *entry += SEMIDEFINITE_TOLERANCE * value;
+            }
         }
-        match self.pivots(&raised)?.into_iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
-            Some((row, value)) => Err(ReductionError::Indefinite { what, row, value, limit: 0.0 }),
+        let pivots = self.factored(&self.fronts_of(&raised, 0.0))?.pivots();
+        match forward(&self.symbolic).iter().zip(pivots).find(|(_, value)| value.is_nan() || *value <= 0.0) {
+            Some((&row, value)) => Err(ReductionError::Indefinite { what, row, value, limit: 0.0 }),
             None => Ok(()),
         }
     }
@@ -246,52 +209,39 @@ impl<'a> Pencil<'a> {
 
 /// Cholesky factor `P (K + s M) Pᵀ = L Lᵀ`.
 pub(super) struct Llt<'a> {
-    pub(super) symbolic: &'a SymbolicCholesky<usize>,
-    pub(super) values: Vec<f64>,
+    pencil: &'a Pencil<'a>,
+    values: Vec<f64>,
 }
 
-impl Llt<'_> {
-    fn supernodal(&self) -> SupernodalLltRef<'_, usize, f64> {
-        SupernodalLltRef::new(supernodal(self.symbolic), &self.values)
+impl<'a> Llt<'a> {
+    pub(super) fn new(pencil: &'a Pencil<'a>, values: Vec<f64>) -> Self {
+        Self { pencil, values }
     }
 
-    /// Solves for blocks of columns, on all cores; the blocks do not depend on their number.
-    fn in_blocks(&self, rhs: MatMut<'_, f64>, solve: impl Fn(MatMut<'_, f64>, &mut MemStack) + Sync) {
-        let (mut blocks, mut rest) = (vec![], rhs);
-        let width = rest.ncols().div_ceil(rest.ncols().div_ceil(SOLVED_TOGETHER).max(1));
-        while rest.ncols() > 0 {
-            let at = width.min(rest.ncols());
-            let (block, others) = rest.split_at_col_mut(at);
-            blocks.push(block);
-            rest = others;
-        }
-        shared(blocks, true, |block: MatMut<'_, f64>| {
-            let mut memory = MemBuffer::new(self.symbolic.solve_in_place_scratch::<f64>(block.ncols(), Par::Seq));
-            solve(block, MemStack::new(&mut memory));
-        });
+    fn triangle(&self) -> Triangle<'_> {
+        let Pencil { symbolic, tree, .. } = self.pencil;
+        Triangle { supernodes: supernodal(symbolic), tree, values: &self.values, unit: false }
     }
 
     /// `A⁻¹ B` in place.
-    pub(super) fn solve(&self, rhs: MatMut<'_, f64>) {
-        let factor = LltRef::new(self.symbolic, &self.values);
-        self.in_blocks(rhs, |block, stack| factor.solve_in_place_with_conj(Conj::No, block, Par::Seq, stack));
+    pub(super) fn solve(&self, mut rhs: MatMut<'_, f64>) {
+        let x = self.unwhiten(self.whiten(&rhs.to_owned()));
+        rhs.copy_from(x);
     }
 
     /// `L⁻¹ P X`.
     pub(super) fn whiten(&self, x: &Mat<f64>) -> Mat<f64> {
-        let forward = forward(self.symbolic);
+        let forward = forward(&self.pencil.symbolic);
         let mut y = Mat::from_fn(x.nrows(), x.ncols(), |i, j| x[(forward[i], j)]);
-        let factor = self.supernodal();
-        self.in_blocks(y.as_mut(), |block, stack| factor.l_solve_with_conj(Conj::No, block, Par::Seq, stack));
+        self.triangle().forward(y.as_mut());
         y
     }
 
     /// `Pᵀ L⁻ᵀ Y`.
     pub(super) fn unwhiten(&self, mut y: Mat<f64>) -> Mat<f64> {
-        let factor = self.supernodal();
-        self.in_blocks(y.as_mut(), |block, stack| factor.l_transpose_solve_with_conj(Conj::No, block, Par::Seq, stack));
+        self.triangle().backward(y.as_mut());
         let mut x = Mat::zeros(y.nrows(), y.ncols());
-        for (position, &row) in forward(self.symbolic).iter().enumerate() {
+        for (position, &row) in forward(&self.pencil.symbolic).iter().enumerate() {
             for column in 0..y.ncols() {
                 x[(row, column)] = y[(position, column)];
             }
@@ -303,6 +253,7 @@ impl Llt<'_> {
 /// The factor `P (K - σ M) Pᵀ = L D Lᵀ`; vectors are in the order of elimination.
 pub(super) struct Ldlt {
     symbolic: Arc<SymbolicCholesky<usize>>,
+    tree: Arc<Tree>,
     values: Vec<f64>,
 }
 
@@ -345,42 +296,21 @@ impl Ldlt {
         lower
     }
 
-    /// `L⁻¹ Z` in place.
-    pub(super) fn forward(&self, z: &mut Mat<f64>) {
-        let (factor, columns) = (self.supernodal(), z.ncols());
-        let mut below = Mat::<f64>::zeros(0, columns);
-        for s in 0..supernodal(&self.symbolic).n_supernodes() {
-            let node = factor.supernode(s);
-            let (start, block, pattern) = (node.start(), node.val(), node.pattern());
-            let (top, rest) = block.split_at_row(block.ncols());
-            let mut of_node = z.subrows_mut(start, block.ncols());
-            solve_unit_lower_triangular_in_place(top, of_node.as_mut(), Par::Seq);
-            below.resize_with(pattern.len(), columns, |_, _| 0.0);
-            matmul(below.as_mut(), Accum::Replace, rest, of_node.as_ref(), 1.0, Par::Seq);
-            for column in 0..columns {
-                let (from, to) = (below.col_as_slice(column), z.col_as_slice_mut(column));
-                pattern.iter().zip(from).for_each(|(&row, value)| to[row] -= value);
-            }
+    /// `A⁻¹ B` in place.
+    pub(super) fn solve(&self, mut rhs: MatMut<'_, f64>) {
+        let (order, pivots) = (self.order(), self.pivots());
+        let mut z = Mat::from_fn(rhs.nrows(), rhs.ncols(), |i, j| rhs[(order[i], j)]);
+        self.triangle().forward(z.as_mut());
+        z.col_iter_mut().for_each(|column| column.iter_mut().zip(&pivots).for_each(|(value, pivot)| *value /= pivot));
+        self.triangle().backward(z.as_mut());
+        for j in 0..rhs.ncols() {
+            order.iter().enumerate().for_each(|(position, &row)| rhs[(row, j)] = z[(position, j)]);
         }
     }
 
-    /// `L⁻ᵀ Z` in place.
-    pub(super) fn backward(&self, z: &mut Mat<f64>) {
-        let (factor, columns) = (self.supernodal(), z.ncols());
-        let mut below = Mat::<f64>::zeros(0, columns);
-        for s in (0..supernodal(&self.symbolic).n_supernodes()).rev() {
-            let node = factor.supernode(s);
-            let (start, block, pattern) = (node.start(), node.val(), node.pattern());
-            let (top, rest) = block.split_at_row(block.ncols());
-            below.resize_with(pattern.len(), columns, |_, _| 0.0);
-            for column in 0..columns {
-                let (from, to) = (z.col_as_slice(column), below.col_as_slice_mut(column));
-                pattern.iter().zip(to).for_each(|(&row, value)| *value = from[row]);
-            }
-            let mut of_node = z.subrows_mut(start, block.ncols());
-            matmul(of_node.as_mut(), Accum::Add, rest.transpose(), below.as_ref(), -1.0, Par::Seq);
-            solve_unit_upper_triangular_in_place(top.transpose(), of_node, Par::Seq);
-        }
+    /// `L`, to solve with.
+    pub(super) fn triangle(&self) -> Triangle<'_> {
+        Triangle { supernodes: supernodal(&self.symbolic), tree: &self.tree, values: &self.values, unit: true }
     }
 }
 
@@ -396,7 +326,7 @@ fn ordered(mass: &SparseMatrix, stiffness: &SparseMatrix, last: &[usize]) -> Res
     } else {
         let order = nested_dissection(others.len(), &|position, out: &mut Vec<usize>| {
             out.clear();
-            merge(mass, stiffness, others[position], |other, _, _| out.extend(Some(place[other])));
+            merge(mass, stiffness, others[position], |other| out.push(place[other]));
             out.retain(|&other| other != usize::MAX);
         })?;
         order.arrays().0.iter().map(|&position| others[position]).collect()
@@ -436,34 +366,14 @@ fn check(field: &str, what: &str, matrix: &SparseMatrix, n: usize) -> Result<(),
     }
 }
 
-/// Calls `each(row, entry of a, entry of b)` for every row of a column in which either matrix has an entry, in
-/// ascending order.
-fn merge(
-    a: &SparseColMat<usize, f64>,
-    b: &SparseColMat<usize, f64>,
-    column: usize,
-    mut each: impl FnMut(usize, f64, f64),
-) {
-    let (a, b) = (a.as_ref(), b.as_ref());
-    let mut left = a.row_idx_of_col(column).zip(a.val_of_col(column)).peekable();
-    let mut right = b.row_idx_of_col(column).zip(b.val_of_col(column)).peekable();
-    loop {
-        match (left.peek().copied(), right.peek().copied()) {
-            (Some((i, x)), Some((j, y))) if i == j => {
-                each(i, *x, *y);
-                left.next();
-                right.next();
-            }
-            (Some((i, x)), other) if other.is_none_or(|(j, _)| i < j) => {
-                each(i, *x, 0.0);
-                left.next();
-            }
-            (_, Some((j, y))) => {
-                each(j, 0.0, *y);
-                right.next();
-            }
-            (_, None) => return,
-        }
+/// Calls `each(row)` for every row of a column in which either matrix has an entry, in ascending order.
+fn merge(a: &SparseMatrix, b: &SparseMatrix, column: usize, mut each: impl FnMut(usize)) {
+    let mut left = a.as_ref().row_idx_of_col(column).peekable();
+    let mut right = b.as_ref().row_idx_of_col(column).peekable();
+    while let Some(row) = left.peek().into_iter().chain(right.peek()).min().copied() {
+        each(row);
+        left.next_if_eq(&row);
+        right.next_if_eq(&row);
     }
 }
 

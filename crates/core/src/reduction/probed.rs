@@ -1,12 +1,12 @@
 //! Factors of a pencil, and what is left of it after elimination, each probed before it is used: threads share the work.
 
-use faer::{Mat, MatRef};
+use faer::{Mat, MatMut, MatRef};
 
 use super::ReductionError;
 use super::front_blocks::Broken;
 use super::fronts::{Border, Condensed};
 use super::krylov::random_block;
-use super::pencil::{Llt, Pencil};
+use super::pencil::{Ldlt, Llt, Pencil};
 use super::sparse::{one_norm, symmetric_times};
 
 /// Largest `|A x - b|` of the probe of a factor, relative to `|A| |x| + |b|`.
@@ -22,7 +22,7 @@ impl Pencil<'_> {
 
     /// Cholesky factor `K + s M = L Lᵀ`, probed by a solve; `None` if the matrix is not positive definite.
     pub(super) fn llt(&self, shift: f64) -> Result<Option<Llt<'_>>, ReductionError> {
-        let mut values = self.room(self.symbolic.len_val())?;
+        let mut values = self.room(self.factor_entries())?;
         match self.fronts(shift).cholesky(&mut values) {
             Ok(()) => {}
             Err(Broken::Indefinite) => return Ok(None),
@@ -32,10 +32,26 @@ impl Pencil<'_> {
         if crate::spoil::spoilt(crate::spoil::Spoil::Factor) {
             values[0] *= 1.0 + 1e-6;
         }
-        let factor = Llt { symbolic: &self.symbolic, values };
+        let factor = Llt::new(self, values);
+        self.probe(shift, |x| factor.solve(x))?;
+        Ok(Some(factor))
+    }
+
+    /// Factorises `P (K + s M) Pᵀ = L D Lᵀ`, probed by a solve if it is definite. There is no numerical pivoting, so that of
+    /// an indefinite matrix may be less accurate: callers must check their solves.
+    pub(super) fn ldlt(&self, shift: f64) -> Result<Ldlt, ReductionError> {
+        let factor = self.factored(&self.fronts(shift))?;
+        if factor.pivots().iter().all(|pivot| *pivot > 0.0) {
+            self.probe(shift, |x| factor.solve(x))?;
+        }
+        Ok(factor)
+    }
+
+    /// Checks that `solve` solves with `K + s M`.
+    fn probe(&self, shift: f64, solve: impl FnOnce(MatMut<'_, f64>)) -> Result<(), ReductionError> {
         let b = random_block(self.dimension(), 1, 3);
         let mut x = b.clone();
-        factor.solve(x.as_mut());
+        solve(x.as_mut());
         let norm = one_norm(self.stiffness) + shift.abs() * one_norm(self.mass);
         let rest = (self.shifted_times(shift, x.as_ref()) - &b).norm_l2();
         let value = rest / (norm * x.norm_l2() + b.norm_l2());
@@ -44,7 +60,7 @@ impl Pencil<'_> {
                 self.failed(format!("a solve leaves |A x - b| = {value:.1e} of its parts, limit {PROBE_LIMIT:.1e}"))
             );
         }
-        Ok(Some(factor))
+        Ok(())
     }
 
     /// Eliminates all but the last rows of `K + s M`, bordered by `columns`, with the derivative by `s`; `None` if the

@@ -257,6 +257,7 @@ mod tests {
             assert!(refused(found.unwrap_err()), "{spoilt:?}");
         }
         assert!(refused(with(Spoil::Factor, || analysed.pencil.llt(shift)).err().unwrap()));
+        assert!(refused(with(Spoil::Factor, || analysed.pencil.ldlt(shift)).err().unwrap()));
         analysed.residual(&kept, &rows, &mut |_| {}).unwrap();
     }
 

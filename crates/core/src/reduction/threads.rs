@@ -3,6 +3,8 @@
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, mpsc};
 
+use faer::MatMut;
+
 /// Number of threads: that of the cores.
 pub(super) fn count() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
@@ -31,6 +33,19 @@ pub(super) fn shared<T: Send>(items: Vec<T>, parallel: bool, work: impl Fn(T) + 
         run();
         others.into_iter().for_each(|other| other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
     });
+}
+
+/// Divides a matrix into blocks of `most` rows, each with its first row.
+pub(super) fn row_blocks<T>(mut matrix: MatMut<'_, T>, most: usize) -> Vec<(usize, MatMut<'_, T>)> {
+    let (mut blocks, mut first) = (vec![], 0);
+    while matrix.nrows() > 0 {
+        let at = most.min(matrix.nrows());
+        let (block, rest) = matrix.split_at_row_mut(at);
+        blocks.push((first, block));
+        first += at;
+        matrix = rest;
+    }
+    blocks
 }
 
 /// Runs `work` on every item, on as many threads as there are `workers`, each of which takes the next item with its own
