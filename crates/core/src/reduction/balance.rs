@@ -3,7 +3,7 @@
 use faer::Mat;
 
 use super::pencil::Pencil;
-use super::sparse::{entries, times};
+use super::sparse::{entries, symmetric_times};
 use super::{ReductionError, SparseMatrix};
 
 /// Shift of the stiffness, relative to `tr K / tr M`, that makes the matrix of a free body definite.
@@ -35,10 +35,10 @@ pub fn balanced_displacement(
     let factor = pencil.llt(shift)?.ok_or_else(|| failed("the stiffness is not positive semidefinite"))?;
     let mut displacement = Mat::<f64>::zeros(load.nrows(), load.ncols());
     for _ in 0..MOST_STEPS {
-        let mut step = &load - times(stiffness, displacement.as_ref());
+        let mut step = &load - symmetric_times(stiffness, displacement.as_ref());
         factor.solve(step.as_mut());
         displacement += &step;
-        let energy = |u: &Mat<f64>| u.col(0).transpose() * times(stiffness, u.as_ref()).col(0);
+        let energy = |u: &Mat<f64>| u.col(0).transpose() * symmetric_times(stiffness, u.as_ref()).col(0);
         if energy(&step).max(0.0) <= SETTLED * SETTLED * energy(&displacement) {
             return Ok(displacement);
         }

@@ -21,7 +21,9 @@ use faer::sparse::Triplet;
 use faer::{Mat, MatRef};
 
 use super::dense::symmetric_eigen;
-use super::sparse::{SparseMatrix, entries, is_symmetric, times, times_transposed, weighted_sum, worst_asymmetry};
+use super::sparse::{
+    SparseMatrix, entries, is_symmetric, symmetric_times, times, times_transposed, weighted_sum, worst_asymmetry,
+};
 use super::{ReductionError, SparseModes, project_dense, project_sparse, whiten};
 use crate::contact::Statics;
 use crate::physics::{ContactLaw, ContactPairs, Law, Model, ModelError, OperatingPoint, Situation, Term};
@@ -503,7 +505,7 @@ impl FullModel {
             return;
         }
         let phi = Mat::from_fn(modes.phi.nrows(), damped.len(), |i, j| modes.phi[(i, damped[j])]);
-        let mass_times_modes = times(&self.parts[part].mass, phi.as_ref());
+        let mass_times_modes = symmetric_times(&self.parts[part].mass, phi.as_ref());
         let rates_per_s = damped.into_iter().map(rate).collect();
         self.modal_damping.push(ModalDamping { part, mass_times_modes, rates_per_s });
     }
@@ -529,12 +531,22 @@ impl FullModel {
         product
     }
 
+    /// `½ (K(p) + K(p)ᵀ) X`, without assembling `K`.
+    pub(super) fn symmetric_stiffness_times(&self, here: &Situation, x: MatRef<'_, f64>) -> Mat<f64> {
+        let [contact, _] = self.contact_terms(here);
+        let mut of_terms = Mat::zeros(x.nrows(), x.ncols());
+        for transposed in [false, true] {
+            self.add_terms(&self.stiffness, &contact, here.point(), x, transposed, &mut of_terms);
+        }
+        self.parts_times(|part| &part.stiffness, x) + faer::Scale(0.5) * of_terms
+    }
+
     /// `diag(A_part) X`, where `of` selects a symmetric matrix of every part.
     fn parts_times(&self, of: fn(&FullPart) -> &SparseMatrix, x: MatRef<'_, f64>) -> Mat<f64> {
         let mut product = Mat::zeros(x.nrows(), x.ncols());
         for (part, offset) in self.parts.iter().zip(self.offsets()) {
             let n = part.mass.nrows();
-            product.subrows_mut(offset, n).copy_from(times(of(part), x.subrows(offset, n)));
+            product.subrows_mut(offset, n).copy_from(symmetric_times(of(part), x.subrows(offset, n)));
         }
         product
     }

@@ -12,7 +12,7 @@ use super::full_model::{FullModel, LowRank};
 use super::full_root::{CoveredDisc, FullProgress, FullRoot, FullVectors};
 use super::krylov::{Number, random};
 use super::krylov_schur::{Iteration, Largest};
-use super::sparse::{entries, one_norm, times, times_transposed};
+use super::sparse::{entries, one_norm, symmetric_times, times_transposed, transposed};
 use super::{ReductionError, SparseMatrix, weighted_sum};
 use crate::physics::Situation;
 
@@ -36,6 +36,12 @@ const ZERO: c64 = c64::new(0.0, 0.0);
 /// `Q(s)⁻¹ b`, or `Q(s)⁻ᵀ b` if the second argument is true.
 type Solve<'a> = dyn Fn(MatRef<'_, c64>, bool) -> Result<Mat<c64>, ReductionError> + 'a;
 
+/// The assembled `M`, `C`, `K` and their transposes: products with a transposed matrix are gathered row by row.
+struct Assembled {
+    matrices: [SparseMatrix; 3],
+    transposed: [SparseMatrix; 3],
+}
+
 /// A full model at one operating point.
 pub(super) struct Problem<'a> {
     pub what: &'a str,
@@ -44,8 +50,8 @@ pub(super) struct Problem<'a> {
     vectors: FullVectors,
     pub undamped: bool,
     low_rank: LowRank,
-    /// Assembled `M`, `C`, `K`; `None` for a model of parts joined by contact.
-    matrices: Option<[SparseMatrix; 3]>,
+    /// `None` for a model of parts joined by contact.
+    assembled: Option<Assembled>,
     /// 1-norms of `M`, `C`, `K`; estimates for a model of parts.
     norms: [f64; 3],
     /// Magnitude of growth rate that the discs must cover, 1/s.
@@ -91,13 +97,15 @@ impl<'a> Problem<'a> {
                 vectors,
                 undamped,
                 low_rank,
-                matrices: None,
+                assembled: None,
                 norms,
                 growth_per_s,
                 wanted,
             });
         }
         let matrices = model.matrices_in(&here)?;
+        let [mass, damping, stiffness] = &matrices;
+        let transposed = [transposed(mass)?, transposed(damping)?, transposed(stiffness)?];
         // Upper bound of the 1-norm of `W diag(r) Wᵀ`: the largest sum over its columns.
         let (modes, rates) = model.modal_factors();
         let sizes: Vec<f64> = modes.col_iter().zip(&rates).map(|(column, rate)| rate * column.norm_l1()).collect();
@@ -112,7 +120,7 @@ impl<'a> Problem<'a> {
             vectors,
             undamped,
             low_rank,
-            matrices: Some(matrices),
+            assembled: Some(Assembled { matrices, transposed }),
             norms,
             growth_per_s,
             wanted,
@@ -124,18 +132,16 @@ impl<'a> Problem<'a> {
         let k = x.ncols();
         // Real matrices multiply the real and imaginary parts as separate columns.
         let parts = Mat::from_fn(x.nrows(), 2 * k, |i, j| if j < k { x[(i, j)].re } else { x[(i, j - k)].im });
-        let product = |which: usize| match (&self.matrices, which) {
-            (Some(matrices), 1) => {
-                let of_terms = if transposed { times_transposed } else { times };
-                let product = of_terms(&matrices[1], parts.as_ref());
-                if self.model.modal_damping.is_empty() {
-                    product
-                } else {
+        let product = |which: usize| match (&self.assembled, which) {
+            (Some(assembled), _) => {
+                let of = if transposed { &assembled.matrices } else { &assembled.transposed };
+                let product = times_transposed(&of[which], parts.as_ref());
+                if which == 1 && !self.model.modal_damping.is_empty() {
                     product + self.model.modal_damping_times(parts.as_ref())
+                } else {
+                    product
                 }
             }
-            (Some(matrices), _) if transposed => times_transposed(&matrices[which], parts.as_ref()),
-            (Some(matrices), _) => times(&matrices[which], parts.as_ref()),
             (None, 0) => self.model.mass_times(parts.as_ref()),
             (None, 1) => self.model.damping_times(&self.here, parts.as_ref(), transposed),
             (None, _) => self.model.stiffness_times(&self.here, parts.as_ref(), transposed),
@@ -222,7 +228,7 @@ impl<'a> Problem<'a> {
         gap: [f64; 2],
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
-        let Some([mass, _, stiffness]) = &self.matrices else {
+        let Some(Assembled { matrices: [mass, _, stiffness], .. }) = &self.assembled else {
             unreachable!("a system has its matrices");
         };
         let square = omega * omega;
@@ -231,7 +237,7 @@ impl<'a> Problem<'a> {
         drop(sum);
         progress(FullProgress::Factored { shift_rad_s: omega });
         let inverse = |x: Mat<f64>, transposed: bool| {
-            let mut b = times(mass, x.as_ref());
+            let mut b = symmetric_times(mass, x.as_ref());
             factor.solve(&mut b, transposed)?;
             Ok(b)
         };
@@ -249,7 +255,7 @@ impl<'a> Problem<'a> {
         if self.undamped {
             return self.around_undamped(engine, omega, gap, progress);
         }
-        let Some([mass, damping, stiffness]) = &self.matrices else {
+        let Some(Assembled { matrices: [mass, damping, stiffness], .. }) = &self.assembled else {
             unreachable!("a system has its matrices");
         };
         let failed = |reason: String| ReductionError::Factorisation { what: self.what.to_owned(), reason };

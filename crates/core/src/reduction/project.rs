@@ -2,12 +2,13 @@
 
 use faer::{Mat, MatRef};
 
-use super::sparse::{SparseMatrix, times};
+use super::sparse::{SparseMatrix, symmetric_times, times};
 
 /// `Φᵀ A Φ`, `k×k`, for a sparse `A`, `n×n`, and a `basis` `Φ`, `n×k`. The result is exactly symmetric if `symmetric`
 /// states that `A` is.
 pub fn project_sparse(matrix: &SparseMatrix, basis: MatRef<'_, f64>, symmetric: bool) -> Mat<f64> {
-    mirrored(basis.transpose() * times(matrix, basis), symmetric)
+    let product = if symmetric { symmetric_times(matrix, basis) } else { times(matrix, basis) };
+    mirrored(basis.transpose() * product, symmetric)
 }
 
 /// `Φᵀ A Φ`, `k×k`, for a dense `A`, `n×n`, and a `basis` `Φ`, `n×k`. The result is exactly symmetric if `symmetric`

@@ -3,7 +3,7 @@
 use faer::sparse::{SparseColMat, Triplet};
 use faer::{Mat, MatMut, MatRef};
 
-use super::threads::shared;
+use super::threads::{row_blocks, shared};
 use super::{ReductionError, SYMMETRY_TOLERANCE};
 
 /// Sparse matrix in compressed columns; both triangles of a symmetric matrix are stored.
@@ -116,14 +116,7 @@ fn gather<const W: usize>(matrix: &SparseMatrix, x: MatRef<'_, f64>, product: Ma
         from.iter_mut().zip(x.col(k).iter()).for_each(|(row, value)| row[k] = *value);
     }
     let (starts, rows, values) = (matrix.col_ptr(), matrix.row_idx(), matrix.val());
-    let (mut blocks, mut rest, mut first) = (vec![], product, 0);
-    while rest.nrows() > 0 {
-        let size = ROWS_TOGETHER.min(rest.nrows());
-        let (block, others) = rest.split_at_row_mut(size);
-        blocks.push((first, block));
-        (first, rest) = (first + size, others);
-    }
-    shared(blocks, true, |(first, mut block): (usize, MatMut<'_, f64>)| {
+    shared(row_blocks(product, ROWS_TOGETHER), true, |(first, mut block): (usize, MatMut<'_, f64>)| {
         for j in 0..block.nrows() {
             let entries = starts[first + j]..starts[first + j + 1];
             let mut sum = [0.0; W];

@@ -43,10 +43,8 @@ impl<'a> Metric<'a> {
         for first in (0..x.ncols()).step_by(TOGETHER) {
             let columns = TOGETHER.min(x.ncols() - first);
             let x = x.subcols(first, columns);
-            let mut sum = faer::Scale(self.sigma) * self.full.mass_times(x);
-            for transposed in [false, true] {
-                sum += faer::Scale(0.5) * self.full.stiffness_times(&self.middle, x, transposed);
-            }
+            let mass = faer::Scale(self.sigma) * self.full.mass_times(x);
+            let sum = mass + self.full.symmetric_stiffness_times(&self.middle, x);
             product.subcols_mut(first, columns).copy_from(sum);
         }
         product
