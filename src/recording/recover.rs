@@ -5,9 +5,11 @@
 
 use std::{
     collections::{BTreeMap, HashMap},
-    fs::TryLockError,
+    fs::{File, TryLockError},
     io,
     path::{Path, PathBuf},
+    thread,
+    time::{Duration, Instant},
 };
 
 use crate::files::input_file;
@@ -21,6 +23,9 @@ use crate::files::whole_file::{folder_of, sync_folder};
 /// Suffix of a file being recorded.
 pub const ACTIVE: &str = ".active";
 const DAMAGED: &str = ".damaged";
+/// How long a file must stay locked to be in use. A file that has been closed stays locked for some milliseconds if its
+/// process was just starting another: between `fork` and `exec` the child has the parent's open files.
+const LOCK_WAIT: Duration = Duration::from_secs(1);
 
 /// Why a recording cannot be repaired.
 #[derive(Debug, thiserror::Error)]
@@ -173,13 +178,24 @@ fn is_bag(directory: &Path, file: &Path) -> bool {
     directory.join(bag::METADATA_FILE).exists() || named_alike().is_some()
 }
 
+/// Locks a file, unless another process keeps it locked for [`LOCK_WAIT`].
+fn locked(file: &File) -> io::Result<bool> {
+    let begun = Instant::now();
+    loop {
+        match file.try_lock() {
+            Ok(()) => return Ok(true),
+            Err(TryLockError::WouldBlock) if begun.elapsed() < LOCK_WAIT => thread::sleep(LOCK_WAIT / 100),
+            Err(TryLockError::WouldBlock) => return Ok(false),
+            Err(TryLockError::Error(error)) => return Err(error),
+        }
+    }
+}
+
 fn recover_file(path: &Path) -> Result<Recovery, RecoverError> {
     let recovery = |outcome| Recovery { original: path.to_owned(), outcome };
     let lock = input_file::open(path, input_file::ANY_SIZE).map_err(|source| read_error(path, source))?;
-    match lock.try_lock() {
-        Ok(()) => {}
-        Err(TryLockError::WouldBlock) => return Ok(recovery(Outcome::InUse)),
-        Err(TryLockError::Error(source)) => return Err(read_error(path, source).into()),
+    if !locked(&lock).map_err(|source| read_error(path, source))? {
+        return Ok(recovery(Outcome::InUse));
     }
     let target = finished_name(path);
     if target != path && target.exists() {

@@ -16,7 +16,7 @@ use squealcast::msgs::{DiagnosticArray, DiagnosticStatus, Header, KeyValue, Sess
 use squealcast::recording::message::{Message, Payload};
 use squealcast::recording::reader::{Entry, ReadOptions, Recorded, Recording};
 use squealcast::recording::recorder::{Recorder, RecorderConfig, State};
-use squealcast::recording::recover::{Outcome, recover};
+use squealcast::recording::recover::{Outcome, Recovery, recover};
 use tempfile::TempDir;
 
 fn others() -> Vec<Message> {
@@ -182,6 +182,23 @@ fn a_file_cut_at_any_byte_is_read_up_to_the_cut() {
         }
     }
     assert_eq!(most, whole.len(), "a cut within the summary loses no message");
+}
+
+/// As where a process that has just closed the file is starting another one, which inherits the lock until it has begun.
+#[test]
+fn a_file_that_stays_locked_for_a_moment_is_repaired() {
+    let temp = TempDir::new().unwrap();
+    let (file, bytes) = small_recording(&temp);
+    fs::write(&file, &bytes[..bytes.len() - 100]).unwrap();
+    let locked = fs::File::open(&file).unwrap();
+    locked.lock().unwrap();
+    let recovered = std::thread::scope(|scope| {
+        let recovered = scope.spawn(|| recover(&file).unwrap().recoveries);
+        std::thread::sleep(Duration::from_millis(100)); // the moment
+        drop(locked);
+        recovered.join().unwrap()
+    });
+    assert!(matches!(recovered[..], [Recovery { outcome: Outcome::Restored(_), .. }]), "{recovered:?}");
 }
 
 #[test]
