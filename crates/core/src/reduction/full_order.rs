@@ -110,9 +110,11 @@ impl<'a> FullSolver<'a> {
         Ok(solver)
     }
 
-    /// Calls `work` with a solver for each of up to `threads` threads, which share the memory equally, and, where that is
-    /// too little as `is_of_memory` tells of an error, again with this solver alone. At once with this one where factors
-    /// are kept, which threads cannot share, or are made by a foreign engine, whose ranks need the processors.
+    /// Calls `work` with `threads` solvers of the same model, one for each thread; each may take an equal share of the
+    /// memory. If that is too little, `work` is called again with this solver alone: `is_of_memory` recognises the error.
+    ///
+    /// This solver works alone from the start if it keeps factors, which threads cannot share, or if a foreign engine
+    /// solves, whose ranks need the processors.
     ///
     /// # Errors
     /// Those of `work`.

@@ -36,10 +36,10 @@ const ZERO: c64 = c64::new(0.0, 0.0);
 /// `Q(s)⁻¹ b`, or `Q(s)⁻ᵀ b` if the second argument is true.
 type Solve<'a> = dyn Fn(MatRef<'_, c64>, bool) -> Result<Mat<c64>, ReductionError> + 'a;
 
-/// The assembled `M`, `C`, `K` and their transposes: products with a transposed matrix are gathered row by row.
+/// The assembled `M`, `C`, `K`, and `Cᵀ`, `Kᵀ`, from whose columns products with `C` and `K` are gathered.
 struct Assembled {
     matrices: [SparseMatrix; 3],
-    transposed: [SparseMatrix; 3],
+    transposed: [SparseMatrix; 2],
 }
 
 /// A full model at one operating point.
@@ -104,8 +104,8 @@ impl<'a> Problem<'a> {
             });
         }
         let matrices = model.matrices_in(&here)?;
-        let [mass, damping, stiffness] = &matrices;
-        let transposed = [transposed(mass)?, transposed(damping)?, transposed(stiffness)?];
+        let [_, damping, stiffness] = &matrices;
+        let transposed = [transposed(damping)?, transposed(stiffness)?];
         // Upper bound of the 1-norm of `W diag(r) Wᵀ`: the largest sum over its columns.
         let (modes, rates) = model.modal_factors();
         let sizes: Vec<f64> = modes.col_iter().zip(&rates).map(|(column, rate)| rate * column.norm_l1()).collect();
@@ -134,8 +134,13 @@ impl<'a> Problem<'a> {
         let parts = Mat::from_fn(x.nrows(), 2 * k, |i, j| if j < k { x[(i, j)].re } else { x[(i, j - k)].im });
         let product = |which: usize| match (&self.assembled, which) {
             (Some(assembled), _) => {
-                let of = if transposed { &assembled.matrices } else { &assembled.transposed };
-                let product = times_transposed(&of[which], parts.as_ref());
+                let Assembled { matrices, transposed: [damping, stiffness] } = assembled;
+                let of = match which {
+                    1 if !transposed => damping,
+                    2 if !transposed => stiffness,
+                    _ => &matrices[which],
+                };
+                let product = times_transposed(of, parts.as_ref());
                 if which == 1 && !self.model.modal_damping.is_empty() {
                     product + self.model.modal_damping_times(parts.as_ref())
                 } else {

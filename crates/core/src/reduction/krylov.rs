@@ -10,10 +10,11 @@ use super::ReductionError;
 use super::dense::symmetric_eigen;
 use super::threads::{on_threads, row_blocks, shared, threads_for};
 
-/// Number of rows of a basis worked on at a time, which bounds the memory taken besides the basis.
-const ROWS_TOGETHER: usize = 4096;
+/// Number of rows of a basis worked on at a time, which bounds the memory taken besides the basis. This and the next are
+/// smaller in tests, whose bases are small.
+const ROWS_TOGETHER: usize = if cfg!(test) { 100 } else { 4096 };
 /// Number of entries of a basis below which threads do not share an orthogonalisation.
-const DIVIDED: usize = 1 << 22;
+const DIVIDED: usize = if cfg!(test) { 1 << 10 } else { 1 << 22 };
 
 /// Scalar type of a basis: real or complex.
 pub(super) trait Number: ComplexField<Real = f64> + Copy + std::ops::Mul<Output = Self> {

@@ -177,8 +177,11 @@ impl Building<'_, '_> {
         let points: Vec<(usize, OperatingPoint)> = points.iter().copied().enumerate().collect();
         let is_of_memory = |error: &ReductionError| matches!(error, ReductionError::Memory { .. });
         self.solver.for_threads(threads_for(of), is_of_memory, |solvers| {
-            for solver in &mut *solvers {
-                solver.make_room(FullVectors::None, most_roots, held, 0)?;
+            // A solver that works alone has its room from the samples.
+            if solvers.len() > 1 {
+                for solver in &mut *solvers {
+                    solver.make_room(FullVectors::None, most_roots, held, 0)?;
+                }
             }
             on_threads(solvers, &points, progress, &|solver, &(index, point), report| {
                 let solving = &mut |step| report(ParametricStep::Solving(step));
