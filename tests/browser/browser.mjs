@@ -45,6 +45,13 @@ export async function until(what, holds) {
   }
 }
 
+/** Chooses among radio buttons as a hand does: by the label, once it rests and nothing covers it. */
+export async function choose(page, name, value) {
+  const button = `input[name=${name}][value=${value}]`;
+  await page.locator(`label:has(${button})`).click();
+  check(await page.locator(button).isChecked(), `${name}: ${value} is not chosen by a click on its label`);
+}
+
 export async function picture(page, folder, name) {
   if (!folder) return;
   mkdirSync(folder, { recursive: true });

@@ -1,14 +1,13 @@
 // The contact of a rig whose pairs open and close: node contact.mjs URL [pictures]. URL is a node with such a rig; made-up
 // answers show pairs with places. Prints what the page says of the node's contact, and the fields that the answers have.
 import { fileURLToPath } from "node:url";
-import { check, launch, open, picture, violations } from "./browser.mjs";
+import { check, choose, launch, open, picture, violations } from "./browser.mjs";
 import { fields, serve } from "./canned.mjs";
 
 const [url, pictures] = process.argv.slice(2);
 const faults = [];
 const browser = await launch();
 const text = (page, id) => page.locator(`#${id}`).innerText();
-const choose = (page, view) => page.locator(`input[name=shape-view][value=${view}]`).check({ force: true });
 const closes = (page) => page.waitForFunction(() => / pairs closed at /.test(document.getElementById("contact-note").textContent));
 
 // Pairs on the interface: as many dots and rings as there are pairs, the leading edge on the left, nothing too wide.
@@ -18,7 +17,7 @@ for (const [width, height] of [[360, 740], [1280, 800], [2560, 1440]]) {
     const where = `contact at ${width}, ${colorScheme}`;
     const page = await open(browser, served.url, { viewport: { width, height }, colorScheme }, faults);
     await page.waitForSelector('#status[data-level="ok"]');
-    await choose(page, "contact");
+    await choose(page, "shape-view", "contact");
     await closes(page);
     check((await page.locator("#contact-picture circle").count()) === 66, `${where}: dots`);
     check((await page.locator("#contact-picture .open").count()) === 19, `${where}: ${await page.locator("#contact-picture .open").count()} rings`);
@@ -39,7 +38,7 @@ for (const [width, height] of [[360, 740], [1280, 800], [2560, 1440]]) {
     check(found.length === 0, `axe-core, ${where}: ${found.join("\n")}`);
     if (width === 360) await page.locator("#contact-plan").scrollIntoViewIfNeeded();
     await picture(page, pictures, `contact-${width}-${colorScheme}`);
-    await choose(page, "shape");
+    await choose(page, "shape-view", "shape");
     check((await page.locator("#stage").isVisible()) && !(await page.locator("#contact-plan").isVisible()), `${where}: no way back`);
     await page.context().close();
   }
@@ -57,7 +56,7 @@ plain.stop();
 // A node: bars by number.
 page = await open(browser, url, {}, faults);
 await page.waitForSelector('#status:is([data-level="ok"], [data-level="warn"], [data-level="squeal"])');
-await choose(page, "contact");
+await choose(page, "shape-view", "contact");
 await closes(page);
 const shown = await page.evaluate(() => ({
   note: document.getElementById("contact-note").textContent,

@@ -80,7 +80,7 @@ check(near[0].mu < 0.637 && near[1].mu > 0.67 && near[1].mu - near[0].mu < 0.2, 
 check(/mode 1: 740\.0 Hz, \+2\d\.\d\d 1\/s/.test(near[1].text) && !/mode 14/.test(near[1].text), `near: ${near[1].text}`);
 const step = await readAt(page, "Home", "ArrowRight");
 check(Math.abs(step.mu - near[0].mu - 0.01 * (near[1].mu - near[0].mu)) < 1e-9, `a step leads to ${step.mu}`);
-await page.locator("input[name=map-range][value=all]").check({ force: true });
+await choose(page, "map-range", "all");
 const all = [await readAt(page, "Home"), await readAt(page, "End")];
 check(all[0].mu === 0 && all[1].mu === 1 && /mode 14: 3110\.0 Hz/.test(all[1].text), `all: ${all[0].mu} to ${all[1].mu}, ${all[1].text}`);
 await page.keyboard.press("Escape");
@@ -88,7 +88,7 @@ check((await page.locator("#map-plots").getAttribute("aria-valuetext")) === "not
 const box = await page.locator("#map-frequency .u-over").boundingBox();
 await page.mouse.move(box.x + 0.25 * box.width, box.y + box.height / 2);
 check(/^μ 0\.25/.test(await text(page, "map-readout")), `hover: ${await text(page, "map-readout")}`);
-await page.locator("input[name=map-range][value=near]").check({ force: true });
+await choose(page, "map-range", "near");
 
 // The shape follows the mode that grows, unless the user picked one; it stops without data.
 served.turn("worst");
