@@ -10,10 +10,10 @@ pub enum Spoil {
     Value,
     /// Perturbs a right vector of the unsymmetric dense problem, or a mode of a sparse system.
     Vector,
-    /// Perturbs an entry of a factor `L Lᵀ` or `L D Lᵀ`, or of a condensed matrix, by 1e-6 of itself.
+    /// Perturbs an entry of a factor `L Lᵀ` or `L D Lᵀ` by 1e-6 of itself.
     Factor,
-    /// Perturbs an entry of the derivative of a condensed matrix by 1e-4 of itself.
-    Slope,
+    /// Leaves the rows of one subtree out of the products of responses to loads.
+    Share,
     /// Drops a converged mode of the Lanczos iteration.
     Mode,
     /// Drops a root that lies in the discs of two shifts from one of them.

@@ -146,12 +146,12 @@ impl Engine for Slepc {
         true
     }
 
-    fn lowest(
+    fn lowest<'p>(
         &self,
-        pencil: &Pencil<'_>,
+        pencil: &'p Pencil<'_>,
         wanted: &Lowest,
         progress: &mut dyn FnMut(Progress),
-    ) -> Result<Eigenpairs, ReductionError> {
+    ) -> Result<Eigenpairs<'p>, ReductionError> {
         let failed = |reason: String| ReductionError::Engine { what: pencil.what.to_owned(), reason };
         let (ranks, n) = (self.ranks::<f64>().map_err(failed)?, pencil.dimension());
         let count = (wanted.count + (BEYOND << wanted.attempt.min(10))).min(n);
@@ -175,7 +175,7 @@ impl Engine for Slepc {
             progress(Progress::Factored { shift });
             let converged = omega_squared.len();
             progress(Progress::Iterated { vectors: converged, converged, wanted: wanted.count });
-            return Ok(Eigenpairs { omega_squared, phi, shift });
+            return Ok(Eigenpairs::foreign(omega_squared, phi, shift));
         }
         Err(pencil.no_shift())
     }

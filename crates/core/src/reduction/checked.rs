@@ -56,7 +56,7 @@ impl Factor<f64> for Checked<'_> {
     }
 }
 
-impl Eigenpairs {
+impl Eigenpairs<'_> {
     /// Checks that there are at least `count` pairs, in ascending order, whose vectors are orthonormal in `M`: a pair
     /// that is listed twice would stand for one that is missing.
     ///

@@ -104,7 +104,7 @@ struct PartFactor {
 
 impl PartFactor {
     fn new(ldlt: Ldlt, offset: usize, touched: usize) -> Self {
-        let (pivots, last) = (ldlt.pivots(), ldlt.trailing(touched));
+        let (pivots, last) = (ldlt.pivots(), ldlt.triangle().trailing(touched));
         let first = pivots.len() - touched;
         let mut inverse = Mat::<f64>::identity(touched, touched);
         solve_unit_lower_triangular_in_place(last.as_ref(), inverse.as_mut(), Par::Seq);

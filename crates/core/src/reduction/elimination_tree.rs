@@ -19,7 +19,7 @@ pub(super) struct Tree {
 
 impl Tree {
     /// The tree of the first `count` supernodes.
-    pub(super) fn new(supernodes: &SymbolicSupernodalCholesky<usize>, count: usize, border: usize) -> Self {
+    pub(super) fn new(supernodes: &SymbolicSupernodalCholesky<usize>, count: usize) -> Self {
         let mut of_row = vec![0; supernodes.nrows()];
         for s in 0..supernodes.n_supernodes() {
             of_row[supernodes.supernode_begin()[s]..supernodes.supernode_end()[s]].fill(s);
@@ -29,7 +29,7 @@ impl Tree {
         let parents: Vec<usize> = (0..count).map(parent).collect();
         let size = |s: usize| {
             let columns = supernodes.supernode_end()[s] - supernodes.supernode_begin()[s];
-            (columns, supernodes.supernode(s).pattern().len() + border)
+            (columns, supernodes.supernode(s).pattern().len())
         };
         let sizes: Vec<(usize, usize)> = (0..count).map(size).collect();
         let mut work: Vec<f64> =

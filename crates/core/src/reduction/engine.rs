@@ -8,7 +8,7 @@ use faer::sparse::SparseColMat;
 use faer::{Mat, c64};
 
 use super::ReductionError;
-use super::pencil::Pencil;
+use super::pencil::{Llt, Pencil};
 use super::sparse::SparseMatrix;
 
 /// Relative gap of two neighbouring `ω²` that is wide enough for an inertia (Sturm) count between them.
@@ -94,21 +94,27 @@ pub struct Lowest {
 }
 
 /// Eigenpairs of `K φ = ω² M φ` as an engine found them.
-#[derive(Clone, Debug)]
-pub struct Eigenpairs {
+pub struct Eigenpairs<'p> {
     /// `ω²`, rad²/s², ascending.
     pub omega_squared: Vec<f64>,
     /// `Φ`, a column per `ω²`, mass-normalised.
     pub phi: Mat<f64>,
     /// The shift `s` used, rad²/s².
     pub shift: f64,
+    /// The factor of `K + s M`, if it is in this process.
+    pub(super) factor: Option<Llt<'p>>,
 }
 
-impl Eigenpairs {
+impl Eigenpairs<'_> {
+    /// Eigenpairs from another process.
+    pub fn foreign(omega_squared: Vec<f64>, phi: Mat<f64>, shift: f64) -> Self {
+        Self { omega_squared, phi, shift, factor: None }
+    }
+
     /// The `count` lowest.
     pub(super) fn first(self, count: usize) -> Self {
         let phi = self.phi.subcols(0, count).to_owned();
-        Self { omega_squared: self.omega_squared[..count].to_vec(), phi, shift: self.shift }
+        Self { omega_squared: self.omega_squared[..count].to_vec(), phi, ..self }
     }
 }
 
@@ -121,12 +127,12 @@ pub trait Engine: Sync {
     ///
     /// # Errors
     /// [`ReductionError`]: `NoShift`, `NotConverged`, `Factorisation`, `Engine`.
-    fn lowest(
+    fn lowest<'p>(
         &self,
-        pencil: &Pencil<'_>,
+        pencil: &'p Pencil<'_>,
         wanted: &Lowest,
         progress: &mut dyn FnMut(Progress),
-    ) -> Result<Eigenpairs, ReductionError>;
+    ) -> Result<Eigenpairs<'p>, ReductionError>;
 
     /// Number of `ω²` below `square`, rad²/s², by the inertia of `K - σ M`.
     ///

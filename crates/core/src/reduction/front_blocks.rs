@@ -3,9 +3,7 @@
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::matmul::matmul;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
-use faer::linalg::triangular_solve::{
-    solve_lower_triangular_in_place, solve_unit_lower_triangular_in_place, solve_upper_triangular_in_place,
-};
+use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_unit_lower_triangular_in_place};
 use faer::linalg::{cholesky::ldlt, cholesky::llt};
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 
@@ -49,7 +47,7 @@ pub(super) fn positive(mut panel: MatMut<'_, f64>, parallel: bool) -> Result<(),
         let wide = right.ncols();
         if wide > 0 {
             let rest = right.as_mut().subrows_mut(first + width, below.nrows());
-            subtract_lower(rest, &[(below, below)], parallel);
+            subtract_lower(rest, below, below, parallel);
         }
     }
     Ok(())
@@ -96,35 +94,13 @@ pub(super) fn signed(mut panel: MatMut<'_, f64>, update: MatMut<'_, f64>, parall
             let (below, product) =
                 (below.as_ref(), scaled.as_ref().submatrix(first + width, first, height - first - width, width));
             let rest = right.as_mut().subrows_mut(first + width, below.nrows());
-            subtract_lower(rest, &[(below, product)], parallel);
+            subtract_lower(rest, below, product, parallel);
         }
     }
     let remaining = height - columns;
     let (below, product) = (panel.as_ref().subrows(columns, remaining), scaled.as_ref().subrows(columns, remaining));
-    subtract_lower(update, &[(below, product)], parallel);
+    subtract_lower(update, below, product, parallel);
     Some(negative)
-}
-
-/// Subtracts from the derivative `U'` what the elimination of a front adds: `top` is `L₁₁`, `below` `L₂₁`, and `slope`
-/// the derivative of both before the elimination.
-pub(super) fn differentiate(
-    top: MatRef<'_, f64>,
-    below: MatRef<'_, f64>,
-    slope: MatRef<'_, f64>,
-    update: MatMut<'_, f64>,
-    parallel: bool,
-) {
-    let (remaining, columns) = below.shape();
-    let of_top = Mat::from_fn(columns, columns, |i, j| slope[(i.max(j), i.min(j))]);
-    let mut g = below.to_owned();
-    let mut z = slope.subrows(columns, remaining).to_owned();
-    let pairs = blocks_of_two(g.as_mut(), z.as_mut());
-    shared(pairs, parallel, |(mut g, z): (MatMut<'_, f64>, MatMut<'_, f64>)| {
-        solve_upper_triangular_in_place(top.transpose(), g.as_mut().transpose_mut(), Par::Seq);
-        matmul(z, Accum::Add, g.as_ref(), of_top.as_ref(), -0.5, Par::Seq);
-    });
-    let (g, z) = (g.as_ref(), z.as_ref());
-    subtract_lower(update, &[(g, z), (z, g)], parallel);
 }
 
 /// Divides two matrices into the same blocks of rows.
@@ -133,12 +109,8 @@ fn blocks_of_two<'m>(a: MatMut<'m, f64>, b: MatMut<'m, f64>) -> Vec<(MatMut<'m, 
     blocks.map(|((_, a), (_, b))| (a, b)).collect()
 }
 
-/// `U ← U - Σ a bᵀ` in the lower triangle of a square matrix, or of the first columns of one.
-pub(super) fn subtract_lower(
-    mut update: MatMut<'_, f64>,
-    products: &[(MatRef<'_, f64>, MatRef<'_, f64>)],
-    parallel: bool,
-) {
+/// `U ← U - A Bᵀ` in the lower triangle of a square matrix, or of the first columns of one.
+pub(super) fn subtract_lower(mut update: MatMut<'_, f64>, a: MatRef<'_, f64>, b: MatRef<'_, f64>, parallel: bool) {
     let mut blocks = vec![];
     let mut first = 0;
     while update.ncols() > 0 {
@@ -154,21 +126,19 @@ pub(super) fn subtract_lower(
     shared(blocks, parallel, |(first, block): (usize, MatMut<'_, f64>)| {
         let (rows, width) = block.shape();
         let (mut diagonal, mut below) = block.subrows_mut(first, rows - first).split_at_row_mut(width);
-        for (a, b) in products {
-            let b = b.subrows(first, width).transpose();
-            triangular::matmul(
-                diagonal.as_mut(),
-                BlockStructure::TriangularLower,
-                Accum::Add,
-                a.subrows(first, width),
-                BlockStructure::Rectangular,
-                b,
-                BlockStructure::Rectangular,
-                -1.0,
-                Par::Seq,
-            );
-            let a = a.subrows(first + width, rows - first - width);
-            matmul(below.as_mut(), Accum::Add, a, b, -1.0, Par::Seq);
-        }
+        let b = b.subrows(first, width).transpose();
+        triangular::matmul(
+            diagonal.as_mut(),
+            BlockStructure::TriangularLower,
+            Accum::Add,
+            a.subrows(first, width),
+            BlockStructure::Rectangular,
+            b,
+            BlockStructure::Rectangular,
+            -1.0,
+            Par::Seq,
+        );
+        let a = a.subrows(first + width, rows - first - width);
+        matmul(below.as_mut(), Accum::Add, a, b, -1.0, Par::Seq);
     });
 }

@@ -58,6 +58,7 @@ mod sparse;
 mod static_response;
 mod threads;
 mod triangle;
+mod unit_loads;
 
 mod substructures;
 #[cfg(test)]

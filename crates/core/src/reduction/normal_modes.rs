@@ -11,7 +11,7 @@ use super::dense::{fix_signs, symmetric_eigen};
 use super::engine::{CountedBy, Eigenpairs, Engine, GAP, Lowest, Progress, gap_after};
 use super::lanczos::capacity;
 use super::own_engine::{OwnEngine, TOGETHER};
-use super::pencil::Pencil;
+use super::pencil::{Llt, Pencil};
 use super::sparse::{one_norm, symmetric_times};
 use super::{ReductionError, SparseMatrix, whiten};
 
@@ -20,7 +20,7 @@ const BACKWARD_LIMIT: f64 = 1e-12;
 /// Below this many degrees of freedom a dense solve is at least as fast.
 const DENSE_BELOW: usize = 400;
 /// The first shift `s` to try, relative to `tr K / tr M`.
-const FIRST_SHIFT: f64 = 1e-8;
+const FIRST_SHIFT: f64 = 3e-9;
 /// Largest ratio of the wanted `θ`. Above it the shift is increased, because small `θ` would lose digits to the
 /// rounding of the largest.
 const WIDEST_SPREAD: f64 = 1e6;
@@ -179,6 +179,18 @@ impl<'a> Analysed<'a> {
         memory_limit_bytes: Option<usize>,
         progress: &mut dyn FnMut(Progress),
     ) -> Result<SparseModes, ReductionError> {
+        Ok(self.modes_and_factor(wanted, false, memory_limit_bytes, progress)?.0)
+    }
+
+    /// [`Self::modes`], the shift `s` they were computed with and, if it is to be kept, the factor of `K + s M`. A small system
+    /// has no shift, and a foreign engine no factor here.
+    pub(super) fn modes_and_factor(
+        &self,
+        wanted: Wanted,
+        keep: bool,
+        memory_limit_bytes: Option<usize>,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<(SparseModes, Option<f64>, Option<Llt<'_>>), ReductionError> {
         let pencil = &self.pencil;
         let (what, n) = (pencil.what, pencil.dimension());
         let analysing = |count: usize| Progress::Analysed {
@@ -226,12 +238,13 @@ impl<'a> Analysed<'a> {
             }
         };
         if n < DENSE_BELOW || 3 * count > n {
-            return finish(pencil, dense(pencil, count)?);
+            return Ok((finish(pencil, dense(pencil, count)?)?, None, None));
         }
         let mut shift = pencil.typical_square() * FIRST_SHIFT;
         for attempt in 0.. {
             let wanted = Lowest { first_shift: shift, count, cutoff, attempt };
-            let found = self.engine.lowest(pencil, &wanted, progress)?;
+            let mut found = self.engine.lowest(pencil, &wanted, progress)?;
+            let factor = found.factor.take().filter(|_| keep);
             if self.engine.foreign() {
                 found.check(pencil, count)?;
             }
@@ -247,7 +260,7 @@ impl<'a> Analysed<'a> {
                 None => self.complete_below_gap(squares, count, memory_limit_bytes, progress),
             };
             match counted {
-                Ok(()) => return finish(pencil, found.first(count)),
+                Ok(()) => return Ok((finish(pencil, found.first(count))?, Some(shift), factor)),
                 // Retry with another start block before giving up.
                 Err(ReductionError::MissedModes { .. }) if attempt < 3 => {}
                 Err(error) => return Err(error),
@@ -280,13 +293,13 @@ impl<'a> Analysed<'a> {
 const AT_A_TIME: usize = 4;
 
 /// The `count` lowest modes by a dense solve, for small systems.
-fn dense(pencil: &Pencil<'_>, count: usize) -> Result<Eigenpairs, ReductionError> {
+fn dense<'p>(pencil: &'p Pencil<'_>, count: usize) -> Result<Eigenpairs<'p>, ReductionError> {
     let whitening = whiten(&format!("{}.mass", pencil.what), pencil.mass.to_dense().as_ref())?;
     let stiffness = pencil.stiffness.to_dense();
     let (squares, vectors) = symmetric_eigen(pencil.what, whitening.congruence(stiffness.as_ref(), true).as_ref())?;
     let mut phi = vectors.subcols(0, count).to_owned();
     whitening.back(&mut phi);
-    Ok(Eigenpairs { omega_squared: squares[..count].to_vec(), phi, shift: 0.0 })
+    Ok(Eigenpairs { omega_squared: squares[..count].to_vec(), phi, shift: 0.0, factor: None })
 }
 
 /// Checks that the `count` lowest modes found all lie below the cut-off `σ`, where the inertia of `K - σ M` counted as
@@ -303,7 +316,7 @@ fn complete_below_cutoff(pencil: &Pencil<'_>, squares: &[f64], count: usize, bel
 ///
 /// # Errors
 /// [`ReductionError::Residual`].
-fn finish(pencil: &Pencil<'_>, found: Eigenpairs) -> Result<SparseModes, ReductionError> {
+fn finish(pencil: &Pencil<'_>, found: Eigenpairs<'_>) -> Result<SparseModes, ReductionError> {
     let Eigenpairs { omega_squared, mut phi, .. } = found;
     fix_signs(&mut phi);
     #[cfg(test)]

@@ -24,12 +24,12 @@ impl Engine for OwnEngine {
     }
 
     /// Block Lanczos on `L⁻¹ M L⁻ᵀ`.
-    fn lowest(
+    fn lowest<'p>(
         &self,
-        pencil: &Pencil<'_>,
+        pencil: &'p Pencil<'_>,
         wanted: &Lowest,
         progress: &mut dyn FnMut(Progress),
-    ) -> Result<Eigenpairs, ReductionError> {
+    ) -> Result<Eigenpairs<'p>, ReductionError> {
         let (n, count) = (pencil.dimension(), wanted.count);
         // One more, because a test removes one.
         #[cfg(test)]
@@ -66,10 +66,10 @@ impl Engine for OwnEngine {
         for (k, theta) in largest.theta.iter().enumerate() {
             basis.col_mut(k).iter_mut().for_each(|value| *value /= theta.sqrt());
         }
-        // Free the factor, then copy the modes out of the larger allocation of the basis.
-        drop(factor);
+        // Copied out of the larger allocation of the basis.
         let phi = basis.as_ref().to_owned();
-        let found = Eigenpairs { omega_squared: largest.theta.into_iter().map(square).collect(), phi, shift };
+        let omega_squared = largest.theta.into_iter().map(square).collect();
+        let found = Eigenpairs { omega_squared, phi, shift, factor: Some(factor) };
         #[cfg(test)]
         let found = if crate::spoil::spoilt(crate::spoil::Spoil::Mode) { without(found, 2) } else { found };
         Ok(found)
@@ -141,10 +141,10 @@ fn failed(what: &str, reason: &str) -> ReductionError {
 
 /// `found` without the mode at index `lost`.
 #[cfg(test)]
-fn without(found: Eigenpairs, lost: usize) -> Eigenpairs {
-    let Eigenpairs { mut omega_squared, phi, shift } = found;
+fn without(found: Eigenpairs<'_>, lost: usize) -> Eigenpairs<'_> {
+    let Eigenpairs { mut omega_squared, phi, shift, factor } = found;
     omega_squared.remove(lost);
     let kept = |column: usize| if column < lost { column } else { column + 1 };
     let phi = Mat::from_fn(phi.nrows(), omega_squared.len(), |i, j| phi[(i, kept(j))]);
-    Eigenpairs { omega_squared, phi, shift }
+    Eigenpairs { omega_squared, phi, shift, factor }
 }

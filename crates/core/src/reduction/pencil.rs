@@ -79,7 +79,7 @@ impl<'a> Pencil<'a> {
         )
         .map_err(|error| failed(format!("symbolic analysis failed: {error:?}")))?;
         let supernodes = supernodal(&symbolic);
-        let tree = Arc::new(Tree::new(supernodes, supernodes.n_supernodes(), 0));
+        let tree = Arc::new(Tree::new(supernodes, supernodes.n_supernodes()));
         let pencil = Self { what, mass, stiffness, symbolic: Arc::new(symbolic), tree };
         pencil.check_mass()?;
         Ok(pencil)
@@ -126,12 +126,17 @@ impl<'a> Pencil<'a> {
 
     /// Additional bytes needed while a factor is computed: the fronts.
     pub(super) fn factoring_bytes(&self) -> usize {
-        Fronts::bytes(supernodal(&self.symbolic), 0, false)
+        Fronts::bytes(&self.tree)
     }
 
-    /// Bytes needed to condense to the last rows with a border of `border` columns.
-    pub(super) fn condensing_bytes(&self, border: usize) -> usize {
-        Fronts::bytes(supernodal(&self.symbolic), border, true)
+    /// The structure of a factor.
+    pub(super) fn supernodes(&self) -> &SymbolicSupernodalCholesky<usize> {
+        supernodal(&self.symbolic)
+    }
+
+    /// The row eliminated at each position, and the position of each row.
+    pub(super) fn order(&self) -> (&[usize], &[usize]) {
+        self.symbolic.perm().expect("a permutation was given").arrays()
     }
 
     /// `K + s M`, to be eliminated front by front.
@@ -140,8 +145,8 @@ impl<'a> Pencil<'a> {
     }
 
     fn fronts_of<'f>(&'f self, matrix: &'f SparseMatrix, shift: f64) -> Fronts<'f> {
-        let order = self.symbolic.perm().expect("a permutation was given").arrays();
-        Fronts { matrix, mass: self.mass, shift, supernodes: supernodal(&self.symbolic), tree: &self.tree, order }
+        let (supernodes, order) = (self.supernodes(), self.order());
+        Fronts { matrix, mass: self.mass, shift, supernodes, tree: &self.tree, order }
     }
 
     /// Number of `ω²` below `square`, rad²/s²: the number of negative pivots of `K - σ M = L D Lᵀ` (Sylvester's law of
@@ -218,7 +223,12 @@ impl<'a> Llt<'a> {
         Self { pencil, values }
     }
 
-    fn triangle(&self) -> Triangle<'_> {
+    pub(super) fn pencil(&self) -> &Pencil<'_> {
+        self.pencil
+    }
+
+    /// `L`, to solve with.
+    pub(super) fn triangle(&self) -> Triangle<'_> {
         let Pencil { symbolic, tree, .. } = self.pencil;
         Triangle { supernodes: supernodal(symbolic), tree, values: &self.values, unit: false }
     }
@@ -276,24 +286,6 @@ impl Ldlt {
             (0..block.ncols()).for_each(|k| pivots[start + k] = block[(k, k)]);
         }
         pivots
-    }
-
-    /// Trailing block of `L` for the `count` rows eliminated last, dense.
-    pub(super) fn trailing(&self, count: usize) -> Mat<f64> {
-        let first = self.symbolic.nrows() - count;
-        let factor = self.supernodal();
-        let mut lower = Mat::<f64>::identity(count, count);
-        for s in 0..supernodal(&self.symbolic).n_supernodes() {
-            let node = factor.supernode(s);
-            let (start, block, pattern) = (node.start(), node.val(), node.pattern());
-            for k in first.saturating_sub(start)..block.ncols() {
-                for i in k + 1..block.nrows() {
-                    let row = if i < block.ncols() { start + i } else { pattern[i - block.ncols()] };
-                    lower[(row - first, start + k - first)] = block[(i, k)];
-                }
-            }
-        }
-        lower
     }
 
     /// `A⁻¹ B` in place.

@@ -1,18 +1,15 @@
-//! Factors of a pencil, and what is left of it after elimination, each probed before it is used: threads share the work.
+//! Factors of a pencil, each probed before it is used, since threads share the work.
 
 use faer::{Mat, MatMut, MatRef};
 
 use super::ReductionError;
 use super::front_blocks::Broken;
-use super::fronts::{Border, Condensed};
 use super::krylov::random_block;
 use super::pencil::{Ldlt, Llt, Pencil};
 use super::sparse::{one_norm, symmetric_times};
 
 /// Largest `|A x - b|` of the probe of a factor, relative to `|A| |x| + |b|`.
 const PROBE_LIMIT: f64 = 1e-12;
-/// As [`PROBE_LIMIT`], for the derivative of a condensed matrix, relative to `|M| |x|`.
-const SLOPE_LIMIT: f64 = 1e-8;
 
 impl Pencil<'_> {
     /// `(K + s M) x`.
@@ -61,58 +58,5 @@ impl Pencil<'_> {
             );
         }
         Ok(())
-    }
-
-    /// Eliminates all but the last rows of `K + s M`, bordered by `columns`, with the derivative by `s`; `None` if the
-    /// matrix is not positive definite. What is left is probed: `x` random, `b = A x` is condensed with the matrix, and
-    /// the condensed equations must hold for the last rows of `x`, as must their derivatives.
-    pub(super) fn condense(
-        &self,
-        shift: f64,
-        last: &[usize],
-        columns: MatRef<'_, f64>,
-    ) -> Result<Option<Condensed>, ReductionError> {
-        let (n, c, k) = (self.dimension(), last.len(), columns.ncols());
-        let x = random_block(n, 1, 5);
-        let last_slope = symmetric_times(self.mass, x.as_ref());
-        let mut value = Mat::zeros(n, k + 1);
-        value.subcols_mut(0, k).copy_from(columns);
-        value.subcols_mut(k, 1).copy_from(self.shifted_times(shift, x.as_ref()));
-        let border = Border { value: value.as_ref(), last_slope: last_slope.as_ref() };
-        let found = match self.fronts(shift).condense(c, &border) {
-            Ok(found) => found,
-            Err(Broken::Indefinite) => return Ok(None),
-            Err(Broken::Pivot) => return Err(self.broken()),
-        };
-        #[cfg(test)]
-        let found = {
-            let mut found = found;
-            if crate::spoil::spoilt(crate::spoil::Spoil::Factor) {
-                found.value[(0, 0)] *= 1.0 + 1e-6;
-            }
-            if crate::spoil::spoilt(crate::spoil::Spoil::Slope) {
-                found.slope[(0, 0)] *= 1.0 + 1e-4;
-            }
-            found
-        };
-        for (matrix, norm, limit) in [
-            (&found.value, one_norm(self.stiffness) + shift.abs() * one_norm(self.mass), PROBE_LIMIT),
-            (&found.slope, one_norm(self.mass), SLOPE_LIMIT),
-        ] {
-            let mut rest: Vec<f64> = (0..c).map(|i| -matrix[(c + k, i)]).collect();
-            for j in 0..c {
-                for i in 0..c {
-                    rest[i] += matrix[(i.max(j), i.min(j))] * x[(last[j], 0)];
-                }
-            }
-            let size = |values: &mut dyn Iterator<Item = f64>| values.map(|value| value * value).sum::<f64>().sqrt();
-            let value = size(&mut rest.into_iter()) / (norm * size(&mut last.iter().map(|&row| x[(row, 0)])));
-            if value.is_nan() || value > limit {
-                return Err(self.failed(format!(
-                    "condensed to its contact, it differs by {value:.1e} from its entries, limit {limit:.1e}"
-                )));
-            }
-        }
-        Ok(Some(found))
     }
 }

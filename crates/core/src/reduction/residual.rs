@@ -5,38 +5,35 @@
 //! ```
 //!
 //! The sums are over the truncated modes, with `φ` restricted to the degrees of freedom of the contact. The truncated
-//! modes themselves are not computed. With `A = K + s M`, `B = M Φ` of the kept modes, and loads `F - B Φ_cᵀ` that the
-//! kept modes do not see, everything but the contact is eliminated from the bordered matrix:
+//! modes themselves are not computed. With `A = K + s M`, the kept modes `Φ`, and loads `F` that these do not see,
 //!
 //! ```text
-//! [A B; Bᵀ 0]  ->  [S D; Dᵀ -E],   J = I - D Φ_cᵀ,   Z = S⁻¹ J
-//! R_s = Φ_c E Φ_cᵀ + Jᵀ Z,   Q_s = -dR_s/ds = Zᵀ S' Z + Zᵀ D' Φ_cᵀ + Φ_c D'ᵀ Z - Φ_c E' Φ_cᵀ
+//! X = A⁻¹ (F - M Φ Φᵀ F),   R_s = Fᵀ X,   Q_s = -dR_s/ds = Xᵀ M X
 //! ```
 //!
-//! The derivatives by `s` are eliminated with the matrix: no factor is stored, and no load is solved alone. `R_s` and
-//! `Q_s` differ from `R` and `Q` by powers of `s/ω²`. With `s` a millionth of the last kept `ω²`, rigid-body modes need no
-//! special treatment, and `R = R_s + s Q_s` is accurate to 1e-12.
+//! The factor is that of the modes where its shift is small enough. `R_s` and `Q_s` differ from `R` and `Q` by powers of
+//! `s/ω²`: in `R = R_s + s Q_s` each truncated mode has a relative error of `(s/ω²)²`, in `Q` of `2 s/ω²`. With `s` below
+//! [`REUSED`] of the last kept `ω²`, that is 2.5e-11 for the lowest truncated mode, whose share of `R` is small, and
+//! rigid-body modes need no special treatment.
 //!
-//! A foreign engine solves for every load instead, once for `R_s` and once more for `Q_s`:
-//!
-//! ```text
-//! X = A⁻¹ (F - M Φ Φᵀ F),   R_s = Fᵀ X,   Q_s = Fᵀ A⁻¹ M X
-//! ```
+//! A foreign engine solves for some loads at a time, once for `R_s` and once more for `Q_s = Fᵀ A⁻¹ M X`.
 //!
 //! Source: MacNeal 1971; Rubin 1975.
 
-use faer::linalg::solvers::Solve;
-use faer::{Mat, Side};
+use faer::Mat;
 
 use super::ReductionError;
 use super::checked::definite;
 use super::engine::Progress;
-use super::fronts::Condensed;
 use super::normal_modes::{Analysed, SparseModes};
+use super::pencil::Llt;
 use super::sparse::{SparseMatrix, symmetric_times};
+use super::unit_loads::Responses;
 
-/// The shift `s`, relative to the last kept `ω²`.
+/// The shift `s` of a factor made for residuals, relative to the last kept `ω²`.
 const SHIFT: f64 = 1e-6;
+/// Largest shift of a factor of the modes with which residuals are computed, relative to the last kept `ω²`.
+const REUSED: f64 = 5e-6;
 /// Largest `ω²` of a rigid-body mode (a rounding error), relative to the largest ratio of diagonal entries of stiffness
 /// and mass.
 const RIGID: f64 = 1e-13;
@@ -56,14 +53,14 @@ impl Analysed<'_> {
     /// Estimated bytes that residuals need in addition to [`Self::held_bytes`], including `count` modes.
     pub fn bytes_for_residual(&self, count: usize) -> usize {
         let (n, loads, float) = (self.pencil.dimension(), self.contact.len(), size_of::<f64>());
-        // Both results, what is condensed, and temporaries.
-        let between = 10 * float * (loads + count).pow(2);
+        // Both results, what they are computed from, and temporaries.
+        let between = 10 * float * loads.pow(2);
         if self.engine.foreign() {
             // The modes and their products with M; for one set of loads: loads, responses, products and permuted copies.
             return between + n * float * (2 * count + 5 * TOGETHER);
         }
-        // The modes, their products with M, and these as a border.
-        between + n * float * (3 * count + 4) + self.pencil.condensing_bytes(count + 1)
+        let responding = Llt::response_bytes(&self.pencil, loads, count).max(self.pencil.factoring_bytes());
+        between + n * float * count + self.pencil.factor_bytes() + responding
     }
 
     /// Residual flexibility and inertia of the modes that `modes` omits, between the degrees of freedom `rows`, those of
@@ -79,11 +76,34 @@ impl Analysed<'_> {
         rows: &[Option<usize>],
         progress: &mut dyn FnMut(Progress),
     ) -> Result<Residual, ReductionError> {
-        let shift = self.shift(modes)?;
+        self.residual_at(None, None, modes, rows, progress)
+    }
+
+    /// As [`Self::residual`], with the shift of the modes, and their factor, where they serve.
+    pub(super) fn residual_at(
+        &self,
+        shift: Option<f64>,
+        factor: Option<Llt<'_>>,
+        modes: &SparseModes,
+        rows: &[Option<usize>],
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<Residual, ReductionError> {
+        let (anew, largest) = self.shifts(modes)?;
+        let reused = shift.filter(|shift| *shift <= largest);
+        let shift = reused.unwrap_or(anew);
         let [flexibility, inertia] = if self.engine.foreign() {
             self.by_solves(modes, shift, progress)?
         } else {
-            self.by_condensation(modes, shift, progress)?
+            let factor = match factor.filter(|_| reused.is_some()) {
+                Some(factor) => factor,
+                None => {
+                    let no_shift = || ReductionError::NoShift { what: self.pencil.what.to_owned(), value: shift };
+                    let factor = self.pencil.llt(shift)?.ok_or_else(no_shift)?;
+                    progress(Progress::Factored { shift });
+                    factor
+                }
+            };
+            self.by_responses(&factor, modes, shift, progress)?
         };
         let shifted = |i: usize, j: usize| flexibility[(i, j)] + shift * inertia[(i, j)];
         Ok(Residual {
@@ -92,41 +112,23 @@ impl Analysed<'_> {
         })
     }
 
-    /// `R_s` and `Q_s` between the rows of the contact.
-    fn by_condensation(
+    /// `R_s` and `Q_s` between the rows of the contact, from the factor of `K + s M`.
+    fn by_responses(
         &self,
+        factor: &Llt<'_>,
         modes: &SparseModes,
         shift: f64,
         progress: &mut dyn FnMut(Progress),
     ) -> Result<[Mat<f64>; 2], ReductionError> {
-        let (pencil, c, k) = (&self.pencil, self.contact.len(), modes.phi.ncols());
-        if c == 0 {
+        let loads = self.contact.len();
+        if loads == 0 {
             return Ok([0, 1].map(|_| Mat::zeros(0, 0)));
         }
-        let indefinite = || ReductionError::NoShift { what: pencil.what.to_owned(), value: shift };
-        let border = symmetric_times(pencil.mass, modes.phi.as_ref());
-        let Condensed { value, slope } =
-            pencil.condense(shift, &self.contact, border.as_ref())?.ok_or_else(indefinite)?;
-        progress(Progress::Factored { shift });
-        drop(border);
-        let phi = Mat::from_fn(c, k, |i, mode| modes.phi[(self.contact[i], mode)]);
-        let symmetric = |of: &Mat<f64>, first: usize, size: usize, sign: f64| {
-            Mat::from_fn(size, size, |i, j| sign * of[(first + i.max(j), first + i.min(j))])
-        };
-        let between = |of: &Mat<f64>| of.submatrix(c, 0, k, c).transpose().to_owned();
-        let [s, s_slope] = [&value, &slope].map(|of| symmetric(of, 0, c, 1.0));
-        let [e, e_slope] = [&value, &slope].map(|of| symmetric(of, c, k, -1.0));
-        let [d, d_slope] = [&value, &slope].map(between);
-        let j = Mat::<f64>::identity(c, c) - &d * phi.transpose();
-        let mut z = s.llt(Side::Lower).map_err(|_| indefinite())?.solve(&j);
-        // Removes components of the kept modes that rounding reintroduces, above all rigid-body ones.
-        let back = d.transpose() * &z - &e * phi.transpose();
-        z -= &phi * back;
-        let flexibility = &phi * e * phi.transpose() + j.transpose() * &z;
-        let mixed = z.transpose() * d_slope * phi.transpose();
-        let inertia = z.transpose() * s_slope * &z + &mixed + mixed.transpose() - &phi * e_slope * phi.transpose();
-        progress(Progress::Loaded { solved: c, loads: c });
-        Ok([flexibility, inertia])
+        let Responses { at_contact, inertia, of_modes } = factor.responses(shift, &self.contact, modes.phi.as_ref())?;
+        progress(Progress::Loaded { solved: loads, loads });
+        // Removes components of the kept modes that rounding reintroduces, above all rigid-body ones: `X - Φ Bᵀ X`.
+        let phi = Mat::from_fn(loads, modes.phi.ncols(), |load, mode| modes.phi[(self.contact[load], mode)]);
+        Ok([at_contact - phi * &of_modes, inertia - of_modes.transpose() * &of_modes])
     }
 
     /// `R_s` and `Q_s` between the rows of the contact, by two solves for each of them.
@@ -185,8 +187,8 @@ impl Analysed<'_> {
         })
     }
 
-    /// The shift of the factor, from the highest of the kept modes.
-    fn shift(&self, modes: &SparseModes) -> Result<f64, ReductionError> {
+    /// The shift of a factor for residuals, and the largest one of a factor that serves too, from the highest kept mode.
+    fn shifts(&self, modes: &SparseModes) -> Result<(f64, f64), ReductionError> {
         let (what, mass, stiffness) = (self.pencil.what, self.pencil.mass, self.pencil.stiffness);
         let last = modes.omega_squared.last().copied().unwrap_or(0.0);
         let diagonal = |matrix: &SparseMatrix, k: usize| matrix.get(k, k).copied().unwrap_or(0.0);
@@ -199,13 +201,13 @@ impl Analysed<'_> {
         if let Some((mode, &value)) = modes.omega_squared.iter().enumerate().find(|(_, square)| **square < limit) {
             return Err(ReductionError::NegativeStiffness { what: format!("{what}.stiffness"), mode, value, limit });
         }
-        Ok(SHIFT * last)
+        Ok((SHIFT * last, REUSED * last))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::{ModeSelection, OwnEngine, SparseMatrix, Wanted, free_interface_modes, lowest_modes};
+    use super::super::{ModeSelection, OwnEngine, Wanted, free_interface_modes, lowest_modes};
     use super::*;
     use crate::spoil::{Spoil, with};
     use faer::sparse::Triplet;
@@ -247,12 +249,12 @@ mod tests {
         let rows = [Some(3), Some(200)];
         let analysed = Analysed::with_contact(&OwnEngine, "pad", &mass, &stiffness, &rows).unwrap();
         let kept = analysed.modes(Wanted::Lowest(9), None, &mut |_| {}).unwrap();
-        let shift = analysed.shift(&kept).unwrap();
+        let (shift, _) = analysed.shifts(&kept).unwrap();
         let refused = |error: ReductionError| match error {
             ReductionError::Factorisation { what, reason } => what == "pad" && reason.contains("limit"),
             _ => false,
         };
-        for spoilt in [Spoil::Factor, Spoil::Slope] {
+        for spoilt in [Spoil::Factor, Spoil::Share] {
             let found = with(spoilt, || analysed.residual(&kept, &rows, &mut |_| {}));
             assert!(refused(found.unwrap_err()), "{spoilt:?}");
         }
@@ -269,11 +271,12 @@ mod tests {
         let rows = [Some(3), None, Some(200), Some(n - 1)];
         let analysed = Analysed::with_contact(&OwnEngine, "pad", &mass, &stiffness, &rows).unwrap();
         let found = analysed.residual(&kept, &rows, &mut |_| {}).unwrap();
-        let shift = analysed.shift(&kept).unwrap();
-        let [solved, again] = [Analysed::by_solves, Analysed::by_condensation]
-            .map(|way| way(&analysed, &kept, shift, &mut |_| {}).unwrap());
-        for (solved, condensed) in solved.iter().zip(&again) {
-            assert!((solved - condensed).norm_max() < 1e-10 * solved.norm_max());
+        let (shift, _) = analysed.shifts(&kept).unwrap();
+        let factor = analysed.pencil.llt(shift).unwrap().unwrap();
+        let solved = analysed.by_solves(&kept, shift, &mut |_| {}).unwrap();
+        let responses = analysed.by_responses(&factor, &kept, shift, &mut |_| {}).unwrap();
+        for (solved, found) in solved.iter().zip(&responses) {
+            assert!((solved - found).norm_max() < 1e-10 * solved.norm_max());
         }
         // Expected: the sum over the other 400 modes of a dense solve. Errors of 1e-12 of a kept mode enter squared.
         // The lowest truncated ω², 1e-2 of the largest (500), is accurate to 1e-11 in the dense solve.

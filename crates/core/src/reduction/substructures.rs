@@ -106,9 +106,11 @@ pub fn keep_modes(
             }
         };
         let limit = memory_limit_bytes.filter(|_| engine.foreign());
-        let modes = analysed[index].modes(wanted[index], limit, &mut report)?;
-        let residual =
-            if with_residual { Some(analysed[index].residual(&modes, parts[index].rows, &mut report)?) } else { None };
+        let (modes, shift, factor) =
+            analysed[index].modes_and_factor(wanted[index], with_residual, limit, &mut report)?;
+        let residual = with_residual
+            .then(|| analysed[index].residual_at(shift, factor, &modes, parts[index].rows, &mut report))
+            .transpose()?;
         Ok(Kept { modes, residual })
     })
 }

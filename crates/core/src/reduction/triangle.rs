@@ -31,6 +31,7 @@ const DIVIDED: usize = if cfg!(test) { 1 << 9 } else { 1 << 19 };
 const TOGETHER: usize = 24;
 
 /// A supernodal factor `L`.
+#[derive(Clone, Copy)]
 pub(super) struct Triangle<'a> {
     pub(super) supernodes: &'a SymbolicSupernodalCholesky<usize>,
     pub(super) tree: &'a Tree,
@@ -196,8 +197,24 @@ impl Triangle<'_> {
         }
     }
 
+    /// Trailing block of `L` for the `count` rows eliminated last, dense.
+    pub(super) fn trailing(&self, count: usize) -> Mat<f64> {
+        let first = self.supernodes.nrows() - count;
+        let mut lower = Mat::<f64>::identity(count, count);
+        for s in 0..self.supernodes.n_supernodes() {
+            let (start, (panel, pattern)) = (self.supernodes.supernode_begin()[s], self.panel(s));
+            for k in first.saturating_sub(start)..panel.ncols() {
+                for i in k + usize::from(self.unit)..panel.nrows() {
+                    let row = if i < panel.ncols() { start + i } else { pattern[i - panel.ncols()] };
+                    lower[(row - first, start + k - first)] = panel[(i, k)];
+                }
+            }
+        }
+        lower
+    }
+
     /// `[L₁₁; L₂₁]` of supernode `s`, and the rows of `L₂₁`.
-    fn panel(&self, s: usize) -> (MatRef<'_, f64>, &[usize]) {
+    pub(super) fn panel(&self, s: usize) -> (MatRef<'_, f64>, &[usize]) {
         let ends = self.supernodes.col_ptr_for_val();
         let pattern = self.supernodes.supernode(s).pattern();
         let columns = self.supernodes.supernode_end()[s] - self.supernodes.supernode_begin()[s];
@@ -206,7 +223,7 @@ impl Triangle<'_> {
     }
 
     /// The rows eliminated in a subtree.
-    fn own(&self, subtree: &[usize]) -> impl Iterator<Item = usize> {
+    pub(super) fn own(&self, subtree: &[usize]) -> impl Iterator<Item = usize> {
         let [begin, end] = [self.supernodes.supernode_begin(), self.supernodes.supernode_end()];
         subtree.iter().flat_map(move |&s| begin[s]..end[s])
     }
@@ -243,7 +260,7 @@ mod tests {
         let pencil = Pencil::new("cube", &mass, &stiffness).unwrap();
         let ldlt = pencil.ldlt(-150.0).unwrap();
         assert!(ldlt.pivots().iter().any(|pivot| *pivot < 0.0));
-        let lower = ldlt.trailing(n);
+        let lower = ldlt.triangle().trailing(n);
         let llt = pencil.llt(3.0).unwrap().unwrap();
         let z = Mat::from_fn(n, TOGETHER + 5, |i, j| ((i * (j + 3)) as f64).sin());
         // Substitution loses `n ε` times the condition of `L`. For `L Lᵀ = K + 3 M` that is below 33: springs of at most 130
