@@ -1,7 +1,8 @@
-//! Reads the files of a full model, each in one pass, and hashes them.
+//! Reads the files of a full model, each in one pass, and hashes them meanwhile on a thread of its own.
 
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::{self, SyncSender};
 
 use sha2::{Digest, Sha256};
 
@@ -11,6 +12,8 @@ use crate::text::hex::hex;
 
 /// Size of the read buffer, bytes.
 const CHUNK: usize = 1 << 20;
+/// Number of chunks that may wait to be hashed.
+const WAITING: usize = 4;
 
 /// The TOML file of a full model and the files it refers to, with their hashes.
 pub struct Files {
@@ -48,12 +51,16 @@ impl Files {
         };
         let path = self.directory.join(name);
         let file = input_file::open(&path, input_file::FULL_MODEL_PART).map_err(missing)?;
-        let hashing = Hashing { inner: file, hasher: Sha256::new() };
-        let mut reader = BufReader::with_capacity(CHUNK, hashing);
-        let made = work(&mut reader)?;
-        // The hash covers the whole file, even if `work` did not read to the end.
-        io::copy(&mut reader, &mut io::sink()).map_err(missing)?;
-        let digest = reader.into_inner().hasher.finalize().into();
+        let (made, digest) = std::thread::scope(|scope| {
+            let (to_hasher, chunks) = mpsc::sync_channel::<Vec<u8>>(WAITING);
+            let hasher = scope.spawn(|| chunks.into_iter().fold(Sha256::new(), Sha256::chain_update).finalize());
+            let mut reader = BufReader::with_capacity(CHUNK, Copied { inner: file, to_hasher });
+            let made = work(&mut reader)?;
+            // The hash covers the whole file, even if `work` did not read to the end.
+            io::copy(&mut reader, &mut io::sink()).map_err(missing)?;
+            drop(reader);
+            Ok((made, hasher.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)).into()))
+        })?;
         if !self.digests.iter().any(|(known, _)| known == name) {
             self.digests.push((name.to_owned(), digest));
         }
@@ -77,16 +84,17 @@ impl Files {
     }
 }
 
-/// A reader that hashes everything read through it.
-struct Hashing<R> {
+/// A reader that sends a copy of everything read through it to the thread that hashes.
+struct Copied<R> {
     inner: R,
-    hasher: Sha256,
+    to_hasher: SyncSender<Vec<u8>>,
 }
 
-impl<R: Read> Read for Hashing<R> {
+impl<R: Read> Read for Copied<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let count = self.inner.read(buffer)?;
-        self.hasher.update(&buffer[..count]);
+        // The hasher receives until this reader is dropped.
+        self.to_hasher.send(buffer[..count].to_vec()).map_err(io::Error::other)?;
         Ok(count)
     }
 }

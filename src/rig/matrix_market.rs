@@ -119,7 +119,7 @@ pub fn read_entries(
             return Err(refuse("entries", value, "no more than the size says"));
         }
         seen += 1;
-        let mut words = content.split_whitespace();
+        let mut words = content.split_ascii_whitespace();
         let words = [words.next(), words.next(), words.next(), words.next()];
         let (row, column, word) = match (words, coordinate) {
             ([Some(row), Some(column), Some(word), None], true) => {
