@@ -10,7 +10,7 @@ use super::files::Files;
 use super::raw::RawPart;
 use super::tables::{self, Nodes};
 use super::{DampedModes, INTERNAL, PartGeometry};
-use crate::reduction::{FullPart, PartTurning, SYMMETRY_TOLERANCE, SparseMatrix};
+use crate::reduction::{Asymmetry, FullPart, PartTurning, SparseMatrix, first_asymmetry};
 use crate::rig::raw::OneOrMany;
 use crate::rig::settings::{MOST_COORDINATES, at_most, within};
 use crate::rig::{RigError, lines, matrix_market};
@@ -259,30 +259,18 @@ impl Read<'_> {
         if let Property::Stiffness | Property::Mass = property {
             self.check_diagonal(files, property == Property::Mass)?;
         }
-        let view = self.matrix.as_ref();
         let (sign, kind, minus) = match property {
             Property::Stiffness | Property::Mass | Property::Symmetric => (1.0, "symmetric", ""),
             Property::Skew => (-1.0, "skew-symmetric", " with opposite signs"),
         };
-        let largest = self.matrix.val().iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
-        let limit = SYMMETRY_TOLERANCE * largest;
-        for column in 0..self.matrix.ncols() {
-            for (row, &value) in view.row_idx_of_col(column).zip(view.val_of_col(column)) {
-                let mirrored = view.get(column, row).copied().unwrap_or(0.0);
-                if (value - sign * mirrored).abs() > limit {
-                    let problem = format!(
-                        "at row {}, column {} is {value}, but {mirrored} at row {}, column {}",
-                        row + 1,
-                        column + 1,
-                        column + 1,
-                        row + 1
-                    );
-                    let limit = format!("a {kind} matrix; mirrored entries{minus} may differ by {limit:.3e}");
-                    return Err(self.at_line(files, (row, column), problem, &limit));
-                }
-            }
-        }
-        Ok(())
+        let Some(Asymmetry { row, column, value, mirrored, limit }) = first_asymmetry(&self.matrix, sign) else {
+            return Ok(());
+        };
+        let [at, opposite] =
+            [(row, column), (column, row)].map(|(row, column)| format!("row {}, column {}", row + 1, column + 1));
+        let problem = format!("at {at} is {value}, but {mirrored} at {opposite}");
+        let limit = format!("a {kind} matrix; mirrored entries{minus} may differ by {limit:.3e}");
+        Err(self.at_line(files, (row, column), problem, &limit))
     }
 
     /// Checks that the matrix has a complete diagonal, and that no entry there is negative (or zero, for a mass

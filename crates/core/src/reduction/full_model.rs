@@ -22,7 +22,7 @@ use faer::{Mat, MatRef};
 
 use super::dense::symmetric_eigen;
 use super::sparse::{
-    SparseMatrix, entries, is_symmetric, symmetric_times, times, times_transposed, weighted_sum, worst_asymmetry,
+    SparseMatrix, entries, first_asymmetry, is_symmetric, symmetric_times, times, times_transposed, weighted_sum,
 };
 use super::{ReductionError, SparseModes, project_dense, project_sparse, whiten};
 use crate::contact::Statics;
@@ -580,7 +580,7 @@ impl FullModel {
 /// `Vᵀ A V` of a term, exactly symmetric or skew if `A` is up to rounding.
 fn on_basis(term: &SparseTerm, basis: MatRef<'_, f64>) -> Mat<f64> {
     let matrix = project_sparse(&term.matrix, basis, is_symmetric(&term.matrix));
-    if turns(&term.law) && worst_asymmetry(&term.matrix, -1.0).is_none() { skew_part(&matrix) } else { matrix }
+    if turns(&term.law) && first_asymmetry(&term.matrix, -1.0).is_none() { skew_part(&matrix) } else { matrix }
 }
 
 /// Whether a law is a power of the disc speed. Only matrices of such terms are made exactly skew.

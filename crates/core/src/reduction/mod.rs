@@ -85,7 +85,7 @@ pub use pencil::Pencil;
 use project::project_dense;
 pub use project::project_sparse;
 pub use residual::Residual;
-pub use sparse::{SparseMatrix, is_symmetric, weighted_sum};
+pub use sparse::{Asymmetry, SparseMatrix, first_asymmetry, is_symmetric, weighted_sum};
 
 pub use substructures::{Kept, Substructure, keep_modes};
 pub use threads::{on_threads, threads_for};

@@ -15,7 +15,7 @@ use super::elimination_tree::Tree;
 use super::fronts::Fronts;
 use super::krylov::random_block;
 use super::ordering::nested_dissection;
-use super::sparse::{entries, symmetric_times, worst_asymmetry};
+use super::sparse::{Asymmetry, entries, first_asymmetry, symmetric_times};
 use super::triangle::Triangle;
 use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
 
@@ -350,9 +350,9 @@ fn check(field: &str, what: &str, matrix: &SparseMatrix, n: usize) -> Result<(),
     if let Some((row, column, value)) = entries(matrix).find(|(_, _, value)| !value.is_finite()) {
         return Err(ReductionError::NotFinite { what, row, column, value });
     }
-    match worst_asymmetry(matrix, 1.0) {
+    match first_asymmetry(matrix, 1.0) {
         None => Ok(()),
-        Some((row, column, value, mirrored, limit)) => {
+        Some(Asymmetry { row, column, value, mirrored, limit }) => {
             Err(ReductionError::Unsymmetric { what, row, column, value, mirrored, limit })
         }
     }
