@@ -11,6 +11,7 @@ use std::panic::resume_unwind;
 use std::sync::{Mutex, PoisonError};
 
 use super::fit::{Basis, Fit};
+use super::lateral::{Speeds, in_place_of_speed};
 use super::leaf::Branches;
 use super::pairing::within_bounds;
 use super::samples::{Sample, Sampler, follow, spread};
@@ -69,6 +70,8 @@ pub enum ChartError {
 const HELD_OUT: usize = 3;
 /// A box split off within a unit of work stays pending if its share is below this fraction of the unit's.
 const UNIT: f64 = 0.04;
+/// The same with an axis of lateral damping, of whose halves the upper one holds few conditions.
+const LATERAL_UNIT: f64 = 0.005;
 /// Number of boxes tried concurrently. It is independent of the number of threads because it decides the order of
 /// boxes.
 const SIDE_BY_SIDE: usize = 4;
@@ -106,7 +109,14 @@ pub fn resume(
     begun: Option<Chart>,
     go_on: &mut dyn FnMut(&Progress<'_>) -> bool,
 ) -> Result<Chart, ChartError> {
-    let (axes, low, high) = domain(model, options)?;
+    let (mut axes, mut low, mut high) = domain(model, options)?;
+    let lateral = speeds_and_model(model, options, &axes);
+    let speeds = lateral.as_ref().map(|(speeds, _)| *speeds);
+    if let (Some(speeds), Some(last)) = (speeds, axes.len().checked_sub(1)) {
+        axes[last] = Axis::LateralDamping;
+        [low[last], high[last]] = speeds.range(&options.low, &options.high);
+    }
+    let model = lateral.as_ref().map_or(model, |(_, model)| model);
     let sampler = Sampler { model, traces: Traces::new(model), axes: axes.clone(), low, high, base: options.low };
     let mut solvers: Vec<Solver> = (0..options.threads.max(1)).map(|_| Solver::new(model.dimension())).collect();
     let chart = match begun {
@@ -117,7 +127,7 @@ pub fn resume(
             let basis = Basis::for_axes(axes.len());
             let branches = vec![Branch::Pending];
             let mut chart =
-                Chart { axes, low, high, basis, branches, leaves: vec![], undamped, solves: 1, totals: None };
+                Chart { axes, low, high, speeds, basis, branches, leaves: vec![], undamped, solves: 1, totals: None };
             if model.statics().is_some() {
                 let smallest_share = options.smallest_share;
                 let (axes, base) = (&sampler.axes, options.low);
@@ -160,7 +170,7 @@ fn domain(model: &Model, options: &ChartOptions) -> Result<(Vec<Axis>, Corner, C
         };
         (low[k], high[k]) = match axis {
             Axis::LoadOverSpeed => (corner(&options.low, &options.high), corner(&options.high, &options.low)),
-            Axis::Friction | Axis::Load | Axis::Speed => {
+            Axis::Friction | Axis::Load | Axis::Speed | Axis::LateralDamping => {
                 (corner(&options.low, &options.low), corner(&options.high, &options.high))
             }
         };
@@ -168,13 +178,25 @@ fn domain(model: &Model, options: &ChartOptions) -> Result<(Vec<Axis>, Corner, C
             let (what, limit) = match axis {
                 Axis::Friction => ("friction coefficient", ""),
                 Axis::Load => ("normal load", " above 0"),
-                Axis::Speed => ("disc speed", " above 0"),
+                Axis::Speed | Axis::LateralDamping => ("disc speed", " above 0"),
                 Axis::LoadOverSpeed => ("normal load over disc speed", " above 0"),
             };
             return Err(ChartError::Range { what, low: low[k], high: high[k], limit });
         }
     }
     Ok((axes, low, high))
+}
+
+/// The speeds of a chart and its model with lateral damping in place of the speed, if an axis of lateral damping replaces that
+/// of the speed.
+fn speeds_and_model(model: &Model, options: &ChartOptions, axes: &[Axis]) -> Option<(Speeds, Model)> {
+    let [low, high] = [options.low, options.high].map(|p| p.disc_speed_rad_s);
+    let one_way = low * high > 0.0;
+    if axes != [Axis::Friction, Axis::Load, Axis::Speed] || !one_way || options.low.friction_coefficient < 0.0 {
+        return None;
+    }
+    let speeds = Speeds { low: low.abs().min(high.abs()), high: low.abs().max(high.abs()) };
+    in_place_of_speed(model).map(|model| (speeds, model))
 }
 
 /// A box to be charted.
@@ -188,24 +210,26 @@ struct Work {
 }
 
 impl Work {
-    /// Splits the box along an axis: the coordinate of the split, and the lower and upper half, each with the samples
-    /// that lie in it. Both halves become pending in `chart`.
-    fn halves(self, axis: usize, chart: &mut Chart) -> (f64, [Self; 2]) {
+    /// Splits the box along an axis: the branch of the split, and the lower and upper half, each trimmed to its conditions
+    /// and with the samples that lie in it. The halves become pending in `chart`; one without conditions is left out.
+    fn halves(self, axis: usize, chart: &mut Chart) -> (Branch, Vec<Self>) {
         let Self { low, high, samples, .. } = self;
         let at = 0.5 * (low[axis] + high[axis]);
         let slot = chart.branches.len();
-        chart.branches.extend([Branch::Pending, Branch::Pending]);
         let (mut middle_high, mut middle_low) = (high, low);
         (middle_high[axis], middle_low[axis]) = (at, at);
-        let (below, above) = samples.into_iter().partition(|sample| sample.at[axis] < at);
-        let half = |slot, low: Corner, high: Corner, samples| Self {
-            slot,
-            low,
-            high,
-            share: chart.share(&low, &high),
-            samples,
-        };
-        (at, [half(slot, low, middle_high, below), half(slot + 1, middle_low, high, above)])
+        let (below, above): (Vec<Sample>, Vec<Sample>) = samples.into_iter().partition(|sample| sample.at[axis] < at);
+        let mut halves = vec![];
+        for (slot, low, high, mut samples) in [(slot, low, middle_high, below), (slot + 1, middle_low, high, above)] {
+            let Some((low, high)) = chart.trimmed(&low, &high) else {
+                chart.branches.push(Branch::Dense);
+                continue;
+            };
+            chart.branches.push(Branch::Pending);
+            samples.retain(|sample| (0..chart.axes.len()).all(|k| (low[k]..=high[k]).contains(&sample.at[k])));
+            halves.push(Self { slot, low, high, share: chart.share(&low, &high), samples });
+        }
+        (Branch::Split { axis, at, below: slot, above: slot + 1 }, halves)
     }
 }
 
@@ -239,7 +263,8 @@ impl Builder<'_> {
 
     /// Charts a box, and recursively its halves until they are much smaller than it.
     fn unit(&mut self, unit: Work, go_on: &mut dyn FnMut(&Progress<'_>) -> bool) -> Result<(), ChartError> {
-        let smallest = (UNIT * unit.share).max(self.options.smallest_share);
+        let part = if self.chart.speeds.is_some() { LATERAL_UNIT } else { UNIT };
+        let smallest = (part * unit.share).max(self.options.smallest_share);
         let mut stack = vec![unit];
         let mut unit_finished = true;
         while !stack.is_empty() {
@@ -258,10 +283,9 @@ impl Builder<'_> {
                         Branch::Leaf(self.chart.leaves.len() - 1)
                     }
                     Outcome::Split(axis) => {
-                        let (at, halves) = work.halves(axis, &mut self.chart);
-                        let [below, above] = [0, 1].map(|k| halves[k].slot);
+                        let (split, halves) = work.halves(axis, &mut self.chart);
                         stack.extend(halves.into_iter().rev().filter(|half| half.share >= smallest));
-                        Branch::Split { axis, at, below, above }
+                        split
                     }
                 };
             }
@@ -354,7 +378,7 @@ impl Builder<'_> {
         let (mut scratch, mut modes) = (Scratch::default(), vec![]);
         held_out.iter().all(|sample| {
             modes.clear();
-            alone.evaluate(&sample.spectrum.point, sample.totals, &mut scratch, &mut modes).is_ok()
+            alone.evaluate_at(&sample.at, sample.totals, &mut scratch, &mut modes).is_ok()
                 && within_bounds(&modes, &sample.spectrum)
         })
     }
@@ -443,16 +467,36 @@ mod tests {
         }
     }
 
-    /// Three axes down to low speeds, where `μN/ω` moves the roots far: split along the axis along which roots curve most,
-    /// nearly all conditions are charted after this number of solves; split by the last coefficients, half of them.
+    /// Three axes down to low speeds, where `μN/ω` moves the roots far and makes some static, whichever way the disc turns. Nearly
+    /// all conditions are charted after this number of solves; over the speed instead of `μN/ω`, none.
     #[test]
     fn three_axes_down_to_low_speeds() {
         let contact_law =
             ContactLaw { exponent: 1.0 / 3.0, slope_s_per_m: -0.02, lateral_damping: true, ..Default::default() };
         let model = rig(&Synthetic { modes: 24, pairs: 48, damping_ratio: 5e-3, contact_law, seed: 1 }).unwrap();
-        let options = ChartOptions { max_solves: 3500, ..options((0.0, 50.0, 1.0), (1.0, 2000.0, 60.0), Some(5000.0)) };
-        let found = held_out(&model, &options, 300);
-        assert!(found.charted > 270, "{found:?}");
+        for (from, to) in [(1.0, 60.0), (-60.0, -1.0)] {
+            let options =
+                ChartOptions { max_solves: 2000, ..options((0.0, 50.0, from), (1.0, 2000.0, to), Some(5000.0)) };
+            let found = held_out(&model, &options, 300);
+            assert!(found.charted > 290, "{from} to {to} rad/s: {found:?}");
+        }
+    }
+
+    /// Conditions beyond the speeds are outside a chart over lateral damping, though `μN/ω` is within it.
+    #[test]
+    fn speeds_beyond_those_of_a_chart_are_outside() {
+        let contact_law = ContactLaw { exponent: 0.3, lateral_damping: true, ..Default::default() };
+        let model = rig(&Synthetic { modes: 4, pairs: 6, damping_ratio: 5e-3, contact_law, seed: 1 }).unwrap();
+        let options = options((0.0, 400.0, 10.0), (0.4, 600.0, 20.0), None);
+        let chart = build(&model, &options, &|_| true).expect("the chart can be built");
+        let chart = Chart::from_words(&chart.words()).expect("words of a chart");
+        let traces = Traces::new(&model);
+        let answer = |disc_speed_rad_s: f64| {
+            let p = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s, friction_coefficient: 0.2 };
+            chart.evaluate(&p, traces.at(&model, &p), &mut Scratch::default(), &mut vec![]).map(|_| ())
+        };
+        assert_eq!([10.0, 15.0, 20.0].map(answer), [Ok(()); 3]);
+        assert_eq!([9.9, 20.1].map(answer), [Err(NotCharted::Outside); 2]);
     }
 
     /// Friction that falls with speed: the damping of each of 48 pairs at different radii follows the disc speed. On the

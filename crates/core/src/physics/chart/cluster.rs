@@ -9,7 +9,13 @@ use faer::c64;
 use crate::physics::spectrum::{magnitude, square_root};
 
 /// Maximum number of roots of a cluster.
-pub const MAX_SIZE: usize = 4;
+pub const MAX_SIZE: usize = 8;
+
+/// Maximum number of roots of a cluster in a chart over `axes` conditions. Over three, a heavily damped root passes many
+/// others before it meets the one that it merges with.
+pub fn max_size(axes: usize) -> usize {
+    if axes < 3 { 4 } else { MAX_SIZE }
+}
 
 /// The symmetric functions of the roots `z`: their mean, then the coefficients of `w^(k-2) .. w^0`.
 pub fn symmetric_functions(z: &[c64]) -> Vec<c64> {
@@ -168,7 +174,7 @@ fn simultaneous(a: &[c64], w: &mut [c64]) {
 mod tests {
     use super::*;
 
-    /// Roots to symmetric functions and back: clusters of one to four roots, merging pairs included.
+    /// Roots to symmetric functions and back: clusters of one to eight roots, merging pairs included.
     #[test]
     fn there_and_back() {
         let z = |re: f64, im: f64| c64::new(re, im);
@@ -178,6 +184,7 @@ mod tests {
             vec![z(-4.0, 0.0), z(-4.1, 0.0), z(-3.7, 0.0)],
             vec![z(-4.0, 0.2), z(-4.0, -0.2), z(-3.7, 0.0)],
             vec![z(-4.0, 0.2), z(-4.0, -0.2), z(-3.7, 0.1), z(-3.7, -0.1)],
+            (0..8).map(|k| z(-4.0 + 0.1 * f64::from(k % 3), 0.15 * f64::from(k))).collect(),
         ];
         for roots_in in cases {
             let functions = symmetric_functions(&roots_in);

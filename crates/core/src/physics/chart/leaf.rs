@@ -4,7 +4,7 @@
 use faer::{Mat, c64};
 
 use super::build::Builder;
-use super::cluster::{MAX_SIZE, symmetric_curvatures, symmetric_functions, symmetric_slopes};
+use super::cluster::{max_size, symmetric_curvatures, symmetric_functions, symmetric_slopes};
 use super::derivatives::pairs;
 use super::fit::{Basis, Fit, Fitted};
 use super::samples::Sample;
@@ -91,6 +91,7 @@ impl Builder<'_> {
         let omega = |z: c64| if branches.undamped { (-z.re).max(0.0).sqrt() } else { z.im };
         let limit = self.options.band_max_hz.map_or(f64::INFINITY, |hz| hz * std::f64::consts::TAU);
         let in_band = |branch: usize| (0..branches.samples.len()).any(|k| omega(branches.z(k, branch)) <= limit);
+        let most = max_size(self.chart.axes.len());
         let mut settled: Vec<(Vec<usize>, Expansion)> = vec![];
         let mut open: Vec<Vec<usize>> = (0..branches.count).filter(|&k| in_band(k)).map(|k| vec![k]).collect();
         while let Some(members) = open.pop() {
@@ -99,7 +100,7 @@ impl Builder<'_> {
                 settled.push((members, expansion));
                 continue;
             };
-            if members.len() >= MAX_SIZE {
+            if members.len() >= most {
                 return Err(axis);
             }
             // The branch nearest to any member joins the cluster, with its own cluster if it has one.
@@ -117,7 +118,7 @@ impl Builder<'_> {
             } else {
                 joined.push(nearest);
             }
-            if joined.len() > MAX_SIZE {
+            if joined.len() > most {
                 return Err(axis);
             }
             open.push(joined);

@@ -12,6 +12,7 @@ mod channels;
 mod cluster;
 mod derivatives;
 mod fit;
+mod lateral;
 mod leaf;
 pub(crate) mod pairing;
 mod pieces;
@@ -30,6 +31,7 @@ use super::traces::Exact;
 use channels::Channels;
 use cluster::MAX_SIZE;
 use fit::Basis;
+use lateral::Speeds;
 use totals::Totals;
 use tree::Branch;
 
@@ -48,6 +50,8 @@ pub(crate) enum Axis {
     Speed,
     /// Ratio of load to speed, if the model depends on both only through it.
     LoadOverSpeed,
+    /// Damping coefficient of lateral friction, `μ N / |ω|`, if the speed matters to nothing else; see [`lateral`].
+    LateralDamping,
 }
 
 impl Axis {
@@ -58,16 +62,19 @@ impl Axis {
             Self::Load => p.normal_load_n.ln(),
             Self::Speed => -1.0 / p.disc_speed_rad_s,
             Self::LoadOverSpeed => p.normal_load_n / p.disc_speed_rad_s,
+            Self::LateralDamping => p.friction_coefficient * p.normal_load_n / p.disc_speed_rad_s.abs(),
         }
     }
 
-    /// Moves `p` to `coordinate` on this axis.
+    /// Moves `p` to `coordinate` on this axis. With an axis of lateral damping, `p` is a point of the model
+    /// [`lateral::in_place_of_speed`].
     fn place(self, p: &mut OperatingPoint, coordinate: f64) {
         match self {
             Self::Friction => p.friction_coefficient = coordinate,
             Self::Load => p.normal_load_n = coordinate.exp(),
             Self::Speed => p.disc_speed_rad_s = -1.0 / coordinate,
             Self::LoadOverSpeed => p.normal_load_n = coordinate * p.disc_speed_rad_s,
+            Self::LateralDamping => lateral::place(p, coordinate),
         }
     }
 
@@ -79,21 +86,22 @@ impl Axis {
             Self::Load => (Parameter::Load, p.normal_load_n),
             Self::Speed => (Parameter::Speed, p.disc_speed_rad_s * p.disc_speed_rad_s),
             Self::LoadOverSpeed => (Parameter::Load, p.disc_speed_rad_s),
+            Self::LateralDamping => (Parameter::Speed, p.disc_speed_rad_s.signum()),
         }
     }
 
-    /// Whether the coordinate depends on the speed, beyond whose range in the box laws may be undefined.
+    /// Whether steps along the coordinate change the speed, beyond whose range in the box laws may be undefined.
     fn involves_speed(self) -> bool {
         match self {
             Self::Speed | Self::LoadOverSpeed => true,
-            Self::Friction | Self::Load => false,
+            Self::Friction | Self::Load | Self::LateralDamping => false,
         }
     }
 
-    /// Coordinate in which conditions are uniformly distributed, if loads and speeds are.
+    /// Coordinate in which conditions are uniformly distributed, if loads and speeds are. Not with an axis of lateral damping.
     fn condition(self, coordinate: f64) -> f64 {
         match self {
-            Self::Friction => coordinate,
+            Self::Friction | Self::LateralDamping => coordinate,
             Self::Load => coordinate.exp(),
             Self::Speed | Self::LoadOverSpeed => -1.0 / coordinate,
         }
@@ -166,6 +174,8 @@ pub struct Chart {
     axes: Vec<Axis>,
     low: [f64; MAX_AXES],
     high: [f64; MAX_AXES],
+    /// Range of speeds, if one axis is that of lateral damping.
+    speeds: Option<Speeds>,
     basis: Basis,
     branches: Vec<Branch>,
     leaves: Vec<Leaf>,
@@ -210,20 +220,30 @@ impl Chart {
 
     /// Share of all conditions that lie in a box.
     fn share(&self, low: &[f64; MAX_AXES], high: &[f64; MAX_AXES]) -> f64 {
+        if let Some(speeds) = &self.speeds {
+            return speeds.volume(low, high) / speeds.volume(&self.low, &self.high);
+        }
         let width = |axis: &Axis, low: f64, high: f64| axis.condition(high) - axis.condition(low);
         let along = |k: usize| width(&self.axes[k], low[k], high[k]) / width(&self.axes[k], self.low[k], self.high[k]);
         (0..self.axes.len()).map(along).product()
     }
 
-    /// Every box of the tree, with its index among the branches.
+    /// The part of a box that holds conditions; `None` if it holds none.
+    fn trimmed(&self, low: &[f64; MAX_AXES], high: &[f64; MAX_AXES]) -> Option<([f64; MAX_AXES], [f64; MAX_AXES])> {
+        self.speeds.map_or(Some((*low, *high)), |speeds| speeds.trimmed(low, high))
+    }
+
+    /// Every box of the tree that holds conditions, with its index among the branches.
     fn boxes(&self) -> impl Iterator<Item = (usize, [f64; MAX_AXES], [f64; MAX_AXES])> {
         let mut open = vec![(0, self.low, self.high)];
         std::iter::from_fn(move || {
-            let (slot, low, high) = open.pop()?;
+            let (slot, low, high): (usize, [f64; MAX_AXES], [f64; MAX_AXES]) = open.pop()?;
             if let Branch::Split { axis, at, below, above } = self.branches[slot] {
                 let (mut middle_high, mut middle_low) = (high, low);
                 (middle_high[axis], middle_low[axis]) = (at, at);
-                open.extend([(above, middle_low, high), (below, low, middle_high)]);
+                let halves = [(above, middle_low, high), (below, low, middle_high)];
+                let part = |(slot, low, high)| self.trimmed(&low, &high).map(|(low, high)| (slot, low, high));
+                open.extend(halves.into_iter().filter_map(part));
             }
             Some((slot, low, high))
         })
@@ -241,6 +261,7 @@ impl Chart {
             axes: self.axes.clone(),
             low: leaf.low,
             high: leaf.high,
+            speeds: self.speeds,
             basis: self.basis.clone(),
             branches: vec![Branch::Leaf(0)],
             leaves: vec![leaf.clone()],
@@ -277,9 +298,20 @@ impl Chart {
         scratch: &mut Scratch,
         out: &mut Vec<Root>,
     ) -> Result<Census, NotCharted> {
-        let leaf = self.expand(p, scratch)?;
+        self.evaluate_at(&self.coordinates(p)?, known, scratch, out)
+    }
+
+    /// Does the same as [`Self::evaluate`] at coordinates in the box.
+    fn evaluate_at(
+        &self,
+        x: &[f64; MAX_AXES],
+        known: Exact,
+        scratch: &mut Scratch,
+        out: &mut Vec<Root>,
+    ) -> Result<Census, NotCharted> {
+        let leaf = self.expand(x, scratch)?;
         let known = match &self.totals {
-            Some(totals) => totals.at(&self.coordinates(p)?)?,
+            Some(totals) => totals.at(x)?,
             None => known,
         };
         leaf.auxiliary.evaluate(&self.basis, &scratch.basis, &mut scratch.auxiliary);
@@ -333,6 +365,9 @@ impl Chart {
                 return Err(NotCharted::Outside);
             }
         }
+        if self.speeds.is_some_and(|speeds| !speeds.hold(p)) {
+            return Err(NotCharted::Outside);
+        }
         Ok(x)
     }
 
@@ -342,7 +377,7 @@ impl Chart {
     /// # Errors
     /// [`NotCharted`]; `out` is unchanged then.
     pub fn values(&self, p: &OperatingPoint, scratch: &mut Scratch, out: &mut Vec<c64>) -> Result<(), NotCharted> {
-        let leaf = self.expand(p, scratch)?;
+        let leaf = self.expand(&self.coordinates(p)?, scratch)?;
         for cluster in &leaf.clusters {
             let size = cluster.size();
             let functions = self.functions(cluster, &scratch.functions);
@@ -368,10 +403,9 @@ impl Chart {
         functions
     }
 
-    /// The leaf that contains `p`. `scratch` then holds the basis polynomials and the symmetric functions at `p`.
-    fn expand(&self, p: &OperatingPoint, scratch: &mut Scratch) -> Result<&Leaf, NotCharted> {
-        let x = self.coordinates(p)?;
-        let leaf = &self.leaves[tree::find(&self.branches, &x).ok_or(NotCharted::NotConverged)?];
+    /// The leaf that contains the coordinates `x`. `scratch` then holds the basis polynomials and the symmetric functions there.
+    fn expand(&self, x: &[f64; MAX_AXES], scratch: &mut Scratch) -> Result<&Leaf, NotCharted> {
+        let leaf = &self.leaves[tree::find(&self.branches, x).ok_or(NotCharted::NotConverged)?];
         let mut unit = [0.0; MAX_AXES];
         for (k, unit) in unit[..self.axes.len()].iter_mut().enumerate() {
             *unit = 2.0 * (x[k] - leaf.low[k]) / (leaf.high[k] - leaf.low[k]) - 1.0;

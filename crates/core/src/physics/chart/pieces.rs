@@ -35,7 +35,7 @@ impl<'a> Pieces<'a> {
         let breaks = model.statics().map(|statics| statics.parts().law.breaks()).filter(|breaks| !breaks.is_empty())?;
         let moves = |axis: &Axis| match axis {
             Axis::Friction | Axis::Load | Axis::LoadOverSpeed => true,
-            Axis::Speed => false,
+            Axis::Speed | Axis::LateralDamping => false,
         };
         let axes = axes.iter().copied().enumerate().filter(|(_, axis)| moves(axis)).collect();
         Some(Self { model, breaks, axes, base })

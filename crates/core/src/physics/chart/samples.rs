@@ -5,7 +5,7 @@ use faer::{Mat, c64};
 
 use super::derivatives::{Change, Derivatives, PAIRS, pairs};
 use super::pieces::Pieces;
-use super::{Axis, MAX_AXES};
+use super::{Axis, MAX_AXES, lateral};
 use crate::physics::model::Model;
 use crate::physics::operating_point::OperatingPoint;
 use crate::physics::solver::{ROUNDING, Solver};
@@ -267,11 +267,15 @@ impl Sampler<'_> {
         Ok(sums)
     }
 
-    /// The central difference along an axis at `x`, with both points inside the box.
+    /// The central difference along an axis at `x`, with both points inside the box; those of lateral damping may be outside.
     fn difference(&self, x: &[f64; MAX_AXES], axis: usize) -> Difference {
         let (mut below, mut above) = (*x, *x);
-        below[axis] = (x[axis] - STEP).max(self.low[axis]);
-        above[axis] = (x[axis] + STEP).min(self.high[axis]);
+        if self.axes[axis] == Axis::LateralDamping {
+            (below[axis], above[axis]) = (x[axis] - lateral::STEP, x[axis] + lateral::STEP);
+        } else {
+            below[axis] = (x[axis] - STEP).max(self.low[axis]);
+            above[axis] = (x[axis] + STEP).min(self.high[axis]);
+        }
         let per = 1.0 / (above[axis] - below[axis]);
         Difference { below: self.point(&below), above: self.point(&above), per }
     }
@@ -279,7 +283,12 @@ impl Sampler<'_> {
     /// The differences whose sum is the second derivative along axes `a` and `b` at `x`. In friction and load, laws
     /// are defined slightly beyond the box. At an end of an axis of speed the derivative is taken one step inside.
     fn second_difference(&self, x: &[f64; MAX_AXES], [a, b]: [usize; 2]) -> [Difference; 2] {
-        let step = |k: usize| 0.5 * WIDE_STEP * (self.high[k] - self.low[k]);
+        let step = |k: usize| match self.axes[k] {
+            Axis::LateralDamping => lateral::STEP,
+            Axis::Friction | Axis::Load | Axis::Speed | Axis::LoadOverSpeed => {
+                0.5 * WIDE_STEP * (self.high[k] - self.low[k])
+            }
+        };
         let mut centre = *x;
         for k in [a, b].into_iter().filter(|&k| self.axes[k].involves_speed()) {
             centre[k] = x[k].clamp(self.low[k] + step(k), self.high[k] - step(k));

@@ -2,20 +2,22 @@
 
 use super::cluster::MAX_SIZE;
 use super::fit::Basis;
+use super::lateral::Speeds;
 use super::totals::Totals;
 use super::{Axis, Branch, Channels, Chart, Cluster, Leaf, MAX_AXES, REMAINDERS};
 
 /// Format version: incremented when the meaning of the words or the result of a build changes.
-pub const FORMAT: u64 = 7;
+pub const FORMAT: u64 = 8;
 
 /// The source files that determine the result of a build. Stored charts are keyed by them, so a chart of an older
 /// builder is never used.
-pub const BUILDER: [&str; 40] = [
+pub const BUILDER: [&str; 41] = [
     include_str!("build.rs"),
     include_str!("channels.rs"),
     include_str!("cluster.rs"),
     include_str!("derivatives.rs"),
     include_str!("fit.rs"),
+    include_str!("lateral.rs"),
     include_str!("leaf.rs"),
     include_str!("mod.rs"),
     include_str!("pairing.rs"),
@@ -53,7 +55,7 @@ pub const BUILDER: [&str; 40] = [
     include_str!("../../sampling.rs"),
 ];
 
-const AXES: [Axis; 4] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed];
+const AXES: [Axis; 5] = [Axis::Friction, Axis::Load, Axis::Speed, Axis::LoadOverSpeed, Axis::LateralDamping];
 
 impl Chart {
     /// The complete content of the chart: charts with equal words give equal predictions.
@@ -62,6 +64,7 @@ impl Chart {
         words.extend(self.axes.iter().map(|axis| *axis as u64));
         words.push(self.basis.degree() as u64);
         words.extend(self.low.iter().chain(&self.high).map(|x| x.to_bits()));
+        words.extend(self.speeds.iter().flat_map(|speeds| [speeds.low, speeds.high]).map(f64::to_bits));
         words.push(self.branches.len() as u64);
         for branch in &self.branches {
             words.extend(branch.words());
@@ -99,6 +102,10 @@ impl Chart {
             return None;
         }
         let (low, high) = (words.numbers()?, words.numbers()?);
+        let speeds = match axes.contains(&Axis::LateralDamping) {
+            true => Some(Speeds { low: words.number()?, high: words.number()? }),
+            false => None,
+        };
         let count = words.count(words.0.len())?;
         let branches: Vec<Branch> = (0..count).map(|k| words.branch(k, count, axes.len())).collect::<Option<_>>()?;
         let leaves: Vec<Leaf> =
@@ -109,7 +116,7 @@ impl Chart {
             words => Some(Totals::from_words(words).filter(|totals| totals.axes() == axes.len())?),
         };
         let whole = known && count > 0;
-        whole.then_some(Self { axes, low, high, basis, branches, leaves, undamped, solves, totals })
+        whole.then_some(Self { axes, low, high, speeds, basis, branches, leaves, undamped, solves, totals })
     }
 }
 
