@@ -23,6 +23,9 @@ use super::schur::Schur;
 pub(super) const BLOCK: usize = 4;
 /// Largest number of restarts.
 const MOST_RESTARTS: usize = 40;
+/// Length of a vector, relative to what it was, below which its remainder outside its own block is made orthogonal to the
+/// earlier blocks again: an error of orthogonality grows by the inverse of this.
+const REMAINDER: f64 = 0.1;
 /// Relative difference of magnitudes below which two eigenvalues are a pair that a restart must not separate.
 const TOGETHER: f64 = 1e-9;
 
@@ -76,6 +79,8 @@ impl Iteration<'_> {
         space.append(start, None, self.seed);
         let mut next_check = (3 * self.count / 2).min(capacity);
         let (mut restarts, mut built) = (0, BLOCK);
+        // Size of the basis and number of converged pairs at the last check.
+        let mut last = (0, 0);
         loop {
             let mut w = apply(space.basis.last_block(BLOCK))?;
             let before = w.norm_l2();
@@ -84,9 +89,9 @@ impl Iteration<'_> {
             let full = space.basis.size() + BLOCK > capacity || whole;
             if full || space.basis.size() >= next_check {
                 let remainder = T::inner(w.as_ref(), w.as_ref());
-                let ritz = space.ritz(self.what, remainder.as_ref())?;
-                let good = |k: &usize| ritz.residuals[*k] <= self.residual_limit || whole;
-                let converged = (0..space.basis.size()).take_while(good).count();
+                let limit = if whole { f64::INFINITY } else { self.residual_limit };
+                let ritz = space.ritz(self.what, remainder.as_ref(), limit)?;
+                let converged = ritz.converged;
                 progress(built, converged);
                 let theta: Vec<c64> = (0..converged).map(|k| ritz.schur.value(k)).collect();
                 if converged >= self.count || whole || (converged > 0 && enough(&theta)) {
@@ -97,7 +102,7 @@ impl Iteration<'_> {
                     return Err(ReductionError::NotConverged {
                         what: self.what.to_owned(),
                         mode: converged,
-                        value: ritz.residuals[converged],
+                        value: ritz.next_residual,
                         limit: self.residual_limit,
                         vectors: built,
                     });
@@ -106,11 +111,17 @@ impl Iteration<'_> {
                     let coupling = space.restart(&ritz, (self.count + capacity) / 2)?;
                     restarts += 1;
                     next_check = space.basis.size() + self.count / 2;
+                    last = (space.basis.size(), converged);
                     space.append(w, Some(coupling), self.seed);
                     built += BLOCK;
                     continue;
                 }
-                next_check = space.basis.size() + (self.count / 2).max(BLOCK);
+                // A check takes as long as several steps. Convergence accelerates: the next check comes halfway to where
+                // its present rate leads.
+                let (grown, gained) = (space.basis.size() - last.0, converged.saturating_sub(last.1).max(1));
+                let expected = (self.count - converged) * grown / gained;
+                next_check = space.basis.size() + (expected / 2).clamp(self.count / 2, self.count).max(BLOCK);
+                last = (space.basis.size(), converged);
             }
             space.append(w, None, self.seed);
             built += BLOCK;
@@ -118,10 +129,13 @@ impl Iteration<'_> {
     }
 }
 
-/// Ordered Schur form of the projected operator, and the residual of every Ritz pair relative to its `θ`.
+/// Ordered Schur form of the projected operator.
 struct Ritz {
     schur: Schur,
-    residuals: Vec<f64>,
+    /// Number of the largest Ritz pairs whose residuals are within the limit.
+    converged: usize,
+    /// Residual of the next one, relative to its `θ`; 0 if all are within it.
+    next_residual: f64,
 }
 
 /// Orthonormal basis `V` and the projected operator `H = Vᴴ C V`.
@@ -155,13 +169,18 @@ impl<T: Number> Space<T> {
         let whole = block.norm_l2();
         for column in 0..BLOCK {
             let mut vector = block.subcols(column, 1).to_owned();
-            let within = self.basis.make_orthogonal(&mut vector, start);
-            (0..column).for_each(|i| r[(i, column)] = within[(i, 0)].complex());
+            let before = vector.norm_l2();
+            for _ in 0..2 {
+                let within = self.basis.make_orthogonal(&mut vector, start);
+                (0..column).for_each(|i| r[(i, column)] += within[(i, 0)].complex());
+            }
             let mut norm = vector.norm_l2();
             if norm > 1e-13 * whole {
-                // A small remainder may no longer be orthogonal to the basis.
-                self.basis.make_orthogonal(&mut vector, 0);
-                norm = vector.norm_l2();
+                // A small remainder is no longer orthogonal to the earlier blocks, as the whole vector was.
+                if norm < REMAINDER * before {
+                    (0..2).for_each(|_| drop(self.basis.make_orthogonal(&mut vector, 0)));
+                    norm = vector.norm_l2();
+                }
                 r[(column, column)] = c64::new(norm, 0.0);
             }
             let mut attempt = 0;
@@ -176,7 +195,6 @@ impl<T: Number> Space<T> {
                 }
             }
             Basis::normalise(&mut vector);
-            self.basis.make_orthogonal(&mut vector, 0);
             self.basis.push(&vector);
         }
         let joined = match coupling {
@@ -190,8 +208,9 @@ impl<T: Number> Space<T> {
         }
     }
 
-    /// Ordered Schur form of `H` and residuals; `remainder` is the Gram matrix of the next block.
-    fn ritz(&self, what: &str, remainder: MatRef<'_, T>) -> Result<Ritz, ReductionError> {
+    /// Ordered Schur form of `H`, and how many Ritz pairs have residuals, relative to their `θ`, of at most `limit`;
+    /// `remainder` is the Gram matrix of the next block.
+    fn ritz(&self, what: &str, remainder: MatRef<'_, T>, limit: f64) -> Result<Ritz, ReductionError> {
         let m = self.basis.size();
         let failed = || ReductionError::Factorisation {
             what: what.to_owned(),
@@ -200,16 +219,16 @@ impl<T: Number> Space<T> {
         let mut schur = Schur::new(self.projected.submatrix(0, 0, m, m)).ok_or_else(failed)?;
         schur.sort();
         let residual = |k: usize| {
-            let vector = schur.vector(k);
-            let tail = |i: usize| vector[(m - BLOCK + i, 0)];
+            let tail = schur.last_rows_of_vector(k, BLOCK);
             let sum: c64 = (0..BLOCK)
                 .flat_map(|i| (0..BLOCK).map(move |j| (i, j)))
-                .map(|(i, j)| tail(i).conj() * remainder[(i, j)].complex() * tail(j))
+                .map(|(i, j)| tail[(i, 0)].conj() * remainder[(i, j)].complex() * tail[(j, 0)])
                 .sum();
             sum.re.max(0.0).sqrt() / schur.value(k).norm()
         };
-        let residuals = (0..m).map(residual).collect();
-        Ok(Ritz { schur, residuals })
+        let bad = (0..m).map(|k| (k, residual(k))).find(|&(_, residual)| residual > limit || residual.is_nan());
+        let (converged, next_residual) = bad.unwrap_or((m, 0.0));
+        Ok(Ritz { schur, converged, next_residual })
     }
 
     /// The Ritz vectors of the `count` largest Ritz values.

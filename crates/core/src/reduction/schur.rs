@@ -29,39 +29,53 @@ impl Schur {
     pub(super) fn new(matrix: MatRef<'_, c64>) -> Option<Self> {
         let m = matrix.nrows();
         let mut schur = Self { t: matrix.to_owned(), u: Mat::identity(m, m) };
-        schur.hessenberg();
-        schur.iterate().then_some(schur)
+        let converged = pulp::Arch::new().dispatch(
+            #[inline(always)]
+            || {
+                schur.hessenberg();
+                schur.iterate()
+            },
+        );
+        converged.then_some(schur)
     }
 
-    /// Reduces `T` to Hessenberg form: zero below the first subdiagonal.
+    /// Reduces `T` to Hessenberg form: zero below the first subdiagonal. All loops run along columns, which are
+    /// contiguous.
+    #[inline(always)]
     fn hessenberg(&mut self) {
         let m = self.t.nrows();
+        let mut along = vec![ZERO; m];
         for k in 0..m.saturating_sub(2) {
-            let mut v: Vec<c64> = (k + 1..m).map(|i| self.t[(i, k)]).collect();
+            let mut v = self.t.col_as_slice(k)[k + 1..].to_vec();
             let norm = v.iter().map(|x| x.norm_sqr()).sum::<f64>().sqrt();
             if norm == 0.0 {
                 continue;
             }
             let phase = if v[0] == ZERO { ONE } else { v[0] / v[0].norm() };
             v[0] += phase * norm;
-            let scale = v.iter().map(|x| x.norm_sqr()).sum::<f64>();
+            let scale = 2.0 / v.iter().map(|x| x.norm_sqr()).sum::<f64>();
             for j in k..m {
-                let dot: c64 = v.iter().enumerate().map(|(i, x)| x.conj() * self.t[(k + 1 + i, j)]).sum();
-                let factor = dot * (2.0 / scale);
-                v.iter().enumerate().for_each(|(i, x)| self.t[(k + 1 + i, j)] -= factor * x);
+                let column = &mut self.t.col_as_slice_mut(j)[k + 1..];
+                let factor = dot(&v, column) * scale;
+                column.iter_mut().zip(&v).for_each(|(t, x)| *t -= factor * x);
             }
             for matrix in [&mut self.t, &mut self.u] {
-                for i in 0..m {
-                    let dot: c64 = v.iter().enumerate().map(|(j, x)| matrix[(i, k + 1 + j)] * x).sum();
-                    let factor = dot * (2.0 / scale);
-                    v.iter().enumerate().for_each(|(j, x)| matrix[(i, k + 1 + j)] -= factor * x.conj());
+                along.fill(ZERO);
+                for (j, x) in v.iter().enumerate() {
+                    along.iter_mut().zip(matrix.col_as_slice(k + 1 + j)).for_each(|(sum, t)| *sum += t * x);
+                }
+                for (j, x) in v.iter().enumerate() {
+                    let factor = x.conj() * scale;
+                    let column = matrix.col_as_slice_mut(k + 1 + j);
+                    column.iter_mut().zip(&along).for_each(|(t, sum)| *t -= sum * factor);
                 }
             }
-            (k + 2..m).for_each(|i| self.t[(i, k)] = ZERO);
+            self.t.col_as_slice_mut(k)[k + 2..].fill(ZERO);
         }
     }
 
     /// QR iterations until `T` is triangular; `false` if an eigenvalue does not converge.
+    #[inline(always)]
     fn iterate(&mut self) -> bool {
         let m = self.t.nrows();
         let size = self.t.norm_max().max(f64::MIN_POSITIVE);
@@ -104,18 +118,14 @@ impl Schur {
     }
 
     /// One QR step on the active block, rows `start` to `end` (exclusive).
+    #[inline(always)]
     fn sweep(&mut self, start: usize, end: usize, shift: c64) {
-        let m = self.t.nrows();
         let (mut x, mut y) = (self.t[(start, start)] - shift, self.t[(start + 1, start)]);
         for k in start..end - 1 {
             let norm = (x.norm_sqr() + y.norm_sqr()).sqrt();
             if norm > 0.0 {
                 let (c, s) = (x / norm, y / norm);
-                for j in k.saturating_sub(1).max(start)..m {
-                    let (p, q) = (self.t[(k, j)], self.t[(k + 1, j)]);
-                    self.t[(k, j)] = c.conj() * p + s.conj() * q;
-                    self.t[(k + 1, j)] = c * q - s * p;
-                }
+                self.mix_rows(k, [c, s], k.saturating_sub(1).max(start));
                 self.mix_columns(k, [c, s], (k + 3).min(end));
             }
             if k + 2 < end {
@@ -124,21 +134,33 @@ impl Schur {
         }
     }
 
+    /// Multiplies rows `k` and `k + 1` of `T`, from column `first` on, by `[[c̄, s̄], [-s, c]]`.
+    #[inline(always)]
+    fn mix_rows(&mut self, k: usize, [c, s]: [c64; 2], first: usize) {
+        for j in first..self.t.ncols() {
+            let [p, q] = &mut self.t.col_as_slice_mut(j)[k..k + 2] else { unreachable!("two rows") };
+            (*p, *q) = (c.conj() * *p + s.conj() * *q, c * *q - s * *p);
+        }
+    }
+
     /// Multiplies columns `k` and `k + 1` of `T`, down to row `rows`, and of `U` by `[[c, -s̄], [s, c̄]]`.
+    #[inline(always)]
     fn mix_columns(&mut self, k: usize, [c, s]: [c64; 2], rows: usize) {
         let m = self.u.nrows();
         for (matrix, rows) in [(&mut self.t, rows), (&mut self.u, m)] {
-            for i in 0..rows {
-                let (p, q) = (matrix[(i, k)], matrix[(i, k + 1)]);
-                matrix[(i, k)] = p * c + q * s;
-                matrix[(i, k + 1)] = q * c.conj() - p * s.conj();
+            let (left, right) = matrix.as_mut().split_at_col_mut(k + 1);
+            let [left, right] = [left.col_mut(k), right.col_mut(0)].map(|column| {
+                let Some(column) = column.try_as_col_major_mut() else { unreachable!("columns are contiguous") };
+                &mut column.as_slice_mut()[..rows]
+            });
+            for (p, q) in left.iter_mut().zip(right) {
+                (*p, *q) = (*p * c + *q * s, *q * c.conj() - *p * s.conj());
             }
         }
     }
 
     /// Exchanges the eigenvalues at `k` and `k + 1`.
     fn swap(&mut self, k: usize) {
-        let m = self.t.nrows();
         let (first, second, above) = (self.t[(k, k)], self.t[(k + 1, k + 1)], self.t[(k, k + 1)]);
         let (x, y) = (above, second - first);
         let norm = (x.norm_sqr() + y.norm_sqr()).sqrt();
@@ -146,11 +168,7 @@ impl Schur {
             return;
         }
         let (c, s) = (x / norm, y / norm);
-        for j in k..m {
-            let (p, q) = (self.t[(k, j)], self.t[(k + 1, j)]);
-            self.t[(k, j)] = c.conj() * p + s.conj() * q;
-            self.t[(k + 1, j)] = c * q - s * p;
-        }
+        self.mix_rows(k, [c, s], k);
         self.mix_columns(k, [c, s], k + 2);
         self.t[(k + 1, k)] = ZERO;
         self.t[(k, k)] = second;
@@ -161,7 +179,7 @@ impl Schur {
     pub(super) fn sort(&mut self) {
         let m = self.t.nrows();
         for place in 0..m {
-            let size = |k: usize| self.t[(k, k)].norm();
+            let size = |k: usize| self.t[(k, k)].norm_sqr();
             let largest = (place..m).max_by(|&a, &b| size(a).total_cmp(&size(b)).then(b.cmp(&a))).unwrap_or(place);
             (place..largest).rev().for_each(|k| self.swap(k));
         }
@@ -174,17 +192,36 @@ impl Schur {
 
     /// Eigenvector of the original matrix for the eigenvalue at position `k`, 2-norm 1.
     pub(super) fn vector(&self, k: usize) -> Mat<c64> {
-        let tiny = f64::EPSILON * self.t.norm_max();
-        let mut y = Mat::<c64>::zeros(k + 1, 1);
-        y[(k, 0)] = ONE;
-        for i in (0..k).rev() {
-            let sum: c64 = (i + 1..=k).map(|j| self.t[(i, j)] * y[(j, 0)]).sum();
-            let gap = self.t[(i, i)] - self.t[(k, k)];
-            y[(i, 0)] = -sum / if gap.norm() > tiny { gap } else { c64::new(tiny, 0.0) };
-        }
-        let norm = y.norm_l2();
-        (self.u.subcols(0, k + 1) * y) * faer::Scale(c64::new(1.0 / norm, 0.0))
+        self.last_rows_of_vector(k, self.u.nrows())
     }
+
+    /// The last `rows` rows of [`Self::vector`].
+    pub(super) fn last_rows_of_vector(&self, k: usize, rows: usize) -> Mat<c64> {
+        let tiny = f64::EPSILON * self.t.norm_max();
+        // Back substitution column by column: `y` holds the right-hand side above the row reached.
+        let mut y: Vec<c64> = self.t.col_as_slice(k)[..k].iter().map(|t| -t).collect();
+        y.push(ONE);
+        for i in (0..k).rev() {
+            let gap = self.t[(i, i)] - self.t[(k, k)];
+            y[i] /= if gap.norm() > tiny { gap } else { c64::new(tiny, 0.0) };
+            let (above, solved) = y.split_at_mut(i);
+            above.iter_mut().zip(self.t.col_as_slice(i)).for_each(|(sum, t)| *sum -= t * solved[0]);
+        }
+        let norm = y.iter().map(|x| x.norm_sqr()).sum::<f64>().sqrt();
+        let y = Mat::from_fn(k + 1, 1, |i, _| y[i] / norm);
+        self.u.submatrix(self.u.nrows() - rows, 0, rows, k + 1) * y
+    }
+}
+
+/// `aᴴ b`, in four independent partial sums.
+#[inline(always)]
+fn dot(a: &[c64], b: &[c64]) -> c64 {
+    let mut sums = [ZERO; 4];
+    let (mut a, mut b) = (a.chunks_exact(4), b.chunks_exact(4));
+    for (a, b) in (&mut a).zip(&mut b) {
+        sums.iter_mut().zip(a.iter().zip(b)).for_each(|(sum, (a, b))| *sum += a.conj() * b);
+    }
+    sums.iter().sum::<c64>() + a.remainder().iter().zip(b.remainder()).map(|(a, b)| a.conj() * b).sum::<c64>()
 }
 
 #[cfg(test)]
