@@ -23,11 +23,11 @@ impl Building<'_, '_> {
         points: &[OperatingPoint],
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<Option<(OperatingPoint, Estimates, f64)>, ReductionError> {
-        let sigma = self.metric.sigma;
+        let sigma = self.span.metric.sigma;
         self.solver.factor_at(sigma)?;
         let shifted = self.solver.factors_at(sigma);
         let coupled = shifted.map(|shifted| {
-            let low_rank = self.full.low_rank(&self.metric.middle);
+            let low_rank = self.full.low_rank(&self.span.metric.here);
             let weights = low_rank.stiffness.clone();
             shifted.couple::<f64>(&low_rank, weights, false)
         });

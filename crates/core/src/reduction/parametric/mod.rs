@@ -36,18 +36,18 @@ mod estimate;
 mod metric;
 mod request;
 mod sampling;
+mod span;
 mod truncation;
-
-use faer::Mat;
 
 use super::full_model::{FullModel, Projected};
 use super::matching::{RootMatch, match_roots};
 use super::pencil::Pencil;
 use super::{FullSolver, FullVectors, ReductionError, on_threads, threads_for};
 use crate::physics::{Model, OperatingPoint, Solver, Vectors};
-use metric::Metric;
+pub(super) use metric::Metric;
 pub use request::{ParametricRequest, ParametricStep};
 use sampling::{BAND_MARGIN, Building, comparable, comparable_of, solve_failed};
+pub(super) use span::Span;
 
 /// Largest number of rounds of validation.
 const MOST_ROUNDS: usize = 4;
@@ -97,17 +97,18 @@ pub fn parametric_basis(
 ) -> Result<ParametricBasis, ReductionError> {
     request.range.check()?;
     let most_roots = solver.count_below(BAND_MARGIN * request.counted.band_rad_s)?;
-    let metric = Metric::new(full, request)?;
-    let assembled = if solver.has_parts() { None } else { Some(metric.assembled()?) };
+    // Without friction, `K` is nearest to symmetric.
+    let middle = full.at(&request.range.at([0.5; 3]).with_friction(0.0))?;
+    let mut metric = Metric::new(full, middle, request.counted.band_rad_s);
+    let assembled = if solver.has_parts() { None } else { Some(metric.assemble()?) };
     let pencil = assembled.as_ref().map(|[mass, stiffness]| Pencil::new("full model", mass, stiffness)).transpose()?;
     let mut build = Building {
         full,
         solver,
         request,
-        metric,
         pencil,
         most_roots,
-        span: Mat::zeros(full.dimension(), 0),
+        span: Span::new(full, metric),
         sampled: vec![],
         true_over_estimate: 1.0,
     };
@@ -160,7 +161,7 @@ pub fn parametric_basis(
             build.sample(held.point, None, progress)?;
         }
     }
-    Err(failed(last, build.span.ncols(), build.sampled.len()))
+    Err(failed(last, build.span.size(), build.sampled.len()))
 }
 
 impl Building<'_, '_> {
@@ -172,7 +173,7 @@ impl Building<'_, '_> {
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<Vec<HeldOut>, ReductionError> {
         let counted = self.request.counted;
-        let held = size_of::<f64>() * self.full.dimension() * (self.span.ncols() + model.dimension());
+        let held = size_of::<f64>() * self.full.dimension() * (self.span.size() + model.dimension());
         let (most_roots, of) = (self.most_roots, points.len());
         let points: Vec<(usize, OperatingPoint)> = points.iter().copied().enumerate().collect();
         let is_of_memory = |error: &ReductionError| matches!(error, ReductionError::Memory { .. });
@@ -204,8 +205,8 @@ fn worst_of(held_out: &[HeldOut]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use faer::c64;
     use faer::linalg::solvers::Solve;
+    use faer::{Mat, c64};
 
     use super::super::{Counted, OperatingBox, SparseMatrix};
     use super::*;

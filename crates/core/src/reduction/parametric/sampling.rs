@@ -1,16 +1,15 @@
 //! Greedy sampling: the full model is solved at the point with the largest error estimate, and its right and left
 //! vectors extend the span.
 
-use faer::{Mat, MatRef, c64};
+use faer::c64;
 
-use super::super::dense::symmetric_eigen;
 use super::super::full_model::{FullModel, Projected};
 use super::super::matching::Counted;
 use super::super::pencil::Pencil;
-use super::super::{FullSolver, FullSpectrum, FullVectors, ReductionError, on_threads, threads_for};
+use super::super::{FullSolver, FullVectors, ReductionError, on_threads, threads_for};
 use super::condition::Condition;
-use super::metric::Metric;
 use super::request::{ParametricRequest, ParametricStep};
+use super::span::Span;
 use crate::physics::{Model, OperatingPoint, SolveError, Solver, Spectrum, Vectors};
 
 /// Fraction of the tolerance that the estimate must meet at training points, so that held-out points meet the
@@ -23,9 +22,6 @@ pub const BAND_MARGIN: f64 = 1.02;
 const FLOOR_MARGIN: f64 = 1.5;
 /// A vector is not added if its component outside the span is below this times the square root of the tolerance.
 const NEGLIGIBLE: f64 = 0.01;
-/// Components of a vector below this, relative to its length, are rounding errors: the square root of the resolution of
-/// a Gram matrix.
-const ROUNDED: f64 = 1e-7;
 /// Number of roots whose residuals are computed at a time.
 pub const ROOTS_TOGETHER: usize = 8;
 /// Number of copies of their columns held meanwhile: the vectors, three products in two memory layouts, two of the
@@ -40,13 +36,11 @@ pub struct Building<'a, 'm> {
     pub full: &'a FullModel,
     pub solver: &'a mut FullSolver<'m>,
     pub request: &'a ParametricRequest,
-    pub metric: Metric<'a>,
     /// Factorises `S` for models that are not just parts joined by contact; `None` for those that are.
     pub pencil: Option<Pencil<'a>>,
     /// Estimated number of roots in the band.
     pub most_roots: usize,
-    /// `S`-orthonormal vectors, `n×r`.
-    pub span: Mat<f64>,
+    pub span: Span<'a>,
     pub sampled: Vec<OperatingPoint>,
     pub true_over_estimate: f64,
 }
@@ -65,8 +59,8 @@ impl Building<'_, '_> {
     pub fn make_room(&mut self) -> Result<usize, ReductionError> {
         let column = size_of::<f64>() * self.full.dimension();
         let columns = 4 * self.most_roots;
-        let span = self.span.ncols() + columns;
-        let extended = 2 * span + 5 * columns;
+        let span = self.span.size() + columns;
+        let extended = self.span.columns_held(columns);
         let estimated = 2 * span + ESTIMATING * 4 * ROOTS_TOGETHER;
         let (held_by_caller, other) = (3 * span * column, (4 * span).max(extended).max(estimated) * column);
         self.solver.make_room(FullVectors::Both, self.most_roots, held_by_caller, other)
@@ -102,76 +96,17 @@ impl Building<'_, '_> {
             }
         }
         self.most_roots = self.most_roots.max(chosen.len());
-        let columns = self.columns(&spectrum, &chosen);
+        self.span.add(&spectrum, &chosen, NEGLIGIBLE * self.request.tolerance.sqrt())?;
         drop(spectrum);
-        self.extend(columns)?;
         if ratio.is_finite() {
             self.true_over_estimate = self.true_over_estimate.max(ratio);
         }
         self.sampled.push(point);
         progress(ParametricStep::Sampled {
             roots: counting.len(),
-            vectors: self.span.ncols(),
+            vectors: self.span.size(),
             true_over_estimate: ratio,
         });
-        Ok(())
-    }
-
-    /// Real and imaginary parts of right and left vectors with their [`Condition::scales`], `n×(4·chosen)`.
-    fn columns(&self, spectrum: &FullSpectrum, chosen: &[usize]) -> Mat<f64> {
-        let n = self.full.dimension();
-        let mut columns = Mat::<f64>::zeros(n, 4 * chosen.len());
-        for (k, &root) in chosen.iter().enumerate() {
-            let lambda = spectrum.roots[root].lambda;
-            // Real and imaginary parts of x, then of y.
-            let of_root = Mat::<f64>::from_fn(n, 4, |i, j| {
-                let value = if j < 2 { spectrum.right[(i, root)] } else { spectrum.left[(i, root)] };
-                if j % 2 == 0 { value.re } else { value.im }
-            });
-            let of_mass = self.full.mass_times(of_root.as_ref());
-            let of_damping = self.full.damping_times(&spectrum.here, of_root.as_ref(), false);
-            let at = |m: &Mat<f64>, i: usize, side: usize| c64::new(m[(i, 2 * side)], m[(i, 2 * side + 1)]);
-            let slope: c64 = (0..n)
-                .map(|i| at(&of_root, i, 1).conj() * (lambda * 2.0 * at(&of_mass, i, 0) + at(&of_damping, i, 0)))
-                .sum();
-            let length = |side: usize| -> f64 {
-                (0..n).map(|i| (at(&of_root, i, side).conj() * at(&of_mass, i, side)).re).sum::<f64>().sqrt()
-            };
-            let lengths = [length(0), length(1)];
-            for (side, scale) in Condition::new(lambda, lengths, slope).scales().into_iter().enumerate() {
-                let scaled = faer::Scale(scale) * of_root.subcols(2 * side, 2);
-                columns.subcols_mut(4 * k + 2 * side, 2).copy_from(scaled);
-            }
-        }
-        columns
-    }
-
-    /// Extends the span by the components of `columns` outside it.
-    fn extend(&mut self, columns: Mat<f64>) -> Result<(), ReductionError> {
-        let mut rest = columns;
-        for _ in 0..2 {
-            let step = self.span.transpose() * self.metric.times(rest.as_ref());
-            rest -= &self.span * &step;
-        }
-        let gram = self.metric.gram(&rest);
-        let (squares, vectors) = symmetric_eigen("parametric basis", gram.as_ref())?;
-        let least = (NEGLIGIBLE * self.request.tolerance.sqrt()).max(ROUNDED);
-        let kept: Vec<usize> = (0..squares.len()).rev().filter(|&k| squares[k] > least * least).collect();
-        if kept.is_empty() {
-            return Ok(());
-        }
-        let turn = Mat::from_fn(vectors.nrows(), kept.len(), |i, k| vectors[(i, kept[k])] / squares[kept[k]].sqrt());
-        let mut added = &rest * &turn;
-        drop(rest);
-        // The Gram matrix leaves rounding errors of orthogonality; two passes remove them.
-        for _ in 0..2 {
-            let step = self.span.transpose() * self.metric.times(added.as_ref());
-            added -= &self.span * &step;
-            let gram = self.metric.gram(&added);
-            super::super::whiten("parametric basis", gram.as_ref())?.right(&mut added);
-        }
-        let before = std::mem::replace(&mut self.span, Mat::new());
-        self.span = hstack(before.as_ref(), added.as_ref());
         Ok(())
     }
 
@@ -183,14 +118,14 @@ impl Building<'_, '_> {
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<Projected, ReductionError> {
         loop {
-            let projected = self.full.project(self.span.as_ref())?;
+            let projected = self.full.project(self.span.vectors.as_ref())?;
             let model = self.model(&projected)?;
             let points: Vec<OperatingPoint> =
                 training.iter().filter(|point| !self.sampled.contains(point)).copied().collect();
             let worst = self.worst_estimate(&model, &projected, &points, progress)?;
             let Some((point, estimates, largest)) = worst else { return Ok(projected) };
             let scaled = largest * self.true_over_estimate;
-            progress(ParametricStep::Estimated { worst: scaled, vectors: self.span.ncols() });
+            progress(ParametricStep::Estimated { worst: scaled, vectors: self.span.size() });
             if scaled <= TRAINING_SHARE * self.request.tolerance {
                 return Ok(projected);
             }
@@ -199,7 +134,7 @@ impl Building<'_, '_> {
                     what: "parametric basis (estimated)".to_owned(),
                     value: scaled,
                     limit: TRAINING_SHARE * self.request.tolerance,
-                    vectors: self.span.ncols(),
+                    vectors: self.span.size(),
                     samples: self.sampled.len(),
                 });
             }
@@ -252,12 +187,4 @@ pub fn comparable_of(spectrum: &Spectrum) -> Vec<c64> {
 
 pub fn solve_failed(source: SolveError) -> ReductionError {
     ReductionError::Solve { what: "parametric basis".to_owned(), source: Box::new(source) }
-}
-
-/// `[a b]`.
-fn hstack(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
-    let mut both = Mat::zeros(a.nrows(), a.ncols() + b.ncols());
-    both.subcols_mut(0, a.ncols()).copy_from(a);
-    both.subcols_mut(a.ncols(), b.ncols()).copy_from(b);
-    both
 }

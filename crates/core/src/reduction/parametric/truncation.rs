@@ -36,9 +36,9 @@ impl Building<'_, '_> {
         points: &[OperatingPoint],
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<Projected, ReductionError> {
-        let size = self.span.ncols();
+        let size = self.span.size();
         // Change of coordinates from `wide.basis` to the span.
-        let turn = self.span.transpose() * self.metric.times(wide.basis.as_ref());
+        let turn = self.span.vectors.transpose() * self.span.metric.times(wide.basis.as_ref());
         let mut targets = self.targets(wide, points, &turn)?;
         let back = turn.partial_piv_lu();
         let most_counted = targets.iter().map(|target| target.counted.len()).max().unwrap_or(0);
