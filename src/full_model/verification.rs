@@ -302,7 +302,7 @@ impl Compared<'_> {
     ) -> Result<WindowComparison, VerificationError> {
         let Judged { band_rad_s, .. } = self.judged;
         let of_full = full_windows(&self.full.model, solvers.full, p, band_rad_s, &self.options, progress)?;
-        let of_rig = StabilityMap::build(&self.rig.model, &mut solvers.reduced, p, &self.options)?.windows;
+        let of_rig = StabilityMap::of_windows(&self.rig.model, &mut solvers.reduced, p, &self.options)?.windows;
         Ok(compare_windows(&of_full, &of_rig))
     }
 }

@@ -133,6 +133,23 @@ impl StabilityMap {
         point: &OperatingPoint,
         options: &MapOptions,
     ) -> Result<Self, MapError> {
+        let mut map = Self::of_windows(model, solver, point, options)?;
+        if options.windows {
+            map.ends = Ends::of_map(model, solver, &map)?;
+        }
+        Ok(map)
+    }
+
+    /// The same without [`Self::ends`], whose derivatives need further solves.
+    ///
+    /// # Errors
+    /// Those of [`Self::build`].
+    pub fn of_windows(
+        model: &Model,
+        solver: &mut Solver,
+        point: &OperatingPoint,
+        options: &MapOptions,
+    ) -> Result<Self, MapError> {
         let MapOptions { mu_min, mu_max, .. } = *options;
         if !(mu_min.is_finite() && mu_max.is_finite() && mu_min <= 0.0 && mu_max >= 0.0) {
             return Err(MapError::Range { mu_min, mu_max });
@@ -170,7 +187,6 @@ impl StabilityMap {
         let mut map = Self { point, nodes, numbering, band_max_hz, windows, ends, resolution, complete, sliding_ends };
         if options.windows {
             map.windows = critical::windows(model, solver, &map, options)?;
-            map.ends = Ends::of_map(model, solver, &map)?;
         }
         Ok(map)
     }

@@ -90,7 +90,7 @@ pub fn full_windows(
         }
         let projected = Projection::new(model, span.vectors.as_ref(), p)?;
         let mut dense = Solver::new(projected.model.dimension());
-        let map = StabilityMap::build(&projected.model, &mut dense, p, options)?;
+        let map = StabilityMap::of_windows(&projected.model, &mut dense, p, options)?;
         let found: Vec<f64> = map.windows.iter().flat_map(|w| [Some(w.mu_from), w.mu_to]).flatten().collect();
         let polished = projected.polished(solver, &mut dense, &map.windows)?;
         moved = if polished.is_some() {
