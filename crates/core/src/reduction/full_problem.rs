@@ -356,9 +356,10 @@ impl<'a> Problem<'a> {
                 residual_limit: KRYLOV_LIMIT,
                 seed: if transposed { 2 } else { 1 },
             };
-            let enough = |theta: &[c64]| !transposed && disc_of(theta).covers(gap, self.growth_per_s);
+            let covered =
+                |theta: &[c64]| if transposed { 0.0 } else { disc_of(theta).share_of(gap, self.growth_per_s) };
             let Largest { theta, vectors } =
-                iteration.run::<T>(&|x| inverse(x, transposed), &enough, &mut |vectors, converged| {
+                iteration.run::<T>(&|x| inverse(x, transposed), &covered, &mut |vectors, converged| {
                     progress(FullProgress::Iterated { shift_rad_s: omega, vectors, converged, wanted });
                 })?;
             let vectors = if T::REAL { vectors } else { vectors.subrows(0, n).to_owned() };

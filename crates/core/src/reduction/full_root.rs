@@ -116,10 +116,16 @@ impl CoveredDisc {
         (self.radius * self.radius - off * off).sqrt()
     }
 
-    /// Whether the disc covers the stretch `[from, to]`, rad/s, with growth rates up to `growth`, 1/s, in magnitude.
-    pub(super) fn covers(&self, [from, to]: [f64; 2], growth: f64) -> bool {
-        let [low, high] = self.stretch_rad_s();
-        low <= from && high >= to && self.growth_per_s(from).min(self.growth_per_s(to)) >= growth
+    /// The share of the stretch `[from, to]` around the shift, rad/s, that the disc covers on the side where it covers less;
+    /// 1 only if it covers all of it with growth rates up to `growth`, 1/s, in magnitude.
+    pub(super) fn share_of(&self, [from, to]: [f64; 2], growth: f64) -> f64 {
+        let ([low, high], middle) = (self.stretch_rad_s(), self.shift_rad_s);
+        let enough = self.growth_per_s(from).min(self.growth_per_s(to)) >= growth;
+        if low <= from && high >= to && enough {
+            return 1.0;
+        }
+        let share = |covered: f64, whole: f64| if whole > 0.0 { covered / whole } else { 1.0 };
+        share(middle - low, middle - from).min(share(high - middle, to - middle)).min(1.0 - f64::EPSILON)
     }
 
     /// Whether `λ` lies in the disc shrunk by [`CHORD`].

@@ -21,6 +21,8 @@ use super::schur::Schur;
 
 /// Block size: number of vectors added per step.
 pub(super) const BLOCK: usize = 4;
+/// Share of the stretch to be covered from which on a few more pairs are cheaper than another shift.
+const NEARLY: f64 = 0.9;
 /// Largest number of restarts.
 const MOST_RESTARTS: usize = 40;
 /// Length of a vector, relative to what it was, below which its remainder outside its own block is made orthogonal to the
@@ -61,16 +63,16 @@ pub(super) fn most_found(count: usize) -> usize {
 }
 
 impl Iteration<'_> {
-    /// Computes the largest eigenpairs of `apply`: at least `count`, or fewer if `enough` accepts the converged `θ` or
-    /// the basis spans the whole (or an invariant) space. `progress` receives the number of vectors built and of
-    /// converged pairs.
+    /// Computes the largest eigenpairs of `apply`: at least `count`, or fewer if the converged `θ` cover all that is to be
+    /// covered, 1 of it by `covered`, or the basis spans the whole (or an invariant) space. It computes a few more if they
+    /// nearly cover it. `progress` receives the number of vectors built and of converged pairs.
     ///
     /// # Errors
     /// [`ReductionError`]: `NotConverged`, `Factorisation`; those of `apply`.
     pub(super) fn run<T: Number>(
         &self,
         apply: &dyn Fn(Mat<T>) -> Result<Mat<T>, ReductionError>,
-        enough: &dyn Fn(&[c64]) -> bool,
+        covered: &dyn Fn(&[c64]) -> f64,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Largest, ReductionError> {
         let capacity = capacity(self.dimension, self.count);
@@ -94,7 +96,10 @@ impl Iteration<'_> {
                 let converged = ritz.converged;
                 progress(built, converged);
                 let theta: Vec<c64> = (0..converged).map(|k| ritz.schur.value(k)).collect();
-                if converged >= self.count || whole || (converged > 0 && enough(&theta)) {
+                let covered = if converged > 0 { covered(&theta) } else { 0.0 };
+                let most = converged >= most_found(self.count) || restarts == MOST_RESTARTS;
+                let counted = converged >= self.count && (covered < NEARLY || most);
+                if counted || whole || covered >= 1.0 {
                     let found = converged.min(most_found(self.count));
                     return Ok(Largest { vectors: space.vectors(&ritz, found), theta: theta[..found].to_vec() });
                 }
@@ -119,7 +124,7 @@ impl Iteration<'_> {
                 // A check takes as long as several steps. Convergence accelerates: the next check comes halfway to where
                 // its present rate leads.
                 let (grown, gained) = (space.basis.size() - last.0, converged.saturating_sub(last.1).max(1));
-                let expected = (self.count - converged) * grown / gained;
+                let expected = self.count.saturating_sub(converged) * grown / gained;
                 next_check = space.basis.size() + (expected / 2).clamp(self.count / 2, self.count).max(BLOCK);
                 last = (space.basis.size(), converged);
             }
@@ -282,7 +287,7 @@ mod tests {
         };
         let iteration = Iteration { what: "test", dimension: 2 * blocks, count: 16, residual_limit: 1e-12, seed: 0 };
         let mut most = 0;
-        let found = iteration.run::<f64>(&apply, &|_| false, &mut |built, _| most = built).unwrap();
+        let found = iteration.run::<f64>(&apply, &|_| 0.0, &mut |built, _| most = built).unwrap();
         assert!(most > capacity(2 * blocks, 16), "no restart was needed: {most}");
         let mut expected: Vec<c64> = (0..blocks).flat_map(|block| [value(block), value(block).conj()]).collect();
         expected.sort_by(|a, b| b.norm().total_cmp(&a.norm()));
