@@ -13,9 +13,13 @@ use super::sampling::{Building, comparable_of, on_points, solve_failed};
 use crate::physics::{OperatingPoint, Situation, Vectors};
 
 /// Fraction of the tolerance by which the roots may differ from those of the wide model.
-const SHARE: f64 = 0.5;
+const SHARE: f64 = 0.4;
 /// Number of times that roots gain weight before more vectors are taken.
 const MOST_WEIGHTINGS: usize = 3;
+/// Fraction of the limit that weights aim at: errors would approach the limit itself from above.
+const AIM: f64 = 0.8;
+/// Fraction of the limit above which an error is watched.
+const NEAR: f64 = 0.3;
 
 /// What a smaller basis must hold at one operating point.
 struct Target {
@@ -26,6 +30,9 @@ struct Target {
     counted: Vec<(c64, f64)>,
     /// Real and imaginary parts of their right and left vectors with their [`Condition::scales`], in the span: four columns each.
     vectors: Mat<f64>,
+    /// Whether the roots of the last basis compared here had errors near the limit: the next one is compared here first.
+    watched: bool,
+    last: RootMatch,
 }
 
 impl Building<'_, '_> {
@@ -44,24 +51,29 @@ impl Building<'_, '_> {
         let most_counted = targets.iter().map(|target| target.counted.len()).max().unwrap_or(0);
         let mut best_allowed = f64::INFINITY;
         let limit = SHARE * self.request.tolerance;
+        let unweighted = covariance(size, &targets);
+        let first_axes = axes(&unweighted)?;
         let mut attempt = |count: usize| -> Result<(Projected, f64), ReductionError> {
-            let mut best: Option<(Projected, f64)> = None;
             for target in &mut targets {
                 target.counted.iter_mut().for_each(|(_, weight)| *weight = 1.0);
+                target.watched = true;
             }
-            for _ in 0..=MOST_WEIGHTINGS {
-                let mut leading = leading(size, count, &targets)?;
+            let mut covariance = unweighted.clone();
+            let mut weightings = 0;
+            let (smaller, worst) = loop {
+                let weighted = if weightings > 0 { Some(axes(&covariance)?) } else { None };
+                // Ascending: the last ones lead.
+                let axes = weighted.as_ref().unwrap_or(&first_axes);
+                let mut leading = axes.subcols(size - count, count).to_owned();
                 back.solve_in_place(leading.as_mut());
                 let smaller = wide.restricted(leading.as_ref())?;
-                let worst = self.weigh(&smaller, &mut targets, limit)?;
-                if best.as_ref().is_none_or(|(_, before)| worst < *before) {
-                    best = Some((smaller, worst));
+                let worst = self.compare(&smaller, &mut targets, limit)?;
+                if worst <= limit || worst == f64::INFINITY || weightings == MOST_WEIGHTINGS {
+                    break (smaller, worst);
                 }
-                if worst <= limit || worst == f64::INFINITY {
-                    break;
-                }
-            }
-            let (smaller, worst) = best.expect("at least one weighting");
+                covariance += gained(size, &mut targets, AIM * limit);
+                weightings += 1;
+            };
             progress(ParametricStep::Cut { vectors: count, worst });
             if count <= self.request.most_vectors {
                 best_allowed = best_allowed.min(worst);
@@ -125,37 +137,59 @@ impl Building<'_, '_> {
                 roots: comparable_of(&spectrum),
                 counted: chosen.iter().map(|&k| (spectrum.roots[k].lambda, 1.0)).collect(),
                 vectors: turn * vectors,
+                watched: true,
+                last: RootMatch::default(),
             })
         })
     }
 
-    /// Largest error of a root of `smaller` at the targets. Every root whose error exceeds `limit` gains weight.
-    fn weigh(&self, smaller: &Projected, targets: &mut [Target], limit: f64) -> Result<f64, ReductionError> {
+    /// Largest error of a root of `smaller` at the targets. Once it exceeds `limit` at a watched one, the others are left out.
+    fn compare(&self, smaller: &Projected, targets: &mut [Target], limit: f64) -> Result<f64, ReductionError> {
         let model = self.model(smaller)?;
-        let comparisons = on_points(&model, targets, &|solver, target| {
-            let reduced = solver.solve_in(&model, &target.here, Vectors::None).map_err(solve_failed)?;
-            Ok(match_roots(&target.roots, &comparable_of(&reduced), self.request.counted))
-        })?;
-        let worst = comparisons.iter().map(RootMatch::worst).fold(0.0, f64::max);
-        for (target, comparison) in targets.iter_mut().zip(comparisons).filter(|_| worst < f64::INFINITY) {
-            for (lambda, error) in comparison.errors {
-                let of_root = target.counted.iter_mut().filter(|(of, _)| *of == lambda);
-                of_root.for_each(|(_, weight)| *weight *= (error / limit).max(1.0));
+        let (watched, others): (Vec<usize>, Vec<usize>) = (0..targets.len()).partition(|&k| targets[k].watched);
+        let mut worst = 0.0_f64;
+        for indices in [watched, others] {
+            let compared = on_points(&model, &indices, &|solver, &k| {
+                let reduced = solver.solve_in(&model, &targets[k].here, Vectors::None).map_err(solve_failed)?;
+                Ok(match_roots(&targets[k].roots, &comparable_of(&reduced), self.request.counted))
+            })?;
+            for (k, last) in indices.into_iter().zip(compared) {
+                worst = worst.max(last.worst());
+                targets[k].watched = last.worst() > NEAR * limit;
+                targets[k].last = last;
+            }
+            if worst > limit {
+                break;
             }
         }
         Ok(worst)
     }
 }
 
-/// The `count` leading left singular vectors of the weighted vectors of all targets, `size×count`.
-fn leading(size: usize, count: usize, targets: &[Target]) -> Result<Mat<f64>, ReductionError> {
-    let mut covariance = Mat::<f64>::zeros(size, size);
-    for target in targets {
-        let weighted =
-            Mat::from_fn(size, target.vectors.ncols(), |i, j| target.counted[j / 4].1 * target.vectors[(i, j)]);
-        covariance += &weighted * target.vectors.transpose();
+/// `Σ v vᵀ` over the vectors of all targets, `size×size`.
+fn covariance(size: usize, targets: &[Target]) -> Mat<f64> {
+    targets.iter().fold(Mat::zeros(size, size), |sum, target| sum + &target.vectors * target.vectors.transpose())
+}
+
+/// Gives every root whose error exceeds `aim` the more weight; returns what their vectors add to the covariance.
+fn gained(size: usize, targets: &mut [Target], aim: f64) -> Mat<f64> {
+    let mut sum = Mat::zeros(size, size);
+    for Target { counted, vectors, last, .. } in targets {
+        for (lambda, error) in last.errors.iter().filter(|(_, error)| *error > aim) {
+            for (k, (_, weight)) in counted.iter_mut().enumerate().filter(|(_, (of, _))| of == lambda) {
+                let of_root = vectors.subcols(4 * k, 4);
+                let more = *weight * (error / aim - 1.0);
+                sum += faer::Scale(more) * (of_root * of_root.transpose());
+                *weight += more;
+            }
+        }
     }
-    let covariance = Mat::from_fn(size, size, |i, j| covariance[(i.max(j), i.min(j))]);
-    let (_, vectors) = symmetric_eigen("parametric basis", covariance.as_ref())?;
-    Ok(Mat::from_fn(size, count, |i, k| vectors[(i, size - 1 - k)]))
+    sum
+}
+
+/// Eigenvectors of a covariance, ascending in their eigenvalues.
+fn axes(covariance: &Mat<f64>) -> Result<Mat<f64>, ReductionError> {
+    let n = covariance.nrows();
+    let symmetric = Mat::from_fn(n, n, |i, j| covariance[(i.max(j), i.min(j))]);
+    Ok(symmetric_eigen("parametric basis", symmetric.as_ref())?.1)
 }
