@@ -72,7 +72,7 @@ pub enum CountedBy {
 }
 
 /// Solves with one factorised matrix `A`.
-pub trait Factor<T> {
+pub trait Factor<T>: Sync {
     /// `A⁻¹ B` in place, or `A⁻ᵀ B` if `transposed`.
     ///
     /// # Errors

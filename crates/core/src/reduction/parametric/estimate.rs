@@ -5,14 +5,14 @@ use faer::{Mat, c64};
 use super::super::ReductionError;
 use super::super::checked::definite;
 use super::super::full_model::Projected;
-use super::super::threads_for;
+use super::super::{on_threads, threads_for};
 use super::condition::slope;
 use super::request::ParametricStep;
-use super::sampling::{Building, Estimates, ROOTS_TOGETHER, on_points, solve_failed};
+use super::sampling::{Building, ESTIMATORS, Estimates, ROOTS_TOGETHER, on_points, solve_failed};
 use crate::physics::{Model, OperatingPoint, Spectrum, Vectors};
 
 /// `S⁻¹ B`.
-type Inverse<'a> = dyn Fn(Mat<f64>) -> Result<Mat<f64>, ReductionError> + 'a;
+type Inverse<'a> = dyn Fn(Mat<f64>) -> Result<Mat<f64>, ReductionError> + Sync + 'a;
 
 impl Building<'_, '_> {
     /// Point with the largest estimate, all estimates there, and the largest one; `None` without points.
@@ -47,6 +47,7 @@ impl Building<'_, '_> {
             (None, None) => unreachable!("a model without parts has a pencil"),
         };
         let mut worst: Option<(OperatingPoint, Estimates, f64)> = None;
+        let this = &*self;
         // As many spectra are in memory as there are threads.
         for (chunk, points_of_chunk) in points.chunks(threads_for(points.len())).enumerate() {
             let done = chunk * threads_for(points.len());
@@ -54,8 +55,13 @@ impl Building<'_, '_> {
             let spectra = on_points(model, points_of_chunk, &|solver, point| {
                 solver.solve(model, point, Vectors::Both).map_err(solve_failed)
             })?;
-            for (point, spectrum) in points_of_chunk.iter().zip(spectra) {
-                let estimates = self.estimates(&inverse, projected, &spectrum)?;
+            // Products with parts and solves with their factors share the cores themselves.
+            let estimators = if this.pencil.is_some() { ESTIMATORS } else { 1 };
+            let mut threads = vec![(); threads_for(spectra.len()).min(estimators)];
+            let estimates = on_threads(&mut threads, &spectra, &mut |()| (), &|(), spectrum, _| {
+                this.estimates(&inverse, projected, spectrum)
+            })?;
+            for (point, estimates) in points_of_chunk.iter().zip(estimates) {
                 let largest = estimates.iter().map(|(_, estimate)| *estimate).fold(0.0, f64::max);
                 if worst.as_ref().is_none_or(|(_, _, before)| largest > *before) {
                     worst = Some((*point, estimates, largest));

@@ -117,9 +117,7 @@ pub fn parametric_basis(
     let mut corners = request.range.corners_and_middle();
     let middle = corners.pop().expect("a middle");
     let opposite = corners.last().copied().unwrap_or(middle);
-    for point in [middle, opposite] {
-        build.sample(point, None, progress)?;
-    }
+    build.sample_all(&[middle, opposite], progress)?;
     let mut first = 0;
     let mut training: Vec<OperatingPoint> = corners;
     training.extend(request.range.spread(first, request.training));

@@ -6,7 +6,7 @@ use faer::c64;
 use super::super::full_model::{FullModel, Projected};
 use super::super::matching::Counted;
 use super::super::pencil::Pencil;
-use super::super::{FullSolver, FullVectors, ReductionError, on_threads, threads_for};
+use super::super::{FullSolver, FullSpectrum, FullVectors, ReductionError, on_threads, threads_for};
 use super::condition::Condition;
 use super::request::{ParametricRequest, ParametricStep};
 use super::span::Span;
@@ -21,8 +21,10 @@ pub const BAND_MARGIN: f64 = 1.02;
 /// Factor on a negative growth floor down to which vectors are taken, for the same reason.
 const FLOOR_MARGIN: f64 = 1.5;
 /// A vector is not added if its component outside the span is below this times the square root of the tolerance.
-const NEGLIGIBLE: f64 = 0.01;
-/// Number of roots whose residuals are computed at a time.
+const NEGLIGIBLE: f64 = 0.1;
+/// Largest number of threads that compute residuals, each with memory of its own.
+pub const ESTIMATORS: usize = 4;
+/// Number of roots whose residuals a thread computes at a time.
 pub const ROOTS_TOGETHER: usize = 8;
 /// Number of copies of their columns held meanwhile: the vectors, three products in two memory layouts, two of the
 /// residuals, and three during the solve.
@@ -61,7 +63,8 @@ impl Building<'_, '_> {
         let columns = 4 * self.most_roots;
         let span = self.span.size() + columns;
         let extended = self.span.columns_held(columns);
-        let estimated = 2 * span + ESTIMATING * 4 * ROOTS_TOGETHER;
+        let estimators = if self.pencil.is_some() { threads_for(ESTIMATORS) } else { 1 };
+        let estimated = 2 * span + estimators * ESTIMATING * 4 * ROOTS_TOGETHER;
         let (held_by_caller, other) = (3 * span * column, (4 * span).max(extended).max(estimated) * column);
         self.solver.make_room(FullVectors::Both, self.most_roots, held_by_caller, other)
     }
@@ -74,15 +77,76 @@ impl Building<'_, '_> {
         estimates: Option<&[(c64, f64)]>,
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<(), ReductionError> {
-        let counted = self.request.counted;
         self.make_room()?;
         progress(ParametricStep::Sampling { point, sample: self.sampled.len() + 1 });
-        let wanted = Counted {
+        let band_rad_s = self.wanted().band_rad_s;
+        let report = &mut |step| progress(ParametricStep::Solving(step));
+        let spectrum = self.solver.roots(&point, band_rad_s, FullVectors::Both, report)?;
+        self.take(point, &spectrum, estimates, progress)
+    }
+
+    /// Samples several `points`, at once if the solvers do not share the cores themselves and memory allows it.
+    pub fn sample_all(
+        &mut self,
+        points: &[OperatingPoint],
+        progress: &mut dyn FnMut(ParametricStep),
+    ) -> Result<(), ReductionError> {
+        let apart = self.pencil.is_some() && !self.solver.engine().foreign();
+        let spectra = if apart { self.spectra(points, progress) } else { Ok(vec![]) };
+        match spectra {
+            Ok(spectra) if spectra.len() == points.len() => {
+                for (&point, spectrum) in points.iter().zip(&spectra) {
+                    progress(ParametricStep::Sampling { point, sample: self.sampled.len() + 1 });
+                    self.take(point, spectrum, None, progress)?;
+                }
+                Ok(())
+            }
+            Ok(_) | Err(ReductionError::Memory { .. }) => {
+                points.iter().try_for_each(|&point| self.sample(point, None, progress))
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The spectra at `points` with their vectors, each thread solving at some of them.
+    fn spectra(
+        &mut self,
+        points: &[OperatingPoint],
+        progress: &mut dyn FnMut(ParametricStep),
+    ) -> Result<Vec<FullSpectrum>, ReductionError> {
+        self.make_room()?;
+        let (n, roots, band_rad_s) = (self.full.dimension(), self.most_roots, self.wanted().band_rad_s);
+        let held = points.len() * 2 * roots * n * size_of::<c64>();
+        let is_of_memory = |error: &ReductionError| matches!(error, ReductionError::Memory { .. });
+        self.solver.for_threads(threads_for(points.len()), is_of_memory, |solvers| {
+            for solver in &mut *solvers {
+                solver.make_room(FullVectors::Both, roots, held, 0)?;
+            }
+            on_threads(solvers, points, progress, &|solver, point, report| {
+                let report = &mut |step| report(ParametricStep::Solving(step));
+                solver.roots(point, band_rad_s, FullVectors::Both, report)
+            })
+        })
+    }
+
+    /// Roots whose vectors are taken.
+    fn wanted(&self) -> Counted {
+        let counted = self.request.counted;
+        Counted {
             band_rad_s: BAND_MARGIN * counted.band_rad_s,
             growth_floor_per_s: counted.growth_floor_per_s - (FLOOR_MARGIN - 1.0) * counted.growth_floor_per_s.abs(),
-        };
-        let report = &mut |step| progress(ParametricStep::Solving(step));
-        let spectrum = self.solver.roots(&point, wanted.band_rad_s, FullVectors::Both, report)?;
+        }
+    }
+
+    /// Adds the vectors of a sample to the span.
+    fn take(
+        &mut self,
+        point: OperatingPoint,
+        spectrum: &FullSpectrum,
+        estimates: Option<&[(c64, f64)]>,
+        progress: &mut dyn FnMut(ParametricStep),
+    ) -> Result<(), ReductionError> {
+        let wanted = self.wanted();
         let roots: Vec<c64> = spectrum.roots.iter().map(|root| root.lambda).collect();
         let chosen: Vec<usize> = (0..roots.len()).filter(|&k| wanted.counts(roots[k])).collect();
         let counting: Vec<c64> = chosen.iter().map(|&k| roots[k]).collect();
@@ -96,8 +160,7 @@ impl Building<'_, '_> {
             }
         }
         self.most_roots = self.most_roots.max(chosen.len());
-        self.span.add(&spectrum, &chosen, NEGLIGIBLE * self.request.tolerance.sqrt())?;
-        drop(spectrum);
+        self.span.add(spectrum, &chosen, NEGLIGIBLE * self.request.tolerance.sqrt())?;
         if ratio.is_finite() {
             self.true_over_estimate = self.true_over_estimate.max(ratio);
         }
