@@ -135,3 +135,20 @@ impl CoveredDisc {
         distance < CHORD * self.radius
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: a disc of radius 50 around 100 covers 52.5 to 147.5, and growth rates up to 30 at 60 and at 140.
+    #[test]
+    fn a_disc_covers_a_share_of_a_stretch() {
+        let disc = CoveredDisc { shift_rad_s: 100.0, radius: 50.0, squared: false };
+        let share = |from: f64, to: f64, growth: f64| disc.share_of([from, to], growth);
+        assert_eq!(share(60.0, 140.0, 29.0), 1.0);
+        let (too_wide, too_low, one_sided) =
+            (share(60.0, 140.0, 31.0), share(0.0, 140.0, 0.0), share(100.0, 195.0, 0.0));
+        assert!(too_wide < 1.0 && (too_low - 0.475).abs() < 1e-12 && (one_sided - 0.5).abs() < 1e-12);
+        assert_eq!(share(100.0, 100.0, 1.0), 1.0);
+    }
+}

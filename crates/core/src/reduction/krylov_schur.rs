@@ -310,4 +310,24 @@ mod tests {
             assert!(residual.norm_l2() < 1e-11);
         }
     }
+
+    /// Vectors of which little is left beside those before them are orthonormal to a modest multiple of `ε`: those of an
+    /// operator with eigenvalues `10^(-k/8)`, and blocks whose vectors differ by `1e-9`.
+    #[test]
+    fn vectors_stay_orthonormal_where_little_of_them_is_left() {
+        let (n, most) = (200, 60);
+        let mut space = Space::<f64>::new(n, most);
+        let apply = |x: Mat<f64>| Mat::from_fn(n, x.ncols(), |i, j| 10_f64.powf(-(i as f64) / 8.0) * x[(i, j)]);
+        space.append(apply(random::<f64>(n, BLOCK, 5)), None, 5);
+        while space.basis.size() < most {
+            let next = apply(space.basis.last_block(BLOCK));
+            let alike = Mat::from_fn(n, BLOCK, |i, j| next[(i, 0)] + 1e-9 * next[(i, j)]);
+            let mut w = if space.basis.size() < most / 2 { next } else { alike };
+            space.project_out(&mut w);
+            space.append(w, None, 5);
+        }
+        let vectors = space.basis.last_block(most);
+        let off = (vectors.transpose() * &vectors - Mat::<f64>::identity(most, most)).norm_max();
+        assert!(off < 100.0 * f64::EPSILON, "{off:e}");
+    }
 }
