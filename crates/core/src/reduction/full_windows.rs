@@ -85,7 +85,8 @@ pub fn full_windows(
     for _ in 0..rounds {
         for mu in std::mem::take(&mut next) {
             let found = sample(solver, mu, FullVectors::Both, &span)?;
-            span.add(&found, &chosen(&found), least)?;
+            let chosen = chosen(&found);
+            span.add(found, &chosen, least)?;
             sampled.push(mu);
         }
         let projected = Projection::new(model, span.vectors.as_ref(), p)?;
@@ -239,9 +240,12 @@ mod tests {
     use crate::physics::ContactLaw;
 
     /// The span of vectors of all spectra `found`.
-    fn span_of<'a>(model: &'a FullModel, band_rad_s: f64, found: &[FullSpectrum], least: f64) -> Span<'a> {
+    fn span_of(model: &FullModel, band_rad_s: f64, found: Vec<FullSpectrum>, least: f64) -> Span<'_> {
         let mut span = Span::new(model, Metric::new(model, model.at(&point(0.0)).unwrap(), band_rad_s));
-        found.iter().for_each(|found| span.add(found, &chosen(found), least).unwrap());
+        for found in found {
+            let chosen = chosen(&found);
+            span.add(found, &chosen, least).unwrap();
+        }
         span
     }
 
@@ -279,7 +283,7 @@ mod tests {
         // A narrow band keeps the basis far from complete.
         let judged = Judged { band_rad_s: 250.0, ..JUDGED };
         let found = solver.roots(&at(500.0, 0.45), judged.band_rad_s, FullVectors::Both, &mut |_| {}).unwrap();
-        let span = span_of(&model, judged.band_rad_s, &[found], NEW_AT_ENDS);
+        let span = span_of(&model, judged.band_rad_s, vec![found], NEW_AT_ENDS);
         assert!(span.size() < n / 3, "{} columns", span.size());
         let reduced = model.project(span.vectors.as_ref()).unwrap().model(law).unwrap();
         let mut dense = Solver::new(reduced.dimension());
@@ -316,7 +320,7 @@ mod tests {
             let mut solver = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
             let mut solve = |mu: f64| solver.roots(&point(mu), band, FullVectors::Both, &mut |_| {}).unwrap();
             let found: Vec<FullSpectrum> = samples.iter().map(|&mu| solve(mu)).collect();
-            let span = span_of(&model, band, &found, NEW);
+            let span = span_of(&model, band, found, NEW);
             let projection = Projection::new(&model, span.vectors.as_ref(), &point(0.0)).unwrap();
             let map = |model: &Model| {
                 StabilityMap::build(model, &mut Solver::new(model.dimension()), &point(0.0), &options).unwrap().windows
@@ -381,7 +385,7 @@ mod tests {
         let checked = solve(0.4, band);
         let mut error = |samples: &[(f64, f64)]| {
             let found: Vec<FullSpectrum> = samples.iter().map(|&(mu, band)| solve(mu, band)).collect();
-            let span = span_of(&model, band, &found, NEW_AT_ENDS);
+            let span = span_of(&model, band, found, NEW_AT_ENDS);
             let reduced = model.project(span.vectors.as_ref()).unwrap().model(model.contact_law).unwrap();
             let roots = reduced_roots(&reduced, &mut Solver::new(reduced.dimension()), &point(0.4)).unwrap();
             error_of_projection(&checked, &roots, band)

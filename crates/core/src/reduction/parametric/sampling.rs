@@ -82,7 +82,7 @@ impl Building<'_, '_> {
         let band_rad_s = self.wanted().band_rad_s;
         let report = &mut |step| progress(ParametricStep::Solving(step));
         let spectrum = self.solver.roots(&point, band_rad_s, FullVectors::Both, report)?;
-        self.take(point, &spectrum, estimates, progress)
+        self.take(point, spectrum, estimates, progress)
     }
 
     /// Samples several `points`, at once if the solvers do not share the cores themselves and memory allows it.
@@ -95,11 +95,8 @@ impl Building<'_, '_> {
         let spectra = if apart { self.spectra(points, progress) } else { Ok(vec![]) };
         match spectra {
             Ok(spectra) if spectra.len() == points.len() => {
-                for (&point, spectrum) in points.iter().zip(&spectra) {
-                    progress(ParametricStep::Sampling { point, sample: self.sampled.len() + 1 });
-                    self.take(point, spectrum, None, progress)?;
-                }
-                Ok(())
+                let mut found = points.iter().zip(spectra);
+                found.try_for_each(|(&point, spectrum)| self.take(point, spectrum, None, progress))
             }
             Ok(_) | Err(ReductionError::Memory { .. }) => {
                 points.iter().try_for_each(|&point| self.sample(point, None, progress))
@@ -117,6 +114,9 @@ impl Building<'_, '_> {
         self.make_room()?;
         let (n, roots, band_rad_s) = (self.full.dimension(), self.most_roots, self.wanted().band_rad_s);
         let held = points.len() * 2 * roots * n * size_of::<c64>();
+        for (index, &point) in points.iter().enumerate() {
+            progress(ParametricStep::Sampling { point, sample: self.sampled.len() + 1 + index });
+        }
         let is_of_memory = |error: &ReductionError| matches!(error, ReductionError::Memory { .. });
         self.solver.for_threads(threads_for(points.len()), is_of_memory, |solvers| {
             for solver in &mut *solvers {
@@ -142,7 +142,7 @@ impl Building<'_, '_> {
     fn take(
         &mut self,
         point: OperatingPoint,
-        spectrum: &FullSpectrum,
+        spectrum: FullSpectrum,
         estimates: Option<&[(c64, f64)]>,
         progress: &mut dyn FnMut(ParametricStep),
     ) -> Result<(), ReductionError> {

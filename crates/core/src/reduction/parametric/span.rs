@@ -42,8 +42,9 @@ impl<'a> Span<'a> {
     ///
     /// # Errors
     /// [`ReductionError::Factorisation`].
-    pub fn add(&mut self, spectrum: &FullSpectrum, chosen: &[usize], least: f64) -> Result<(), ReductionError> {
-        let mut rest = self.scaled(spectrum, chosen);
+    pub fn add(&mut self, spectrum: FullSpectrum, chosen: &[usize], least: f64) -> Result<(), ReductionError> {
+        let mut rest = self.scaled(&spectrum, chosen);
+        drop(spectrum);
         for _ in 0..2 {
             let step = self.vectors.transpose() * self.metric.times(rest.as_ref());
             rest -= &self.vectors * &step;
@@ -93,7 +94,10 @@ impl<'a> Span<'a> {
             let lengths = [length(0), length(1)];
             for (side, scale) in Condition::new(lambda, lengths, slope).scales().into_iter().enumerate() {
                 let scaled = faer::Scale(scale) * of_root.subcols(2 * side, 2);
-                columns.subcols_mut(4 * k + 2 * side, 2).copy_from(scaled);
+                // A left vector of a dense solve is not finite where `yᴴ x` is exactly zero.
+                if scaled.is_all_finite() {
+                    columns.subcols_mut(4 * k + 2 * side, 2).copy_from(scaled);
+                }
             }
         }
         columns
@@ -106,4 +110,29 @@ fn hstack(a: MatRef<'_, f64>, b: MatRef<'_, f64>) -> Mat<f64> {
     both.subcols_mut(0, a.ncols()).copy_from(a);
     both.subcols_mut(a.ncols(), b.ncols()).copy_from(b);
     both
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::test_models::chains;
+    use super::*;
+    use crate::physics::{ContactLaw, OperatingPoint};
+    use crate::reduction::{FullSolver, FullVectors};
+
+    /// A left vector that is not finite is left out; the others are added.
+    #[test]
+    fn a_vector_that_is_not_finite_is_left_out() {
+        let full = chains(5.0, ContactLaw::default());
+        let point = OperatingPoint { normal_load_n: 500.0, disc_speed_rad_s: 7.0, friction_coefficient: 0.4 };
+        let mut solver = FullSolver::new("chains", &full, None, &mut |_| {}).unwrap();
+        let mut found = solver.roots(&point, 900.0, FullVectors::Both, &mut |_| {}).unwrap();
+        found.left.col_mut(2).fill(c64::new(f64::NAN, f64::NAN));
+        let metric = Metric::new(&full, full.at(&point).unwrap(), 900.0);
+        let mut span = Span::new(&full, metric);
+        let chosen: Vec<usize> = (0..found.roots.len()).collect();
+        span.add(found, &chosen, 1e-5).unwrap();
+        assert!(span.size() > chosen.len() && span.vectors.is_all_finite());
+        let gram = span.metric.gram(&span.vectors);
+        assert!((gram - Mat::<f64>::identity(span.size(), span.size())).norm_max() < 1e-10);
+    }
 }
