@@ -1,6 +1,6 @@
 // The page in every status, with made-up answers: node states.mjs [pictures]. Prints the fields that the answers have.
 import { fileURLToPath } from "node:url";
-import { check, launch, open, picture, until, violations } from "./browser.mjs";
+import { check, choose, launch, open, picture, until, violations } from "./browser.mjs";
 import { fields, serve } from "./canned.mjs";
 
 const [pictures] = process.argv.slice(2);
