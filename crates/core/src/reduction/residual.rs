@@ -242,9 +242,9 @@ mod tests {
         residual(2).unwrap();
     }
 
-    /// What is left after elimination is used only if it holds for a vector whose product is known.
+    /// A factor is used only if it solves a known equation, and sums over subtrees only if they hold for a known combination.
     #[test]
-    fn a_spoilt_factor_or_derivative_is_refused_by_its_probe() {
+    fn spoilt_factors_and_sums_are_refused_by_their_checks() {
         let (mass, stiffness) = chain(420);
         let rows = [Some(3), Some(200)];
         let analysed = Analysed::with_contact(&OwnEngine, "pad", &mass, &stiffness, &rows).unwrap();
