@@ -15,11 +15,14 @@ use crate::physics::{OperatingPoint, Situation, Vectors};
 /// Fraction of the tolerance by which the roots may differ from those of the wide model.
 const SHARE: f64 = 0.4;
 /// Number of times that roots gain weight before more vectors are taken.
-const MOST_WEIGHTINGS: usize = 3;
+const MOST_WEIGHTINGS: i32 = 3;
 /// Fraction of the limit that weights aim at: errors would approach the limit itself from above.
 const AIM: f64 = 0.8;
 /// Fraction of the limit above which an error is watched.
 const NEAR: f64 = 0.3;
+
+/// Number of interpolations in a row before the interval of the number of vectors is halved.
+const MOST_INTERPOLATIONS: usize = 3;
 
 /// What a smaller basis must hold at one operating point.
 struct Target {
@@ -36,7 +39,8 @@ struct Target {
 }
 
 impl Building<'_, '_> {
-    /// Projects the model on the fewest vectors that hold its roots at all `points`; the number is found by bisection.
+    /// Projects the model on the fewest vectors that hold its roots at all `points`; the number is found by
+    /// interpolation of the logarithm of the error, and by bisection.
     pub fn cut(
         &self,
         wide: &Projected,
@@ -59,7 +63,7 @@ impl Building<'_, '_> {
                 target.watched = true;
             }
             let mut covariance = unweighted.clone();
-            let mut weightings = 0;
+            let (mut weightings, mut before) = (0, f64::INFINITY);
             let (smaller, worst) = loop {
                 let weighted = if weightings > 0 { Some(axes(&covariance)?) } else { None };
                 // Ascending: the last ones lead.
@@ -68,11 +72,13 @@ impl Building<'_, '_> {
                 back.solve_in_place(leading.as_mut());
                 let smaller = wide.restricted(leading.as_ref())?;
                 let worst = self.compare(&smaller, &mut targets, limit)?;
-                if worst <= limit || worst == f64::INFINITY || weightings == MOST_WEIGHTINGS {
+                // What is left of the error if every weighting still allowed gains as much as the last one did.
+                let reachable = worst * (worst / before).powi(MOST_WEIGHTINGS - weightings);
+                if worst <= limit || worst == f64::INFINITY || reachable > limit {
                     break (smaller, worst);
                 }
                 covariance += gained(size, &mut targets, AIM * limit);
-                weightings += 1;
+                (weightings, before) = (weightings + 1, worst);
             };
             progress(ParametricStep::Cut { vectors: count, worst });
             if count <= self.request.most_vectors {
@@ -80,16 +86,24 @@ impl Building<'_, '_> {
             }
             Ok((smaller, worst))
         };
-        let (mut enough, mut found) = (size, None);
+        let (mut enough, mut enough_error, mut found) = (size, f64::NAN, None);
         // A basis needs at least as many vectors as counted roots.
-        let mut few = most_counted.min(size - 1);
+        let (mut few, mut few_error) = (most_counted.min(size - 1), f64::NAN);
+        let mut interpolations = 0;
         while enough > few + 1 {
-            let middle = (enough + few) / 2;
-            let (smaller, worst) = attempt(middle)?;
-            if worst <= limit {
-                (enough, found) = (middle, Some(smaller));
+            let share = (few_error / limit).ln() / (few_error / enough_error).ln();
+            let count = if share.is_finite() && interpolations < MOST_INTERPOLATIONS {
+                interpolations += 1;
+                (few + (share * (enough - few) as f64) as usize).clamp(few + 1, enough - 1)
             } else {
-                few = middle;
+                interpolations = 0;
+                (enough + few) / 2
+            };
+            let (smaller, worst) = attempt(count)?;
+            if worst <= limit {
+                (enough, enough_error, found) = (count, worst, Some(smaller));
+            } else {
+                (few, few_error) = (count, worst);
             }
         }
         let chosen = match found {
