@@ -9,8 +9,8 @@ use crate::full_model::FullModelFile;
 use crate::physics::{MapError, MapOptions, OperatingPoint, SolveError, Solver, StabilityMap, Window};
 use crate::random::Random;
 use crate::reduction::{
-    CompareError, FullProgress, FullSolver, FullVectors, Judged, ReductionError, WindowComparison, compare_roots,
-    compare_windows, full_windows, on_threads, reduced_roots, threads_for,
+    CompareError, FullProgress, FullSolver, FullVectors, Judged, ReductionError, compare_roots, compare_windows,
+    full_windows, on_threads, reduced_roots, threads_for,
 };
 use crate::rig::{Certificate, Rig};
 
@@ -198,14 +198,19 @@ pub fn verify_against(
             let what = format!("point {} of {}", index + 1, against.points);
             compared.roots(solvers, p, &mut |step| report((what.clone(), step)))
         })?;
-        let windows = on_threads(&mut workers, &places, &mut report, &|solvers, p, report| {
+        // Those of the full model first, which take longer.
+        let of_both: Vec<_> =
+            [Side::Full, Side::Rig].iter().flat_map(|side| places.iter().map(move |p| (side, p))).collect();
+        let windows = on_threads(&mut workers, &of_both, &mut report, &|solvers, (side, p), report| {
             let what = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
-            compared.windows(solvers, p, &mut |step| report((what.clone(), step)))
+            compared.windows(solvers, side, p, &mut |step| report((what.clone(), step)))
         })?;
         Ok((points, windows))
     })?;
+    let (windows_of_full, windows_of_rig) = of_places.split_at(places.len());
     let (mut windows, mut critical, mut missed, mut invented) = (vec![], None::<f64>, 0, 0);
-    for (p, compared) in places.iter().zip(&of_places) {
+    for ((p, of_full), of_rig) in places.iter().zip(windows_of_full).zip(windows_of_rig) {
+        let compared = compare_windows(of_full, of_rig);
         if !compared.pairs.is_empty() {
             critical = Some(critical.unwrap_or(0.0).max(compared.friction_error(options.mu_max)));
         }
@@ -253,6 +258,13 @@ struct Compared<'a> {
     options: MapOptions,
 }
 
+/// The two sides of a comparison.
+#[derive(Clone, Copy)]
+enum Side {
+    Full,
+    Rig,
+}
+
 /// The solvers of one thread.
 struct Solvers<'s, 'a> {
     full: &'s mut FullSolver<'a>,
@@ -293,17 +305,19 @@ impl Compared<'_> {
         })
     }
 
-    /// Compares the windows of instability at the load and speed of `p`.
+    /// The windows of instability at the load and speed of `p`.
     fn windows(
         &self,
         solvers: &mut Solvers<'_, '_>,
+        side: &Side,
         p: &OperatingPoint,
         progress: &mut dyn FnMut(FullProgress),
-    ) -> Result<WindowComparison, VerificationError> {
-        let Judged { band_rad_s, .. } = self.judged;
-        let of_full = full_windows(&self.full.model, solvers.full, p, band_rad_s, &self.options, progress)?;
-        let of_rig = StabilityMap::of_windows(&self.rig.model, &mut solvers.reduced, p, &self.options)?.windows;
-        Ok(compare_windows(&of_full, &of_rig))
+    ) -> Result<Vec<Window>, VerificationError> {
+        let Self { rig, full, judged, options } = self;
+        Ok(match side {
+            Side::Full => full_windows(&full.model, solvers.full, p, judged.band_rad_s, options, progress)?,
+            Side::Rig => StabilityMap::of_windows(&rig.model, &mut solvers.reduced, p, options)?.windows,
+        })
     }
 }
 
