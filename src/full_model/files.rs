@@ -31,6 +31,25 @@ impl Files {
         Self { toml: name, directory: path.parent().unwrap_or(Path::new("")).to_owned(), digests }
     }
 
+    /// For reading further files at the same time; [`Self::append`] takes their hashes.
+    pub fn beside(&self) -> Self {
+        Self { toml: self.toml.clone(), directory: self.directory.clone(), digests: vec![] }
+    }
+
+    /// Adds the hashes of the files that `beside` read.
+    pub fn append(&mut self, beside: Self) {
+        for (name, digest) in beside.digests {
+            self.add(name, digest);
+        }
+    }
+
+    /// Adds the hash of a file, unless the file is known.
+    fn add(&mut self, name: String, digest: [u8; 32]) {
+        if !self.digests.iter().any(|(known, _)| *known == name) {
+            self.digests.push((name, digest));
+        }
+    }
+
     /// Opens the file `name`, which `field` refers to, and returns the result of `work` on it. The first time, its hash
     /// is recorded.
     ///
@@ -61,9 +80,7 @@ impl Files {
             drop(reader);
             Ok((made, hasher.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)).into()))
         })?;
-        if !self.digests.iter().any(|(known, _)| known == name) {
-            self.digests.push((name.to_owned(), digest));
-        }
+        self.add(name.to_owned(), digest);
         Ok(made)
     }
 

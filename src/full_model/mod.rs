@@ -328,13 +328,20 @@ fn read_parts(
     contact_law: ContactLaw,
 ) -> Result<ReadModel, RigError> {
     let toml = files.toml.clone();
-    let of_disc = [("gyroscopic", &pad.gyroscopic), ("spin", &pad.spin), ("stress_stiffening", &pad.stress_stiffening)];
-    if let Some((key, _)) = of_disc.into_iter().find(|(_, file)| file.is_some()) {
+    let turning = [("gyroscopic", &pad.gyroscopic), ("spin", &pad.spin), ("stress_stiffening", &pad.stress_stiffening)];
+    if let Some((key, _)) = turning.into_iter().find(|(_, file)| file.is_some()) {
         let (field, value) = (format!("pad.{key}"), "is given for the pad, which does not turn".to_owned());
         return Err(RigError::Kind { file: toml, field, value, limit: format!("disc.{key}") });
     }
-    let pad = part::read(files, "pad", pad)?;
-    let disc = own.disc.as_ref().map(|disc| part::read(files, "disc", disc)).transpose()?;
+    // Both at once, with the hashes and the first error in this order.
+    let mut of_disc = files.beside();
+    let (pad, disc) = std::thread::scope(|scope| {
+        let disc = own.disc.as_ref().map(|disc| scope.spawn(|| part::read(&mut of_disc, "disc", disc)));
+        let pad = part::read(files, "pad", pad);
+        (pad, disc.map(|disc| disc.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))))
+    });
+    let (pad, disc) = (pad?, disc.transpose()?);
+    files.append(of_disc);
     let (pad_m, disc_m) = (pad.geometry.interface_m(), disc.as_ref().map(|disc| disc.geometry.interface_m()));
     let patch::Contacts { mut pairs, stiffness_n_per_m, damping_n_s_per_m } =
         patch::contacts(&toml, patches, &pad_m, disc_m.as_deref())?;
