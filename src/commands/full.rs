@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::engine::EngineOptions;
 use super::format::{self, significant};
-use super::memory::{room, solver};
+use super::memory::{keep_freed_unless, room, solver};
 use super::predict::ContactReport;
 use super::steps::ProgressOptions;
 use super::{Conditions, Outcome, positive, print};
@@ -88,6 +88,7 @@ struct RootReport {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        keep_freed_unless(self.memory_gib);
         let chosen = self.engine.choose()?;
         chosen.end_at_signals()?;
         let engine = chosen.engine();

@@ -6,13 +6,22 @@ use anyhow::{Context, bail};
 
 use crate::full_model::FullModelFile;
 use crate::reduction::{Engine, FullProgress, FullSolver, GIB};
-use crate::system::memory::{available_bytes, peak_bytes, resident_bytes};
+use crate::system::memory::{available_bytes, keep_freed, peak_bytes, resident_bytes, return_freed};
+
+/// For a command that works on a full model: unless it is given an amount of memory, what is freed stays in the process,
+/// which is faster but takes up to a twentieth more.
+pub fn keep_freed_unless(asked_gib: Option<f64>) {
+    if asked_gib.is_none() {
+        keep_freed();
+    }
+}
 
 /// Memory that may be used in addition to what this process holds now, bytes; `None` if the system does not report it.
 ///
 /// # Errors
 /// Reading the full model took more than the amount given.
 pub fn room(asked_gib: Option<f64>, full: &Path) -> anyhow::Result<Option<usize>> {
+    return_freed();
     let Some(gib) = asked_gib else { return Ok(available_bytes()) };
     let peak_gib = peak_bytes().map_or(0.0, |bytes| bytes as f64 / GIB);
     if peak_gib > gib {

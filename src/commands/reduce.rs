@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use clap::{Args, Parser};
 
 use super::engine::EngineOptions;
-use super::memory::{room, solver};
+use super::memory::{keep_freed_unless, room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
 use super::steps::{ProgressOptions, Steps};
@@ -125,6 +125,7 @@ pub fn reduce_quietly(words: &[OsString], stopped: Arc<AtomicBool>) -> Result<(R
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        keep_freed_unless(self.memory_gib);
         on_stop(|| {
             remove_begun();
             end_all();

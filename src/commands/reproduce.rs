@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
-use super::memory::{room, solver};
+use super::memory::{keep_freed_unless, room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of};
 use super::signals::on_stop;
 use super::steps::ProgressOptions;
@@ -41,6 +41,7 @@ pub struct Options {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        keep_freed_unless(self.memory_gib);
         on_stop(|| {
             remove_begun();
             note!("\nstopped: not all files were written");

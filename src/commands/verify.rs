@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::engine::EngineOptions;
-use super::memory::{room, solver};
+use super::memory::{keep_freed_unless, room, solver};
 use super::steps::ProgressOptions;
 use super::{Outcome, RigName, positive, print};
 use crate::full_model::FullModelFile;
@@ -63,6 +63,7 @@ pub struct Options {
 
 impl Options {
     pub fn run(self) -> anyhow::Result<Outcome> {
+        keep_freed_unless(self.memory_gib);
         let chosen = self.engine.choose()?;
         chosen.end_at_signals()?;
         let engine = chosen.engine();
