@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use clap::{Args, Parser};
 
 use super::engine::EngineOptions;
-use super::memory::{keep_freed_unless, room, solver};
+use super::memory::{keep_freed_unless, return_freed_by, room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of, ranges};
 use super::signals::on_stop;
 use super::steps::{ProgressOptions, Steps};
@@ -181,7 +181,8 @@ impl Options {
         let wanted = self.wanted(&full)?;
         let names: Vec<&str> = full.model.parts.iter().map(|part| part.name.as_str()).collect();
         let kept = full.keep_modes(engine, &wanted, !self.no_residual, room, &mut |part, what| {
-            steps.modes(part, names[part], what)
+            return_freed_by(&what);
+            steps.modes(part, names[part], what);
         })?;
         for (name, Kept { modes, .. }) in names.iter().zip(&kept) {
             let worst = modes.residuals.iter().copied().fold(0.0, f64::max);

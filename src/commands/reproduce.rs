@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
-use super::memory::{keep_freed_unless, room, solver};
+use super::memory::{keep_freed_unless, return_freed_by, room, solver};
 use super::on_basis::{Ranges, TOLERANCE, basis_of};
 use super::signals::on_stop;
 use super::steps::ProgressOptions;
@@ -77,6 +77,7 @@ impl Options {
             true,
             room(self.memory_gib, &toml)?,
             &mut |part, what| {
+                return_freed_by(&what);
                 steps.modes(part, names[part], what);
             },
         )?;
