@@ -8,16 +8,16 @@ use crate::full_model::FullModelFile;
 use crate::reduction::{Engine, FullProgress, FullSolver, GIB, Progress};
 use crate::system::memory::{available_bytes, keep_freed, peak_bytes, resident_bytes, return_freed};
 
-/// For a command that works on a full model: unless it is given an amount of memory, what is freed stays in the process,
-/// which is faster but takes up to a twentieth more.
+/// Keeps freed memory in the process unless the command is given an amount of memory: faster, but up to a twentieth more
+/// memory.
 pub fn keep_freed_unless(asked_gib: Option<f64>) {
     if asked_gib.is_none() {
         keep_freed();
     }
 }
 
-/// Returns the memory that a step of finding the modes of a part has freed, if it is much: kept between blocks that
-/// stay, it would add to the peak.
+/// Returns freed memory to the system after the steps of a part's modes that free much of it. Kept in gaps between
+/// arrays that stay, it would add to the peak.
 pub fn return_freed_by(step: &Progress) {
     if let Progress::Analysed { .. } | Progress::Factored { .. } | Progress::Counted { .. } = step {
         return_freed();

@@ -31,7 +31,7 @@ impl Files {
         Self { toml: name, directory: path.parent().unwrap_or(Path::new("")).to_owned(), digests }
     }
 
-    /// For reading further files at the same time; [`Self::append`] takes their hashes.
+    /// Reads further files at the same time, on another thread; [`Self::append`] then takes their hashes.
     pub fn beside(&self) -> Self {
         Self { toml: self.toml.clone(), directory: self.directory.clone(), digests: vec![] }
     }

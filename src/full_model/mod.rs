@@ -333,7 +333,7 @@ fn read_parts(
         let (field, value) = (format!("pad.{key}"), "is given for the pad, which does not turn".to_owned());
         return Err(RigError::Kind { file: toml, field, value, limit: format!("disc.{key}") });
     }
-    // Both at once, with the hashes and the first error in this order.
+    // Both at the same time. Hashes and errors are those of reading the pad first.
     let mut of_disc = files.beside();
     let (pad, disc) = std::thread::scope(|scope| {
         let disc = own.disc.as_ref().map(|disc| scope.spawn(|| part::read(&mut of_disc, "disc", disc)));

@@ -198,10 +198,10 @@ pub fn verify_against(
             let what = format!("point {} of {}", index + 1, against.points);
             compared.roots(solvers, p, &mut |step| report((what.clone(), step)))
         })?;
-        // Those of the full model first, which take longer.
+        // The full model first: its windows take longer.
         let of_both: Vec<_> =
-            [Side::Full, Side::Rig].iter().flat_map(|side| places.iter().map(move |p| (side, p))).collect();
-        let windows = on_threads(&mut workers, &of_both, &mut report, &|solvers, (side, p), report| {
+            [Side::Full, Side::Rig].into_iter().flat_map(|side| places.iter().map(move |p| (side, p))).collect();
+        let windows = on_threads(&mut workers, &of_both, &mut report, &|solvers, &(side, p), report| {
             let what = format!("windows at {} N, {} rad/s", p.normal_load_n, p.disc_speed_rad_s);
             compared.windows(solvers, side, p, &mut |step| report((what.clone(), step)))
         })?;
@@ -309,7 +309,7 @@ impl Compared<'_> {
     fn windows(
         &self,
         solvers: &mut Solvers<'_, '_>,
-        side: &Side,
+        side: Side,
         p: &OperatingPoint,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Vec<Window>, VerificationError> {

@@ -29,7 +29,7 @@ pub fn keep_freed() {
     }
 }
 
-/// Returns the memory that is freed and kept to the system, with glibc.
+/// Returns freed memory to the system, with glibc.
 pub fn return_freed() {
     #[cfg(target_env = "gnu")]
     // SAFETY: `malloc_trim` touches free memory alone, and may be called at any time.

@@ -35,12 +35,19 @@ fn the_tribometer_is_read_as_it_was_written() {
         .exits(0)
         .says("294 pairs")
         .says("294 of coincident nodes, 0 interpolated")
+        .says("pad-nodes.csv, pad-rows.csv, pad-stiffness.mtx, pad-mass.mtx, disc-nodes.csv")
         .says(&full.content_hash);
     // Another digit in a matrix is another model.
     let mass = folder.path().join("pad-mass.mtx");
     let changed = std::fs::read_to_string(&mass).unwrap().replacen("% mass", "% Mass", 1);
     std::fs::write(&mass, changed).unwrap();
     assert_ne!(FullModelFile::load(&path).unwrap().content_hash, full.content_hash);
+    // Both parts are read at the same time. Of two errors the pad's is reported, even if the disc's is found long before it.
+    std::fs::remove_file(folder.path().join("disc-nodes.csv")).unwrap();
+    run(["check", &text(&path)]).exits(1).complains("disc.nodes = \"disc-nodes.csv\" cannot be read");
+    let cut = std::fs::read_to_string(&mass).unwrap();
+    std::fs::write(&mass, cut.trim_end().rsplit_once('\n').unwrap().0).unwrap();
+    run(["check", &text(&path)]).exits(1).complains("pad-mass.mtx").complains("entries end after");
 }
 
 /// A pad of one node that moves in x, y, z before a rigid disc.

@@ -20,7 +20,6 @@ const MOST_WEIGHTINGS: i32 = 3;
 const AIM: f64 = 0.8;
 /// Fraction of the limit above which an error is watched.
 const NEAR: f64 = 0.3;
-
 /// Number of interpolations in a row before the interval of the number of vectors is halved.
 const MOST_INTERPOLATIONS: usize = 3;
 
@@ -86,26 +85,9 @@ impl Building<'_, '_> {
             }
             Ok((smaller, worst))
         };
-        let (mut enough, mut enough_error, mut found) = (size, f64::NAN, None);
         // A basis needs at least as many vectors as counted roots.
-        let (mut few, mut few_error) = (most_counted.min(size - 1), f64::NAN);
-        let mut interpolations = 0;
-        while enough > few + 1 {
-            let share = (few_error / limit).ln() / (few_error / enough_error).ln();
-            let count = if share.is_finite() && interpolations < MOST_INTERPOLATIONS {
-                interpolations += 1;
-                (few + (share * (enough - few) as f64) as usize).clamp(few + 1, enough - 1)
-            } else {
-                interpolations = 0;
-                (enough + few) / 2
-            };
-            let (smaller, worst) = attempt(count)?;
-            if worst <= limit {
-                (enough, enough_error, found) = (count, worst, Some(smaller));
-            } else {
-                (few, few_error) = (count, worst);
-            }
-        }
+        let few = most_counted.min(size - 1);
+        let (enough, found) = fewest(few, size, limit, &mut attempt)?;
         let chosen = match found {
             Some(smaller) => smaller,
             None => attempt(enough)?.0,
@@ -180,6 +162,40 @@ impl Building<'_, '_> {
     }
 }
 
+/// The least count above `few`, up to `enough`, whose error is within `limit`, and what `attempt` made of it: `None` for
+/// `enough` itself, which is assumed to hold. `attempt` returns what it made of a count, and its error.
+///
+/// The next count is where the logarithm of the error, interpolated between the two nearest counts tried, crosses the
+/// limit, and the middle where one of them is not tried yet, or after [`MOST_INTERPOLATIONS`]. Where the error is not
+/// monotone, the count found holds and the one below it does not.
+fn fewest<T, E>(
+    mut few: usize,
+    mut enough: usize,
+    limit: f64,
+    attempt: &mut dyn FnMut(usize) -> Result<(T, f64), E>,
+) -> Result<(usize, Option<T>), E> {
+    // NaN: not known.
+    let (mut error_of_few, mut error_of_enough) = (f64::NAN, f64::NAN);
+    let (mut found, mut interpolations) = (None, 0);
+    while enough > few + 1 {
+        let share = (error_of_few / limit).ln() / (error_of_few / error_of_enough).ln();
+        let count = if share.is_finite() && interpolations < MOST_INTERPOLATIONS {
+            interpolations += 1;
+            (few + (share * (enough - few) as f64) as usize).clamp(few + 1, enough - 1)
+        } else {
+            interpolations = 0;
+            (enough + few) / 2
+        };
+        let (made, error) = attempt(count)?;
+        if error <= limit {
+            (enough, error_of_enough, found) = (count, error, Some(made));
+        } else {
+            (few, error_of_few) = (count, error);
+        }
+    }
+    Ok((enough, found))
+}
+
 /// `Σ v vᵀ` over the vectors of all targets, `size×size`.
 fn covariance(size: usize, targets: &[Target]) -> Mat<f64> {
     targets.iter().fold(Mat::zeros(size, size), |sum, target| sum + &target.vectors * target.vectors.transpose())
@@ -206,4 +222,39 @@ fn axes(covariance: &Mat<f64>) -> Result<Mat<f64>, ReductionError> {
     let n = covariance.nrows();
     let symmetric = Mat::from_fn(n, n, |i, j| covariance[(i.max(j), i.min(j))]);
     Ok(symmetric_eigen("parametric basis", symmetric.as_ref())?.1)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use super::*;
+
+    /// Exponential errors, one step, and errors that are infinite for few vectors: the same count as one by one, in at most
+    /// four attempts for each halving of the interval.
+    #[test]
+    fn the_fewest_vectors_are_found_in_few_attempts() {
+        let errors: [&dyn Fn(usize) -> f64; 4] = [
+            &|count| 10.0_f64.powf(-0.1 * count as f64),
+            &|count| if count < 97 { 1.0 } else { 1e-12 },
+            &|count| if count < 60 { f64::INFINITY } else { 10.0_f64.powf(-0.09 * count as f64) },
+            &|_| 0.0,
+        ];
+        let (few, enough, limit) = (15, 145, 4e-7);
+        for (index, error) in errors.into_iter().enumerate() {
+            let expected = (few + 1..enough).find(|&count| error(count) <= limit).unwrap();
+            let mut attempts = 0;
+            let (count, made) = fewest(few, enough, limit, &mut |count| {
+                attempts += 1;
+                Ok::<_, Infallible>((count, error(count)))
+            })
+            .unwrap();
+            assert_eq!((count, made), (expected, Some(expected)), "{index}");
+            assert!(attempts <= 4 * 8, "{index}: {attempts}");
+            // Exponential errors are interpolated to a straight line.
+            assert!(index != 0 || attempts <= 5, "{attempts}");
+        }
+        let nothing = fewest(few, enough, limit, &mut |_| Ok::<_, Infallible>(((), 1.0))).unwrap();
+        assert_eq!(nothing, (enough, None));
+    }
 }
