@@ -11,7 +11,7 @@ use clap::Args;
 use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::physics::OperatingPoint;
-use crate::reduction::{CountedBy, FullProgress, GIB, ParametricStep, Progress};
+use crate::reduction::{CountedBy, FullProgress, GIB, ParametricStep, Precision, Progress};
 use crate::system::clock::monotonic_ns;
 use crate::system::memory::resident_bytes;
 use crate::text::terminal::printable;
@@ -133,8 +133,12 @@ impl Steps {
             FullProgress::Analysed { bytes } => {
                 self.say(&format!("{what}: ordered and analysed, needs {:.2} GiB at least", bytes as f64 / GIB));
             }
-            FullProgress::Factored { shift_rad_s } => {
-                self.say(&format!("{what}: factored at {:.1} Hz", hz(shift_rad_s)));
+            FullProgress::Factored { shift_rad_s, precision } => {
+                let kept = match precision {
+                    Precision::Double => "",
+                    Precision::Single => ", kept in single precision for want of memory",
+                };
+                self.say(&format!("{what}: factored at {:.1} Hz{kept}", hz(shift_rad_s)));
             }
             FullProgress::Iterated { shift_rad_s, converged, wanted, .. } => {
                 self.at(0, &format!("{what}: roots around {:.1} Hz", hz(shift_rad_s)), converged.min(wanted), wanted);

@@ -10,7 +10,8 @@ pub enum Spoil {
     Value,
     /// Perturbs a right vector of the unsymmetric dense problem, or a mode of a sparse system.
     Vector,
-    /// Perturbs an entry of a factor `L Lᵀ` or `L D Lᵀ` by 1e-6 of itself.
+    /// Perturbs an entry of a factor `L Lᵀ` or `L D Lᵀ`: by 1e-6 of itself in double precision, manyfold in single, whose
+    /// solves are refined.
     Factor,
     /// Leaves the rows of one subtree out of the products of responses to loads.
     Share,

@@ -8,7 +8,7 @@
 //!
 //! This is the Woodbury formula. At `s = iω`, `A` is real and `A = P L D Lᵀ Pᵀ`. The contact rows are eliminated last,
 //! so that `G` only needs the trailing block of the factor. A solve is then one forward pass, a dense solve for the
-//! contact, and one backward pass.
+//! contact, and one backward pass. With factors in single precision it is refined by products with `Q`.
 //!
 //! Source: Hager, "Updating the inverse of a matrix", SIAM Review 31 (1989) 221-239.
 
@@ -16,10 +16,14 @@ use faer::linalg::solvers::{PartialPivLu, Solve};
 use faer::linalg::triangular_solve::{solve_unit_lower_triangular_in_place, solve_unit_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par, c64};
 
-use super::ReductionError;
 use super::full_model::{FullModel, LowRank, SparseRow};
 use super::krylov::Number;
-use super::pencil::{Ldlt, Pencil};
+use super::ldlt::Ldlt;
+use super::pencil::Pencil;
+use super::precision::Precision;
+use super::refinement::{Stalled, refined};
+use super::sparse::symmetric_times;
+use super::{ReductionError, SparseMatrix};
 
 /// The parts of a full model, ordered and symbolically analysed.
 pub(super) struct Parts<'a> {
@@ -45,14 +49,14 @@ impl<'a> Parts<'a> {
     }
 
     /// Estimated memory.
-    pub(super) fn bytes(&self) -> PartBytes {
+    pub(super) fn bytes(&self, precision: Precision) -> PartBytes {
         let float = size_of::<f64>();
         let dense = |rows: &Vec<usize>| float * rows.len() * rows.len();
         let pencils = self.pencils.iter();
         // In addition to a factor: its pivots, and `L` and `A⁻¹` of the contact rows, with temporaries of the same
         // size.
         let (factors, pivots) = pencils.clone().fold((0, 0), |(bytes, pivots), pencil| {
-            (bytes + pencil.factor_bytes(), pivots + float * pencil.dimension())
+            (bytes + precision.bytes() * pencil.factor_entries(), pivots + float * pencil.dimension())
         });
         PartBytes {
             held: pencils.clone().map(Pencil::held_bytes).sum(),
@@ -71,12 +75,14 @@ impl<'a> Parts<'a> {
     }
 
     /// Factorises `K - ω² M` of every part, where `square` is `ω²`, rad²/s².
-    pub(super) fn at(&self, square: f64) -> Result<Shifted, ReductionError> {
+    pub(super) fn at(&self, square: f64, precision: Precision) -> Result<Shifted<'a>, ReductionError> {
         let mut parts = vec![];
         for (index, pencil) in self.pencils.iter().enumerate() {
-            parts.push(PartFactor::new(pencil.ldlt(-square)?, self.offsets[index], self.touched[index].len()));
+            let ldlt = pencil.ldlt(-square, precision)?;
+            let matrices = [pencil.stiffness, pencil.mass];
+            parts.push(PartFactor::new(ldlt, matrices, self.offsets[index], self.touched[index].len()));
         }
-        Ok(Shifted { square, parts })
+        Ok(Shifted { square, precision, parts })
     }
 }
 
@@ -92,8 +98,10 @@ pub(super) struct PartBytes {
 }
 
 /// Factor of one part.
-struct PartFactor {
+struct PartFactor<'a> {
     ldlt: Ldlt,
+    /// `K` and `M`.
+    matrices: [&'a SparseMatrix; 2],
     offset: usize,
     pivots: Vec<f64>,
     /// Trailing block of `L`, for the contact rows.
@@ -102,28 +110,34 @@ struct PartFactor {
     flexibility: Mat<f64>,
 }
 
-impl PartFactor {
-    fn new(ldlt: Ldlt, offset: usize, touched: usize) -> Self {
-        let (pivots, last) = (ldlt.pivots(), ldlt.triangle().trailing(touched));
+impl<'a> PartFactor<'a> {
+    fn new(ldlt: Ldlt, matrices: [&'a SparseMatrix; 2], offset: usize, touched: usize) -> Self {
+        let (pivots, last) = (ldlt.pivots(), ldlt.trailing(touched));
         let first = pivots.len() - touched;
         let mut inverse = Mat::<f64>::identity(touched, touched);
         solve_unit_lower_triangular_in_place(last.as_ref(), inverse.as_mut(), Par::Seq);
         let scaled = Mat::from_fn(touched, touched, |i, j| inverse[(i, j)] / pivots[first + i]);
         let flexibility = inverse.transpose() * scaled;
-        Self { ldlt, offset, pivots, last, flexibility }
+        Self { ldlt, matrices, offset, pivots, last, flexibility }
     }
 
     /// Position of the first contact row in the order of elimination.
     fn first(&self) -> usize {
         self.pivots.len() - self.last.nrows()
     }
+
+    /// The contact rows in the order of elimination.
+    fn contact_rows(&self) -> &[usize] {
+        &self.ldlt.order()[self.first()..]
+    }
 }
 
 /// Factors of `K - ω² M` of every part at one shift.
-pub(super) struct Shifted {
+pub(super) struct Shifted<'a> {
     /// `ω²`, rad²/s².
     pub square: f64,
-    parts: Vec<PartFactor>,
+    pub precision: Precision,
+    parts: Vec<PartFactor<'a>>,
 }
 
 /// Rows of the contact pairs, for each part, indexed by position among its contact rows.
@@ -131,7 +145,7 @@ type Placed = Vec<Vec<SparseRow>>;
 
 /// Solver with `Q(s)`, or its transpose, at one shift and operating point.
 pub(super) struct Coupled<'a, T: Number> {
-    shifted: &'a Shifted,
+    shifted: &'a Shifted<'a>,
     left: Placed,
     right: Placed,
     weights: Vec<T>,
@@ -139,7 +153,7 @@ pub(super) struct Coupled<'a, T: Number> {
     factor: PartialPivLu<T>,
 }
 
-impl Shifted {
+impl Shifted<'_> {
     /// Whether `K - ω² M` of every part is positive definite.
     pub(super) fn is_definite(&self) -> bool {
         self.parts.iter().flat_map(|part| &part.pivots).all(|pivot| *pivot > 0.0)
@@ -180,8 +194,8 @@ impl Shifted {
 
     /// Converts rows over all degrees of freedom to rows over the contact rows of each part.
     fn placed(&self, rows: &[SparseRow]) -> Placed {
-        let of_part = |part: &PartFactor| {
-            let order = &part.ldlt.order()[part.first()..];
+        let of_part = |part: &PartFactor<'_>| {
+            let order = part.contact_rows();
             let place: std::collections::HashMap<usize, usize> =
                 order.iter().enumerate().map(|(place, row)| (part.offset + row, place)).collect();
             rows.iter()
@@ -223,19 +237,59 @@ where
     PartialPivLu<T>: Solver<T>,
 {
     /// `Q⁻¹ B`.
-    pub(super) fn solve(&self, b: MatRef<'_, T>) -> Mat<T> {
-        // A block of complex columns is solved as real columns: first all real parts, then all imaginary parts.
-        let (columns, real) = (b.ncols(), if T::REAL { b.ncols() } else { 2 * b.ncols() });
-        let component = |value: T, column: usize| {
-            let value = value.complex();
-            if column < columns { value.re } else { value.im }
-        };
+    ///
+    /// # Errors
+    /// [`Stalled`] if factors in single precision are too inaccurate.
+    pub(super) fn solve(&self, b: MatRef<'_, T>) -> Result<Mat<T>, Stalled> {
+        match self.shifted.precision {
+            Precision::Double => Ok(self.solve_once(b)),
+            Precision::Single => refined(b, |x| self.times(x), |r| self.solve_once(r)),
+        }
+    }
+
+    /// `Q X`.
+    fn times(&self, x: MatRef<'_, T>) -> Mat<T> {
+        let columns = x.ncols();
+        let real = |value: f64| T::from_complex(c64::new(value, 0.0));
+        let mut forces = Mat::<T>::zeros(self.weights.len(), columns);
+        let mut y = Mat::<T>::zeros(x.nrows(), columns);
+        for (part, right) in self.shifted.parts.iter().zip(&self.right) {
+            let (n, contact) = (part.pivots.len(), part.contact_rows());
+            let [stiffness, mass] = part.matrices;
+            let parts = Mat::from_fn(n, real_columns::<T>(columns), |i, j| {
+                part_of(x[(part.offset + i, j % columns)], j < columns)
+            });
+            let z = symmetric_times(stiffness, parts.as_ref())
+                - faer::Scale(self.shifted.square) * symmetric_times(mass, parts.as_ref());
+            for j in 0..columns {
+                (0..n).for_each(|i| y[(part.offset + i, j)] = whole(&z, i, j, columns));
+                for (pair, row) in right.iter().enumerate() {
+                    for &(place, weight) in row {
+                        forces[(pair, j)] += self.weights[pair] * real(weight) * x[(part.offset + contact[place], j)];
+                    }
+                }
+            }
+        }
+        for (part, left) in self.shifted.parts.iter().zip(&self.left) {
+            let contact = part.contact_rows();
+            for (pair, row) in left.iter().enumerate() {
+                for &(place, weight) in row {
+                    (0..columns).for_each(|j| y[(part.offset + contact[place], j)] += real(weight) * forces[(pair, j)]);
+                }
+            }
+        }
+        y
+    }
+
+    /// `Q⁻¹ B` as exactly as the factors are kept.
+    fn solve_once(&self, b: MatRef<'_, T>) -> Mat<T> {
+        let (columns, real) = (b.ncols(), real_columns::<T>(b.ncols()));
         let mut u = Mat::<f64>::zeros(self.weights.len(), real);
         let mut reduced = vec![];
         for (part, right) in self.shifted.parts.iter().zip(&self.right) {
             let (order, n) = (part.ldlt.order(), part.pivots.len());
-            let mut z = Mat::from_fn(n, real, |i, j| component(b[(part.offset + order[i], j % columns)], j));
-            part.ldlt.triangle().forward(z.as_mut());
+            let mut z = Mat::from_fn(n, real, |i, j| part_of(b[(part.offset + order[i], j % columns)], j < columns));
+            part.ldlt.forward(z.as_mut());
             let touched = part.last.nrows();
             let mut x = Mat::from_fn(touched, real, |i, j| z[(part.first() + i, j)] / part.pivots[part.first() + i]);
             solve_unit_upper_triangular_in_place(part.last.transpose(), x.as_mut(), Par::Seq);
@@ -246,10 +300,7 @@ where
             }
             reduced.push(z);
         }
-        let loads = Mat::from_fn(u.nrows(), columns, |pair, j| {
-            let im = if T::REAL { 0.0 } else { u[(pair, columns + j)] };
-            self.weights[pair] * T::from_complex(c64::new(u[(pair, j)], im))
-        });
+        let loads = Mat::from_fn(u.nrows(), columns, |pair, j| self.weights[pair] * whole::<T>(&u, pair, j, columns));
         let y = self.factor.solved(loads);
         let mut x = Mat::<T>::zeros(b.nrows(), columns);
         for ((part, left), mut z) in self.shifted.parts.iter().zip(&self.left).zip(reduced) {
@@ -257,7 +308,7 @@ where
             let mut pushed = Mat::<f64>::zeros(n - first, real);
             for (pair, row) in left.iter().enumerate() {
                 for &(place, weight) in row {
-                    (0..real).for_each(|j| pushed[(place, j)] += weight * component(y[(pair, j % columns)], j));
+                    (0..real).for_each(|j| pushed[(place, j)] += weight * part_of(y[(pair, j % columns)], j < columns));
                 }
             }
             solve_unit_lower_triangular_in_place(part.last.as_ref(), pushed.as_mut(), Par::Seq);
@@ -266,14 +317,30 @@ where
             for j in 0..real {
                 z.col_as_slice_mut(j).iter_mut().zip(&part.pivots).for_each(|(value, pivot)| *value /= pivot);
             }
-            part.ldlt.triangle().backward(z.as_mut());
+            part.ldlt.backward(z.as_mut());
             for j in 0..columns {
                 for (i, &row) in order.iter().enumerate() {
-                    let im = if T::REAL { 0.0 } else { z[(i, columns + j)] };
-                    x[(part.offset + row, j)] = T::from_complex(c64::new(z[(i, j)], im));
+                    x[(part.offset + row, j)] = whole(&z, i, j, columns);
                 }
             }
         }
         x
     }
+}
+
+/// Number of real columns for a block of `columns`. One of complex numbers is solved as all real parts, then all imaginary
+/// parts.
+fn real_columns<T: Number>(columns: usize) -> usize {
+    if T::REAL { columns } else { 2 * columns }
+}
+
+/// The real or the imaginary part of a number.
+fn part_of<T: Number>(value: T, real: bool) -> f64 {
+    let value = value.complex();
+    if real { value.re } else { value.im }
+}
+
+/// The number at `(i, j)` of a block of `columns`, from its parts.
+fn whole<T: Number>(parts: &Mat<f64>, i: usize, j: usize, columns: usize) -> T {
+    T::from_complex(c64::new(parts[(i, j)], if T::REAL { 0.0 } else { parts[(i, columns + j)] }))
 }

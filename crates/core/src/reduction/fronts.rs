@@ -20,6 +20,7 @@ use faer::{Mat, MatMut};
 use super::SparseMatrix;
 use super::elimination_tree::Tree;
 use super::front_blocks::{Broken, positive, signed, subtract_lower};
+use super::precision::{Real, Values};
 use super::threads::shared;
 
 /// Number of rows of a front below which it is not divided among threads.
@@ -62,12 +63,18 @@ struct Update {
     value: Mat<f64>,
 }
 
+/// The factor to be filled, by supernodes.
+enum Kept<'f> {
+    Nothing,
+    Double(Vec<Mutex<&'f mut [f64]>>),
+    Single(Vec<Mutex<&'f mut [f32]>>),
+}
+
 /// One sweep through the tree.
 struct Sweep<'a, 'f> {
     fronts: &'f Fronts<'a>,
     pivots: Pivots,
-    /// The factor to be filled, by supernodes.
-    factor: Option<Vec<Mutex<&'f mut [f64]>>>,
+    factor: Kept<'f>,
     pending: Vec<Mutex<Vec<Update>>>,
     negative: AtomicUsize,
     indefinite: AtomicBool,
@@ -77,21 +84,26 @@ struct Sweep<'a, 'f> {
 impl Fronts<'_> {
     /// Fills `values` with the factor `L` of `L Lᵀ` in the layout of the supernodes.
     pub(super) fn cholesky(&self, values: &mut [f64]) -> Result<(), Broken> {
-        self.sweep(Pivots::Positive, Some(self.divided(values))).map(|_| ())
+        self.sweep(Pivots::Positive, Kept::Double(self.divided(values))).map(|_| ())
     }
 
-    /// Fills `values` with the factor `L` of `L D Lᵀ` in the layout of the supernodes, `D` on its diagonal.
-    pub(super) fn ldlt(&self, values: &mut [f64]) -> Result<(), Broken> {
-        self.sweep(Pivots::Signed, Some(self.divided(values))).map(|_| ())
+    /// Fills `values` with the factor `L` of `L D Lᵀ` in the layout of the supernodes, `D` on its diagonal. It is computed
+    /// in double precision and rounded to that of `values`.
+    pub(super) fn ldlt(&self, values: &mut Values) -> Result<(), Broken> {
+        let kept = match values {
+            Values::Double(values) => Kept::Double(self.divided(values)),
+            Values::Single(values) => Kept::Single(self.divided(values)),
+        };
+        self.sweep(Pivots::Signed, kept).map(|_| ())
     }
 
     /// The number of negative pivots of `L D Lᵀ`. Nothing of the factor is kept.
     pub(super) fn count_negative(&self) -> Result<usize, Broken> {
-        self.sweep(Pivots::Signed, None)
+        self.sweep(Pivots::Signed, Kept::Nothing)
     }
 
     /// The parts of `values` that belong to each supernode.
-    fn divided<'v>(&self, values: &'v mut [f64]) -> Vec<Mutex<&'v mut [f64]>> {
+    fn divided<'v, T>(&self, values: &'v mut [T]) -> Vec<Mutex<&'v mut [T]>> {
         let mut rest = values;
         let part = |ends: &[usize]| {
             let (mine, others) = std::mem::take(&mut rest).split_at_mut(ends[1] - ends[0]);
@@ -107,7 +119,7 @@ impl Fronts<'_> {
     }
 
     /// Eliminates all supernodes. Returns the number of negative pivots.
-    fn sweep<'f>(&'f self, pivots: Pivots, factor: Option<Vec<Mutex<&'f mut [f64]>>>) -> Result<usize, Broken> {
+    fn sweep<'f>(&'f self, pivots: Pivots, factor: Kept<'f>) -> Result<usize, Broken> {
         let sweep = Sweep::new(self, pivots, factor);
         shared(self.tree.subtrees.iter().collect(), true, |subtree: &Vec<usize>| {
             let mut place = vec![ABSENT; self.order.0.len()];
@@ -121,7 +133,7 @@ impl Fronts<'_> {
 }
 
 impl<'a, 'f> Sweep<'a, 'f> {
-    fn new(fronts: &'f Fronts<'a>, pivots: Pivots, factor: Option<Vec<Mutex<&'f mut [f64]>>>) -> Self {
+    fn new(fronts: &'f Fronts<'a>, pivots: Pivots, factor: Kept<'f>) -> Self {
         let pending = fronts.tree.parents.iter().map(|_| Mutex::new(vec![])).collect();
         let (negative, indefinite, broken) = (AtomicUsize::new(0), AtomicBool::new(false), AtomicBool::new(false));
         Self { fronts, pivots, factor, pending, negative, indefinite, broken }
@@ -166,7 +178,10 @@ impl<'a, 'f> Sweep<'a, 'f> {
         let own = || (shape.start..shape.start + columns).chain(shape.rest.iter().copied());
         own().enumerate().for_each(|(local, row)| place[row] = local as u32);
         let mut memory;
-        let mut kept = self.factor.as_ref().and_then(|factor| factor[s].lock().ok());
+        let mut kept = match &self.factor {
+            Kept::Double(factor) => factor[s].lock().ok(),
+            Kept::Nothing | Kept::Single(_) => None,
+        };
         let panel = match &mut kept {
             Some(values) => &mut ***values,
             None => {
@@ -199,6 +214,12 @@ impl<'a, 'f> Sweep<'a, 'f> {
                 Some(negative) => drop(self.negative.fetch_add(negative, Ordering::Relaxed)),
                 None => self.broken.store(true, Ordering::Relaxed),
             },
+        }
+        if let Kept::Single(factor) = &self.factor
+            && let Ok(mut kept) = factor[s].lock()
+        {
+            let rounded = panel.col_iter().flat_map(|column| column.iter().copied().map(f32::rounded));
+            kept.iter_mut().zip(rounded).for_each(|(to, value)| *to = value);
         }
         Update { supernode: s, value: update }
     }

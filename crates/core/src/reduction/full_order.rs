@@ -30,6 +30,7 @@ use super::engine::Engine;
 use super::full_model::FullModel;
 use super::full_problem::{Problem, WANTED, unit};
 use super::full_root::{FullProgress, FullRoot, FullSpectrum, FullVectors};
+use super::kept_factors::KeptFactors;
 use super::krylov_schur::{BLOCK, capacity, most_found};
 use super::own_engine::OwnEngine;
 use crate::physics::{self, OperatingPoint, Vectors};
@@ -40,8 +41,6 @@ const SOLVE_LIMIT: f64 = 1e-13;
 const GROWTH: f64 = 0.02;
 /// Largest number of shifts for one band.
 const MOST_SHIFTS: usize = 200;
-/// Largest number of shifts whose factors are kept for later operating points.
-const MOST_KEPT: usize = 4;
 /// Number of blocks a Krylov step holds in memory besides the basis: matrix products in two memory layouts, complex
 /// numbers split into real and imaginary columns and joined again, and permuted copies around the factors. Used to
 /// estimate memory before factorising.
@@ -61,14 +60,11 @@ pub struct FullSolver<'a> {
     engine: &'a dyn Engine,
     what: String,
     model: &'a FullModel,
-    /// Parts joined by contact only; `None` for other models and for foreign engines, which need a sparse LU.
-    parts: Option<Parts<'a>>,
-    kept: Vec<Shifted>,
+    /// Of parts joined by contact only; `None` for other models and for foreign engines, which need a sparse LU.
+    factors: Option<KeptFactors<'a>>,
     memory_limit_bytes: Option<usize>,
     /// Bytes that the caller holds permanently, see [`FullSolver::held_elsewhere`].
     elsewhere_bytes: usize,
-    /// Number of factors that fit in memory.
-    most_kept: usize,
 }
 
 impl<'a> FullSolver<'a> {
@@ -101,12 +97,11 @@ impl<'a> FullSolver<'a> {
     ) -> Result<Self, ReductionError> {
         let has_terms = !(model.stiffness.is_empty() && model.damping.is_empty() && model.modal_damping.is_empty());
         let by_parts = !has_terms && model.contact.is_some() && !engine.foreign();
-        let parts = if by_parts { Some(Parts::new(model)?) } else { None };
+        let factors = if by_parts { Some(KeptFactors::new(Parts::new(model)?)) } else { None };
         let what = what.to_owned();
-        let mut solver =
-            Self { engine, what, model, parts, kept: vec![], memory_limit_bytes, elsewhere_bytes: 0, most_kept: 1 };
-        progress(FullProgress::Analysed { bytes: solver.bytes(FullVectors::None, 0) });
-        solver.make_room(FullVectors::None, 0, 0, 0)?;
+        let mut solver = Self { engine, what, model, factors, memory_limit_bytes, elsewhere_bytes: 0 };
+        let bytes = solver.make_room(FullVectors::None, 0, 0, 0)?;
+        progress(FullProgress::Analysed { bytes });
         Ok(solver)
     }
 
@@ -129,11 +124,9 @@ impl<'a> FullSolver<'a> {
                 engine: self.engine,
                 what: self.what.clone(),
                 model: self.model,
-                parts: None,
-                kept: vec![],
+                factors: None,
                 memory_limit_bytes: self.memory_limit_bytes.map(|limit| limit / threads),
                 elsewhere_bytes: self.elsewhere_bytes,
-                most_kept: 1,
             };
             let mut solvers: Vec<Self> = (0..threads).map(solver).collect();
             let found = work(&mut solvers);
@@ -152,14 +145,14 @@ impl<'a> FullSolver<'a> {
     /// Estimated bytes a solve needs in addition to memory already in use, with one factor in memory and `roots` roots
     /// in the band.
     pub fn bytes(&self, vectors: FullVectors, roots: usize) -> usize {
-        let PartBytes { held, factors, factoring } = self.factor_bytes();
+        let PartBytes { held, factors, factoring } = self.part_bytes();
         held + factors + factoring.max(self.vector_bytes(vectors, roots))
     }
 
-    fn factor_bytes(&self) -> PartBytes {
+    fn part_bytes(&self) -> PartBytes {
         let n = self.model.dimension();
-        match &self.parts {
-            Some(parts) => parts.bytes(),
+        match &self.factors {
+            Some(factors) => factors.bytes(),
             // The fill of a sparse LU is not known in advance: 400 entries a column are assumed, at most a tenth of a
             // full matrix.
             // For each damped mode, a real vector and two complex ones are held as well.
@@ -197,7 +190,8 @@ impl<'a> FullSolver<'a> {
     }
 
     /// Checks the memory limit for solves with `roots` roots in the band, drops factors that no longer fit, and returns
-    /// the bytes needed with one factor.
+    /// the bytes needed with one factor. Factors are kept in single precision from now on if one in double precision does
+    /// not fit.
     ///
     /// `held_by_caller` bytes are held by the caller during a solve; `other` bytes are needed between solves. As many factors
     /// are kept as the limit allows.
@@ -211,19 +205,17 @@ impl<'a> FullSolver<'a> {
         held_by_caller: usize,
         other: usize,
     ) -> Result<usize, ReductionError> {
-        let PartBytes { held, factors, factoring } = self.factor_bytes();
-        let held = held + self.elsewhere_bytes;
-        let work = (factoring.max(self.vector_bytes(vectors, roots)) + held_by_caller).max(other);
-        let bytes = held + factors + work;
-        self.most_kept = MOST_KEPT;
-        if let Some(limit) = self.memory_limit_bytes {
-            if bytes > limit {
-                return Err(ReductionError::Memory { what: self.what.clone(), bytes, limit });
-            }
-            self.most_kept = MOST_KEPT.min((limit - held - work) / factors.max(1));
-        }
-        while self.kept.len() > self.most_kept {
-            self.kept.remove(0);
+        let (elsewhere, of_vectors) = (self.elsewhere_bytes, self.vector_bytes(vectors, roots));
+        let rest = |PartBytes { held, factoring, factors: _ }: PartBytes| {
+            held + elsewhere + (factoring.max(of_vectors) + held_by_caller).max(other)
+        };
+        let limit = self.memory_limit_bytes.unwrap_or(usize::MAX);
+        let bytes = match &mut self.factors {
+            Some(factors) => factors.make_room(limit, &rest),
+            None => rest(self.part_bytes()) + self.part_bytes().factors,
+        };
+        if bytes > limit {
+            return Err(ReductionError::Memory { what: self.what.clone(), bytes, limit });
         }
         Ok(bytes)
     }
@@ -235,7 +227,7 @@ impl<'a> FullSolver<'a> {
     /// # Errors
     /// [`ReductionError::Factorisation`].
     pub(super) fn count_below(&self, band_rad_s: f64) -> Result<usize, ReductionError> {
-        self.parts.as_ref().map_or(Ok(WANTED), |parts| parts.count_below(band_rad_s * band_rad_s))
+        self.factors.as_ref().map_or(Ok(WANTED), |factors| factors.parts.count_below(band_rad_s * band_rad_s))
     }
 
     /// Factorises `K + sigma M` of the parts, if the model has separate parts. The factors are kept together with those
@@ -244,9 +236,9 @@ impl<'a> FullSolver<'a> {
     /// # Errors
     /// [`ReductionError`]: `Factorisation`, also if `K + sigma M` is not positive definite.
     pub(super) fn factor_at(&mut self, sigma: f64) -> Result<(), ReductionError> {
-        let Some(parts) = &self.parts else { return Ok(()) };
-        let index = Self::keep(&mut self.kept, self.most_kept, parts, -sigma)?.0;
-        if self.kept[index].is_definite() {
+        let Some(factors) = &mut self.factors else { return Ok(()) };
+        let index = factors.at(-sigma)?.0;
+        if factors.get(index).is_definite() {
             return Ok(());
         }
         let reason = "the symmetric stiffness with its shift is not positive definite".to_owned();
@@ -254,14 +246,14 @@ impl<'a> FullSolver<'a> {
     }
 
     /// The factors of `K + sigma M` made by [`Self::factor_at`], if they are still kept.
-    pub(super) fn factors_at(&self, sigma: f64) -> Option<&Shifted> {
-        self.kept.iter().find(|shifted| shifted.square == -sigma)
+    pub(super) fn factors_at(&self, sigma: f64) -> Option<&Shifted<'a>> {
+        self.factors.as_ref()?.find(-sigma)
     }
 
     /// Whether roots are found in `λ²`, with real vectors. Other models than parts joined by contact are not examined for
     /// damping in this process.
     fn is_real(&self) -> bool {
-        (self.parts.is_some() || self.engine.foreign()) && self.model.is_undamped()
+        (self.factors.is_some() || self.engine.foreign()) && self.model.is_undamped()
     }
 
     /// The engine that solves.
@@ -271,24 +263,7 @@ impl<'a> FullSolver<'a> {
 
     /// Whether the model consists of parts joined by contact only, without further terms.
     pub(super) fn has_parts(&self) -> bool {
-        self.parts.is_some()
-    }
-
-    /// Index in `kept` of the factors of `K - square M`, and whether they were newly made.
-    fn keep(
-        kept: &mut Vec<Shifted>,
-        most: usize,
-        parts: &Parts<'_>,
-        square: f64,
-    ) -> Result<(usize, bool), ReductionError> {
-        if let Some(index) = kept.iter().position(|shifted| shifted.square == square) {
-            return Ok((index, false));
-        }
-        if kept.len() >= most {
-            kept.remove(0);
-        }
-        kept.push(parts.at(square)?);
-        Ok((kept.len() - 1, true))
+        self.factors.is_some()
     }
 
     /// Finds every root at `p` with a frequency from 0 to `band_rad_s` and a growth rate within the discs, see
@@ -306,7 +281,7 @@ impl<'a> FullSolver<'a> {
         if self.model.dimension() < DENSE_BELOW {
             return self.dense(p, band_rad_s, vectors);
         }
-        let (what, here, by_parts) = (self.what.clone(), self.model.at(p)?, self.parts.is_some());
+        let (what, here, by_parts) = (self.what.clone(), self.model.at(p)?, self.has_parts());
         let mut problem =
             Problem::new(&what, self.model, here.clone(), vectors, by_parts, self.is_real(), GROWTH * band_rad_s)?;
         let mut found: Vec<Found> = vec![];
@@ -341,7 +316,7 @@ impl<'a> FullSolver<'a> {
         if self.model.dimension() < DENSE_BELOW {
             return Ok(self.dense(p, 2.0 * omega, FullVectors::None)?.roots);
         }
-        let (what, here, by_parts) = (self.what.clone(), self.model.at(p)?, self.parts.is_some());
+        let (what, here, by_parts) = (self.what.clone(), self.model.at(p)?, self.has_parts());
         let mut problem = Problem::new(&what, self.model, here, FullVectors::None, by_parts, self.is_real(), 0.0)?;
         problem.wanted = FEW;
         let shift = BESIDE * omega;
@@ -356,40 +331,38 @@ impl<'a> FullSolver<'a> {
         gap: [f64; 2],
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
-        match &self.parts {
-            Some(parts) => {
-                let index = Self::factored(&mut self.kept, parts, problem, omega, self.most_kept, progress)?;
-                problem.around_parts(&self.kept[index], gap, progress)
+        match &mut self.factors {
+            Some(factors) => {
+                let index = Self::factored(factors, problem, omega, progress)?;
+                problem.around_parts(factors.get(index), gap, progress)
             }
             None => problem.around_system(self.engine, omega, gap, progress),
         }
     }
 
-    /// Index in `kept` of the factors at the shift: `ω` itself or, if solves there are inaccurate because a root is too
-    /// near, slightly above.
+    /// Index of the factors at the shift: `ω` itself or, if solves there are inaccurate because a root is too near, slightly
+    /// above.
     fn factored(
-        kept: &mut Vec<Shifted>,
-        parts: &Parts<'_>,
+        factors: &mut KeptFactors<'a>,
         problem: &Problem<'_>,
         omega: f64,
-        most_kept: usize,
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<usize, ReductionError> {
-        let mut worst = 0.0;
+        let mut last = String::new();
         for attempt in 0..6 {
             let square = omega * omega * (1.0 + 0.002 * f64::from(attempt));
-            let (index, made) = Self::keep(kept, most_kept, parts, square)?;
-            if made {
-                progress(FullProgress::Factored { shift_rad_s: square.sqrt() });
+            let (index, made) = factors.at(square)?;
+            if let Some(precision) = made {
+                progress(FullProgress::Factored { shift_rad_s: square.sqrt(), precision });
             }
-            let residual = problem.solve_residual(&kept[index]);
-            if residual < SOLVE_LIMIT {
-                return Ok(index);
-            }
-            worst = residual;
-            kept.remove(index);
+            last = match problem.solve_residual(factors.get(index)) {
+                Ok(residual) if residual < SOLVE_LIMIT => return Ok(index),
+                Ok(residual) => format!("it leaves residuals of {residual:.1e}, limit {SOLVE_LIMIT:.1e}"),
+                Err(stalled) => stalled.reason(),
+            };
+            factors.drop(index);
         }
-        let reason = format!("L D Lᵀ around {omega} rad/s leaves residuals of {worst:.1e}, limit {SOLVE_LIMIT:.1e}");
+        let reason = format!("L D Lᵀ around {omega} rad/s is too inaccurate: {last}");
         Err(ReductionError::Factorisation { what: problem.what.to_owned(), reason })
     }
 
@@ -433,6 +406,7 @@ impl<'a> FullSolver<'a> {
 pub(super) mod tests {
     use super::super::SparseMatrix;
     use super::super::full_model::{FullContact, FullPart, SparseTerm};
+    use super::super::precision::Precision;
     use super::*;
     use crate::physics::{ContactLaw, Law, Stribeck};
     use faer::sparse::Triplet;
@@ -631,9 +605,52 @@ pub(super) mod tests {
             // Open contact, and another operating point with the same factors.
             let open = OperatingPoint { normal_load_n: 0.0, ..p };
             assert!(solver.roots(&open, band, FullVectors::None, &mut |_| {}).unwrap().roots.len() > 60);
-            let factors = solver.kept.len();
-            solver.roots(&point(0.2), band, FullVectors::None, &mut |_| {}).unwrap();
-            assert!(factors > 0 && solver.kept.len() <= MOST_KEPT);
+            let mut made = 0;
+            let mut count = |step: FullProgress| made += usize::from(matches!(step, FullProgress::Factored { .. }));
+            solver.roots(&point(0.2), 0.2 * band, FullVectors::None, &mut count).unwrap();
+            solver.roots(&point(0.3), 0.2 * band, FullVectors::None, &mut count).unwrap();
+            assert_eq!(made, 1);
+        }
+    }
+
+    /// With memory for one factor in single precision, roots and vectors are those of double precision. A wrong factor
+    /// in single precision is refused.
+    #[test]
+    fn factors_in_single_precision_give_the_same_roots() {
+        for damping in [0.0, 3.0] {
+            let (model, p, band) = (touching(200, damping, ContactLaw::default()), point(0.7), 300.0);
+            let solve = |solver: &mut FullSolver<'_>| {
+                let mut precisions = vec![];
+                let found = solver.roots(&p, band, FullVectors::Both, &mut |step| {
+                    if let FullProgress::Factored { precision, .. } = step {
+                        precisions.push(precision);
+                    }
+                });
+                (found, precisions)
+            };
+            let mut double = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
+            let need = double.bytes(FullVectors::None, 0);
+            let (expected, precisions) = solve(&mut double);
+            let expected = expected.unwrap();
+            assert!(!precisions.is_empty() && precisions.iter().all(|precision| *precision == Precision::Double));
+
+            let mut single = FullSolver::new("full", &model, Some(need - 1), &mut |_| {}).unwrap();
+            assert!(single.bytes(FullVectors::None, 0) < need);
+            let (found, precisions) = solve(&mut single);
+            let found = found.unwrap();
+            assert!(!precisions.is_empty() && precisions.iter().all(|precision| *precision == Precision::Single));
+            assert!(expected.roots.len() > 20 && found.roots.len() == expected.roots.len());
+            for (found, expected) in found.roots.iter().zip(&expected.roots) {
+                // Both differ from the roots by their residuals, at most 4e-12 of `|K|`, about 1e7, times condition numbers.
+                let off = (found.lambda * found.lambda - expected.lambda * expected.lambda).norm();
+                assert!(off < 1e-4, "{} {}", found.lambda, expected.lambda);
+            }
+            vectors_belong(&model, &p, &found);
+
+            let mut wrong = FullSolver::new("full", &model, Some(need - 1), &mut |_| {}).unwrap();
+            let refused = crate::spoil::with(crate::spoil::Spoil::Factor, || solve(&mut wrong).0.map(|_| ()));
+            let Err(ReductionError::Factorisation { reason, .. }) = refused else { panic!("{refused:?}") };
+            assert!(reason.contains("in single precision is too inaccurate"), "{reason}");
         }
     }
 

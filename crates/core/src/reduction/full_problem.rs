@@ -12,6 +12,8 @@ use super::full_model::{FullModel, LowRank};
 use super::full_root::{CoveredDisc, FullProgress, FullRoot, FullVectors};
 use super::krylov::{Number, random};
 use super::krylov_schur::{Iteration, Largest};
+use super::precision::Precision;
+use super::refinement::Stalled;
 use super::sparse::{entries, one_norm, symmetric_times, times_transposed, transposed};
 use super::{ReductionError, SparseMatrix, weighted_sum};
 use crate::physics::Situation;
@@ -185,25 +187,32 @@ impl<'a> Problem<'a> {
     }
 
     /// Scaled residual of one solve with a random right-hand side at a shift, relative to `|Q| |x| + |b|`.
-    pub fn solve_residual(&self, shifted: &Shifted) -> f64 {
+    ///
+    /// # Errors
+    /// [`Stalled`] if the factors are in single precision and too inaccurate.
+    pub fn solve_residual(&self, shifted: &Shifted<'_>) -> Result<f64, Stalled> {
         let s = c64::new(0.0, shifted.square.sqrt());
         let b = random::<c64>(self.model.dimension(), 1, 77);
-        let x = self.coupled(shifted, s, false).solve(b.as_ref());
+        let x = self.coupled(shifted, s, false).solve(b.as_ref())?;
         let r = self.times([s * s, s, c64::new(1.0, 0.0)], x.as_ref(), false) - &b;
         let parts = shifted.square * self.norms[0] + s.im * self.norms[1] + self.norms[2];
-        r.norm_l2() / (parts * x.norm_l2() + b.norm_l2())
+        Ok(r.norm_l2() / (parts * x.norm_l2() + b.norm_l2()))
     }
 
-    fn coupled<'s>(&self, shifted: &'s Shifted, s: c64, transposed: bool) -> Coupled<'s, c64> {
+    fn coupled<'s>(&self, shifted: &'s Shifted<'s>, s: c64, transposed: bool) -> Coupled<'s, c64> {
         let weight = |(k, c): (&f64, &f64)| c64::new(*k, 0.0) + s * *c;
         let weights = self.low_rank.stiffness.iter().zip(&self.low_rank.damping).map(weight).collect();
         shifted.couple(&self.low_rank, weights, transposed)
     }
 
+    fn stalled(&self, stalled: Stalled) -> ReductionError {
+        ReductionError::Factorisation { what: self.what.to_owned(), reason: stalled.reason() }
+    }
+
     /// The roots nearest to a shift, for a model of parts joined by contact.
     pub fn around_parts(
         &mut self,
-        shifted: &Shifted,
+        shifted: &Shifted<'_>,
         gap: [f64; 2],
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
@@ -213,14 +222,15 @@ impl<'a> Problem<'a> {
             // Solvers with `Q(s)` and with its transpose, each set up once.
             let (forward, backward) = (self.coupled(shifted, s, false), self.coupled(shifted, s, true));
             let solve = |b: MatRef<'_, c64>, transposed: bool| {
-                Ok(if transposed { backward.solve(b) } else { forward.solve(b) })
+                if transposed { backward.solve(b) } else { forward.solve(b) }.map_err(|stalled| self.stalled(stalled))
             };
             return self.linearised(omega, gap, &solve, progress);
         }
         let coupled = [false, true]
             .map(|transposed| shifted.couple::<f64>(&self.low_rank, self.low_rank.stiffness.clone(), transposed));
         let inverse = |x: Mat<f64>, transposed: bool| {
-            Ok(coupled[usize::from(transposed)].solve(self.model.mass_times(x.as_ref()).as_ref()))
+            let b = self.model.mass_times(x.as_ref());
+            coupled[usize::from(transposed)].solve(b.as_ref()).map_err(|stalled| self.stalled(stalled))
         };
         self.around(omega, gap, &inverse, &|theta| undamped_roots(theta, square), progress)
     }
@@ -240,7 +250,7 @@ impl<'a> Problem<'a> {
         let sum = weighted_sum(mass.nrows(), &[(1.0, stiffness), (-square, mass)])?;
         let factor = engine.real(self.what, &sum)?;
         drop(sum);
-        progress(FullProgress::Factored { shift_rad_s: omega });
+        progress(FullProgress::Factored { shift_rad_s: omega, precision: Precision::Double });
         let inverse = |x: Mat<f64>, transposed: bool| {
             let mut b = symmetric_times(mass, x.as_ref());
             factor.solve(&mut b, transposed)?;
@@ -273,7 +283,7 @@ impl<'a> Problem<'a> {
         drop(triplets);
         let factor = engine.complex(self.what, &sum)?;
         drop(sum);
-        progress(FullProgress::Factored { shift_rad_s: omega });
+        progress(FullProgress::Factored { shift_rad_s: omega, precision: Precision::Double });
         let sparse = |b: MatRef<'_, c64>, transposed: bool| {
             let mut x = b.to_owned();
             factor.solve(&mut x, transposed)?;

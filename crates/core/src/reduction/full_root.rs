@@ -2,6 +2,7 @@
 
 use faer::{Mat, c64};
 
+use super::precision::Precision;
 use crate::physics::Situation;
 
 /// Half the stretch of the imaginary axis that a disc counts as covering, relative to its radius. At the ends of that
@@ -58,6 +59,8 @@ pub enum FullProgress {
     Factored {
         /// The shift, rad/s.
         shift_rad_s: f64,
+        /// How the factor is kept.
+        precision: Precision,
     },
     /// Krylov vectors built so far around the shift, and how many of the wanted roots have converged.
     Iterated {

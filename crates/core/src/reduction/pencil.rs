@@ -5,7 +5,7 @@ use std::sync::Arc;
 use faer::perm::Perm;
 use faer::sparse::SymbolicSparseColMat;
 use faer::sparse::linalg::SupernodalThreshold;
-use faer::sparse::linalg::cholesky::supernodal::{SupernodalLdltRef, SymbolicSupernodalCholesky};
+use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::sparse::linalg::cholesky::{
     CholeskySymbolicParams, SymbolicCholesky, SymbolicCholeskyRaw, SymmetricOrdering, factorize_symbolic_cholesky,
 };
@@ -15,6 +15,7 @@ use super::elimination_tree::Tree;
 use super::fronts::Fronts;
 use super::krylov::random_block;
 use super::ordering::nested_dissection;
+use super::precision::Precision;
 use super::sparse::{Asymmetry, entries, first_asymmetry, symmetric_times};
 use super::triangle::Triangle;
 use super::{ReductionError, SEMIDEFINITE_TOLERANCE, SparseMatrix};
@@ -35,8 +36,8 @@ pub struct Pencil<'a> {
     pub mass: &'a SparseMatrix,
     /// `K`, N/m, both triangles.
     pub stiffness: &'a SparseMatrix,
-    symbolic: Arc<SymbolicCholesky<usize>>,
-    tree: Arc<Tree>,
+    pub(super) symbolic: Arc<SymbolicCholesky<usize>>,
+    pub(super) tree: Arc<Tree>,
 }
 
 impl<'a> Pencil<'a> {
@@ -119,9 +120,9 @@ impl<'a> Pencil<'a> {
         size_of::<usize>() * (2 * supernodal(&self.symbolic).row_idx().len() + 6 * self.dimension())
     }
 
-    /// Bytes of one factor.
+    /// Bytes of one factor in double precision.
     pub(super) fn factor_bytes(&self) -> usize {
-        size_of::<f64>() * self.factor_entries()
+        Precision::Double.bytes() * self.factor_entries()
     }
 
     /// Additional bytes needed while a factor is computed: the fronts.
@@ -159,17 +160,6 @@ impl<'a> Pencil<'a> {
         self.failed("a pivot is 0 or not finite".to_owned())
     }
 
-    /// The factor `L D Lᵀ` of a matrix on the pattern of the pencil, not probed.
-    pub(super) fn factored(&self, fronts: &Fronts<'_>) -> Result<Ldlt, ReductionError> {
-        let mut values = self.room(self.symbolic.len_val())?;
-        fronts.ldlt(&mut values).map_err(|_| self.broken())?;
-        #[cfg(test)]
-        if crate::spoil::spoilt(crate::spoil::Spoil::Factor) {
-            values[1] *= 1.0 + 1e-6;
-        }
-        Ok(Ldlt { symbolic: self.symbolic.clone(), tree: self.tree.clone(), values })
-    }
-
     /// Checks that `M` is positive semidefinite with a positive diagonal. The mass matrix of a mesh, scaled to a unit
     /// diagonal, has eigenvalues well above zero, which a short Lanczos recurrence usually shows. Otherwise `M` is
     /// factorised with its diagonal raised by [`SEMIDEFINITE_TOLERANCE`]: a singular `M` is valid, because CalculiX
@@ -190,21 +180,16 @@ impl<'a> Pencil<'a> {
                 *entry += SEMIDEFINITE_TOLERANCE * value;
             }
         }
-        let pivots = self.factored(&self.fronts_of(&raised, 0.0))?.pivots();
+        let pivots = self.factored(&self.fronts_of(&raised, 0.0), Precision::Double)?.pivots();
         match forward(&self.symbolic).iter().zip(pivots).find(|(_, value)| value.is_nan() || *value <= 0.0) {
             Some((&row, value)) => Err(ReductionError::Indefinite { what, row, value, limit: 0.0 }),
             None => Ok(()),
         }
     }
 
-    /// A vector of zeros, or an error if memory is insufficient.
-    pub(super) fn room(&self, length: usize) -> Result<Vec<f64>, ReductionError> {
-        let mut values = vec![];
-        values
-            .try_reserve_exact(length)
-            .map_err(|_| self.failed(format!("no memory for a factor of {length} numbers")))?;
-        values.resize(length, 0.0);
-        Ok(values)
+    /// The error where memory for a factor is insufficient.
+    pub(super) fn no_memory(&self) -> ReductionError {
+        self.failed(format!("no memory for a factor of {} numbers", self.factor_entries()))
     }
 
     pub(super) fn failed(&self, reason: String) -> ReductionError {
@@ -260,52 +245,6 @@ impl<'a> Llt<'a> {
     }
 }
 
-/// The factor `P (K - σ M) Pᵀ = L D Lᵀ`; vectors are in the order of elimination.
-pub(super) struct Ldlt {
-    symbolic: Arc<SymbolicCholesky<usize>>,
-    tree: Arc<Tree>,
-    values: Vec<f64>,
-}
-
-impl Ldlt {
-    fn supernodal(&self) -> SupernodalLdltRef<'_, usize, f64> {
-        SupernodalLdltRef::new(supernodal(&self.symbolic), &self.values)
-    }
-
-    /// The row eliminated at each position of the elimination order.
-    pub(super) fn order(&self) -> &[usize] {
-        forward(&self.symbolic)
-    }
-
-    /// The pivots, the diagonal of `D`.
-    pub(super) fn pivots(&self) -> Vec<f64> {
-        let factor = self.supernodal();
-        let mut pivots = vec![0.0; self.symbolic.nrows()];
-        for s in 0..supernodal(&self.symbolic).n_supernodes() {
-            let (start, block) = (factor.supernode(s).start(), factor.supernode(s).val());
-            (0..block.ncols()).for_each(|k| pivots[start + k] = block[(k, k)]);
-        }
-        pivots
-    }
-
-    /// `A⁻¹ B` in place.
-    pub(super) fn solve(&self, mut rhs: MatMut<'_, f64>) {
-        let (order, pivots) = (self.order(), self.pivots());
-        let mut z = Mat::from_fn(rhs.nrows(), rhs.ncols(), |i, j| rhs[(order[i], j)]);
-        self.triangle().forward(z.as_mut());
-        z.col_iter_mut().for_each(|column| column.iter_mut().zip(&pivots).for_each(|(value, pivot)| *value /= pivot));
-        self.triangle().backward(z.as_mut());
-        for j in 0..rhs.ncols() {
-            order.iter().enumerate().for_each(|(position, &row)| rhs[(row, j)] = z[(position, j)]);
-        }
-    }
-
-    /// `L`, to solve with.
-    pub(super) fn triangle(&self) -> Triangle<'_> {
-        Triangle { supernodes: supernodal(&self.symbolic), tree: &self.tree, values: &self.values, unit: true }
-    }
-}
-
 /// The order of elimination: nested dissection of all rows except `last`, followed by `last`.
 fn ordered(mass: &SparseMatrix, stiffness: &SparseMatrix, last: &[usize]) -> Result<Perm<usize>, String> {
     let n = mass.nrows();
@@ -330,11 +269,11 @@ fn ordered(mass: &SparseMatrix, stiffness: &SparseMatrix, last: &[usize]) -> Res
 }
 
 /// The row eliminated at each position of the elimination order.
-fn forward(symbolic: &SymbolicCholesky<usize>) -> &[usize] {
+pub(super) fn forward(symbolic: &SymbolicCholesky<usize>) -> &[usize] {
     symbolic.perm().expect("a permutation was given").arrays().0
 }
 
-fn supernodal(symbolic: &SymbolicCholesky<usize>) -> &SymbolicSupernodalCholesky<usize> {
+pub(super) fn supernodal(symbolic: &SymbolicCholesky<usize>) -> &SymbolicSupernodalCholesky<usize> {
     match symbolic.raw() {
         SymbolicCholeskyRaw::Supernodal(symbolic) => symbolic,
         SymbolicCholeskyRaw::Simplicial(_) => unreachable!("supernodes were requested"),

@@ -18,6 +18,7 @@ use faer::sparse::linalg::cholesky::supernodal::SymbolicSupernodalCholesky;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
 
 use super::elimination_tree::Tree;
+use super::precision::Real;
 use super::threads::{on_threads, row_blocks, shared, threads_for};
 
 /// Number of columns of a supernode that are solved at a time, and of rows below them. This and the next two are smaller
@@ -32,17 +33,17 @@ const TOGETHER: usize = 24;
 
 /// A supernodal factor `L`.
 #[derive(Clone, Copy)]
-pub(super) struct Triangle<'a> {
+pub(super) struct Triangle<'a, T = f64> {
     pub(super) supernodes: &'a SymbolicSupernodalCholesky<usize>,
     pub(super) tree: &'a Tree,
-    pub(super) values: &'a [f64],
+    pub(super) values: &'a [T],
     /// Whether the diagonal of `L` is 1; the stored one is then ignored.
     pub(super) unit: bool,
 }
 
-impl Triangle<'_> {
+impl<T: Real> Triangle<'_, T> {
     /// `L⁻¹ Z` in place.
-    pub(super) fn forward(&self, z: MatMut<'_, f64>) {
+    pub(super) fn forward(&self, z: MatMut<'_, T>) {
         in_blocks(z, |mut z| {
             for (subtree, solved) in self.tree.subtrees.iter().zip(self.subtrees(z.as_ref(), false)) {
                 let own = self.own(subtree).count();
@@ -66,14 +67,14 @@ impl Triangle<'_> {
                     pattern
                         .iter()
                         .zip(&front.col_as_slice(j)[columns..])
-                        .for_each(|(&row, value)| z[(row, j)] += value);
+                        .for_each(|(&row, value)| z[(row, j)] += *value);
                 }
             }
         });
     }
 
     /// `L⁻ᵀ Z` in place.
-    pub(super) fn backward(&self, z: MatMut<'_, f64>) {
+    pub(super) fn backward(&self, z: MatMut<'_, T>) {
         in_blocks(z, |mut z| {
             for &s in self.tree.above.iter().rev() {
                 let (panel, pattern) = self.panel(s);
@@ -97,7 +98,7 @@ impl Triangle<'_> {
 
     /// Solves every subtree on a copy of its rows of `z`, followed by the rows above: forward from 0 there, backward from
     /// `z`.
-    fn subtrees(&self, z: MatRef<'_, f64>, backward: bool) -> Vec<Mat<f64>> {
+    fn subtrees(&self, z: MatRef<'_, T>, backward: bool) -> Vec<Mat<T>> {
         let subtrees = &self.tree.subtrees;
         let mut places = vec![vec![0_u32; z.nrows()]; threads_for(subtrees.len())];
         let solved = on_threads(&mut places, subtrees, &mut |()| (), &|place: &mut Vec<u32>, subtree, _| {
@@ -122,37 +123,37 @@ impl Triangle<'_> {
     }
 
     /// Forward solve with supernode `s`; row `i` is at `place[i]` of `local`. `below` is memory.
-    fn forward_at(&self, s: usize, place: &[u32], local: &mut Mat<f64>, below: &mut Mat<f64>) {
+    fn forward_at(&self, s: usize, place: &[u32], local: &mut Mat<T>, below: &mut Mat<T>) {
         let (panel, pattern) = self.panel(s);
         let (top, rest) = panel.split_at_row(panel.ncols());
         let first = place[self.supernodes.supernode_begin()[s]] as usize;
         let mut of_node = local.subrows_mut(first, panel.ncols());
         self.solve_top(top, of_node.as_mut(), false);
-        below.resize_with(pattern.len(), of_node.ncols(), |_, _| 0.0);
-        matmul(below.as_mut(), Accum::Replace, rest, of_node.as_ref(), 1.0, Par::Seq);
+        below.resize_with(pattern.len(), of_node.ncols(), |_, _| T::zero());
+        matmul(below.as_mut(), Accum::Replace, rest, of_node.as_ref(), T::one(), Par::Seq);
         for j in 0..below.ncols() {
             let (from, to) = (below.col_as_slice(j), local.col_as_slice_mut(j));
-            pattern.iter().zip(from).for_each(|(&row, value)| to[place[row] as usize] -= value);
+            pattern.iter().zip(from).for_each(|(&row, value)| to[place[row] as usize] -= *value);
         }
     }
 
     /// As [`Self::forward_at`], backward.
-    fn backward_at(&self, s: usize, place: &[u32], local: &mut Mat<f64>, below: &mut Mat<f64>) {
+    fn backward_at(&self, s: usize, place: &[u32], local: &mut Mat<T>, below: &mut Mat<T>) {
         let (panel, pattern) = self.panel(s);
         let (top, rest) = panel.split_at_row(panel.ncols());
         let first = place[self.supernodes.supernode_begin()[s]] as usize;
-        below.resize_with(pattern.len(), local.ncols(), |_, _| 0.0);
+        below.resize_with(pattern.len(), local.ncols(), |_, _| T::zero());
         for j in 0..below.ncols() {
             let (from, to) = (local.col_as_slice(j), below.col_as_slice_mut(j));
             pattern.iter().zip(to).for_each(|(&row, value)| *value = from[place[row] as usize]);
         }
         let mut of_node = local.subrows_mut(first, panel.ncols());
-        matmul(of_node.as_mut(), Accum::Add, rest.transpose(), below.as_ref(), -1.0, Par::Seq);
+        matmul(of_node.as_mut(), Accum::Add, rest.transpose(), below.as_ref(), T::MINUS_ONE, Par::Seq);
         self.solve_top(top, of_node, true);
     }
 
     /// Forward solve with a large supernode: `front` has its columns, solved, and what is added to the rows below.
-    fn forward_in(&self, panel: MatRef<'_, f64>, mut front: MatMut<'_, f64>) {
+    fn forward_in(&self, panel: MatRef<'_, T>, mut front: MatMut<'_, T>) {
         let columns = panel.ncols();
         for first in (0..columns).step_by(BLOCK) {
             let width = BLOCK.min(columns - first);
@@ -162,15 +163,15 @@ impl Triangle<'_> {
             self.solve_top(top, of_block.as_mut(), false);
             let of_block = of_block.as_ref();
             let chunks = row_blocks(below, BLOCK);
-            shared(chunks, rest.nrows() * width >= DIVIDED, |(at, below): (usize, MatMut<'_, f64>)| {
+            shared(chunks, rest.nrows() * width >= DIVIDED, |(at, below): (usize, MatMut<'_, T>)| {
                 let rest = rest.subrows(at, below.nrows());
-                matmul(below, Accum::Add, rest, of_block, -1.0, Par::Seq);
+                matmul(below, Accum::Add, rest, of_block, T::MINUS_ONE, Par::Seq);
             });
         }
     }
 
     /// Backward solve with a large supernode: `front` has its columns and the values of the rows below.
-    fn backward_in(&self, panel: MatRef<'_, f64>, mut front: MatMut<'_, f64>) {
+    fn backward_in(&self, panel: MatRef<'_, T>, mut front: MatMut<'_, T>) {
         let columns = panel.ncols();
         for first in (0..columns).step_by(BLOCK).rev() {
             let width = BLOCK.min(columns - first);
@@ -179,16 +180,16 @@ impl Triangle<'_> {
             let (mut of_block, below) = front.as_mut().subrows_mut(first, block.nrows()).split_at_row_mut(width);
             let below = below.as_ref();
             let chunks = row_blocks(of_block.as_mut(), COLUMNS);
-            shared(chunks, rest.nrows() * width >= DIVIDED, |(at, of_columns): (usize, MatMut<'_, f64>)| {
+            shared(chunks, rest.nrows() * width >= DIVIDED, |(at, of_columns): (usize, MatMut<'_, T>)| {
                 let rest = rest.subcols(at, of_columns.nrows());
-                matmul(of_columns, Accum::Add, rest.transpose(), below, -1.0, Par::Seq);
+                matmul(of_columns, Accum::Add, rest.transpose(), below, T::MINUS_ONE, Par::Seq);
             });
             self.solve_top(top, of_block, true);
         }
     }
 
     /// `L₁₁⁻¹ B`, or `L₁₁⁻ᵀ B` if `transposed`, in place.
-    fn solve_top(&self, top: MatRef<'_, f64>, b: MatMut<'_, f64>, transposed: bool) {
+    fn solve_top(&self, top: MatRef<'_, T>, b: MatMut<'_, T>, transposed: bool) {
         match (self.unit, transposed) {
             (false, false) => solve_lower_triangular_in_place(top, b, Par::Seq),
             (false, true) => solve_upper_triangular_in_place(top.transpose(), b, Par::Seq),
@@ -206,15 +207,21 @@ impl Triangle<'_> {
             for k in first.saturating_sub(start)..panel.ncols() {
                 for i in k + usize::from(self.unit)..panel.nrows() {
                     let row = if i < panel.ncols() { start + i } else { pattern[i - panel.ncols()] };
-                    lower[(row - first, start + k - first)] = panel[(i, k)];
+                    lower[(row - first, start + k - first)] = panel[(i, k)].double();
                 }
             }
         }
         lower
     }
 
+    /// The diagonal of `L` as stored.
+    pub(super) fn diagonal(&self) -> Vec<f64> {
+        let panels = (0..self.supernodes.n_supernodes()).map(|s| self.panel(s).0);
+        panels.flat_map(|panel| (0..panel.ncols()).map(move |k| panel[(k, k)].double())).collect()
+    }
+
     /// `[L₁₁; L₂₁]` of supernode `s`, and the rows of `L₂₁`.
-    pub(super) fn panel(&self, s: usize) -> (MatRef<'_, f64>, &[usize]) {
+    pub(super) fn panel(&self, s: usize) -> (MatRef<'_, T>, &[usize]) {
         let ends = self.supernodes.col_ptr_for_val();
         let pattern = self.supernodes.supernode(s).pattern();
         let columns = self.supernodes.supernode_end()[s] - self.supernodes.supernode_begin()[s];
@@ -235,7 +242,7 @@ impl Triangle<'_> {
 }
 
 /// Calls `solve` with at most [`TOGETHER`] columns at a time.
-fn in_blocks(mut z: MatMut<'_, f64>, mut solve: impl FnMut(MatMut<'_, f64>)) {
+fn in_blocks<T>(mut z: MatMut<'_, T>, mut solve: impl FnMut(MatMut<'_, T>)) {
     while z.ncols() > 0 {
         let (block, rest) = {
             let at = TOGETHER.min(z.ncols());
@@ -250,6 +257,7 @@ fn in_blocks(mut z: MatMut<'_, f64>, mut solve: impl FnMut(MatMut<'_, f64>)) {
 mod tests {
     use super::super::fronts::tests::cube;
     use super::super::pencil::Pencil;
+    use super::super::precision::Precision;
     use super::*;
 
     /// Both solves with both kinds of factor, against dense substitution.
@@ -258,9 +266,9 @@ mod tests {
         let [mass, stiffness] = cube(12);
         let n = mass.nrows();
         let pencil = Pencil::new("cube", &mass, &stiffness).unwrap();
-        let ldlt = pencil.ldlt(-150.0).unwrap();
+        let ldlt = pencil.ldlt(-150.0, Precision::Double).unwrap();
         assert!(ldlt.pivots().iter().any(|pivot| *pivot < 0.0));
-        let lower = ldlt.triangle().trailing(n);
+        let lower = ldlt.trailing(n);
         let llt = pencil.llt(3.0).unwrap().unwrap();
         let z = Mat::from_fn(n, TOGETHER + 5, |i, j| ((i * (j + 3)) as f64).sin());
         // Substitution loses `n ε` times the condition of `L`. For `L Lᵀ = K + 3 M` that is below 33: springs of at most 130
@@ -268,14 +276,13 @@ mod tests {
         let tolerance = 33.0 * n as f64 * f64::EPSILON;
         let near = |a: &Mat<f64>, b: &Mat<f64>| (a - b).norm_max() < tolerance * b.norm_max();
 
-        let triangle = ldlt.triangle();
-        assert!(triangle.tree.subtrees.len() > 2 && !triangle.tree.above.is_empty());
+        assert!(pencil.tree.subtrees.len() > 2 && !pencil.tree.above.is_empty());
         let (mut found, mut expected) = (z.clone(), z.clone());
-        triangle.forward(found.as_mut());
+        ldlt.forward(found.as_mut());
         solve_unit_lower_triangular_in_place(lower.as_ref(), expected.as_mut(), Par::Seq);
         assert!(near(&found, &expected));
         let (mut found, mut expected) = (z.clone(), z.clone());
-        triangle.backward(found.as_mut());
+        ldlt.backward(found.as_mut());
         solve_unit_upper_triangular_in_place(lower.transpose(), expected.as_mut(), Par::Seq);
         assert!(near(&found, &expected));
 

@@ -39,7 +39,7 @@ impl Building<'_, '_> {
                 None => None,
             };
         let inverse = |mut b: Mat<f64>| match (&coupled, &factor) {
-            (Some(coupled), _) => Ok(coupled.solve(b.as_ref())),
+            (Some(coupled), _) => coupled.solve(b.as_ref()).map_err(|stalled| failed(stalled.reason())),
             (None, Some(factor)) => {
                 factor.solve(&mut b, false)?;
                 Ok(b)
