@@ -136,7 +136,7 @@ impl Steps {
             FullProgress::Factored { shift_rad_s, precision } => {
                 let kept = match precision {
                     Precision::Double => "",
-                    Precision::Single => ", kept in single precision for want of memory",
+                    Precision::Single => ", kept in single precision to save memory",
                 };
                 self.say(&format!("{what}: factored at {:.1} Hz{kept}", hz(shift_rad_s)));
             }

@@ -434,3 +434,32 @@ fn a_rig_that_leaves_nothing_out_agrees() {
         .says("errors at 5 held-out points")
         .says("0 unstable modes or windows missed, 0 invented");
 }
+
+/// Where memory is too little for a factor in double precision, roots are those of double precision in every printed digit, and
+/// progress says how the factor is kept.
+#[test]
+fn little_memory_is_enough_for_factors_in_single_precision() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = text(&tribometer(folder.path(), 80_000));
+    let args = ["full", path.as_str(), "--mu", "0.4", "--band-hz", "3000"];
+    let double = run(args.into_iter().chain(["--memory-gib", "8"])).exits(0);
+    assert!(!double.stderr.contains("single precision"), "{}", double.stderr);
+    // "[    0.9 s    0.22 GiB] full model: ordered and analysed, needs 0.50 GiB at least"
+    let analysed = double.stderr.lines().find(|line| line.contains("ordered and analysed, needs")).unwrap();
+    let gib: Vec<f64> = analysed
+        .split(" GiB")
+        .filter_map(|before| before.rsplit_once(' ').and_then(|(_, number)| number.parse().ok()))
+        .collect();
+    let [resident, needed] = gib[..] else { panic!("{analysed}") };
+    // The factors have 32 million numbers, of which single precision saves half of 0.24 GiB.
+    let limit = format!("{:.3}", resident + needed - 0.06);
+    let single = run(args.into_iter().chain(["--memory-gib", &limit])).exits(0);
+    assert!(single.stderr.contains("kept in single precision to save memory"), "{}", single.stderr);
+    // Without the column of residuals.
+    let roots = |stdout: &str| -> Vec<Vec<String>> {
+        let rows = stdout.lines().filter(|line| line.starts_with("  ") && line.contains("e-"));
+        rows.map(|row| row.split_whitespace().take(3).map(str::to_owned).collect()).collect()
+    };
+    assert!(roots(&single.stdout).len() > 10);
+    assert_eq!(roots(&single.stdout), roots(&double.stdout));
+}

@@ -16,14 +16,13 @@ use faer::linalg::solvers::{PartialPivLu, Solve};
 use faer::linalg::triangular_solve::{solve_unit_lower_triangular_in_place, solve_unit_upper_triangular_in_place};
 use faer::{Mat, MatRef, Par, c64};
 
+use super::ReductionError;
 use super::full_model::{FullModel, LowRank, SparseRow};
 use super::krylov::Number;
 use super::ldlt::Ldlt;
 use super::pencil::Pencil;
 use super::precision::Precision;
 use super::refinement::{Stalled, refined};
-use super::sparse::symmetric_times;
-use super::{ReductionError, SparseMatrix};
 
 /// The parts of a full model, ordered and symbolically analysed.
 pub(super) struct Parts<'a> {
@@ -75,12 +74,11 @@ impl<'a> Parts<'a> {
     }
 
     /// Factorises `K - ω² M` of every part, where `square` is `ω²`, rad²/s².
-    pub(super) fn at(&self, square: f64, precision: Precision) -> Result<Shifted<'a>, ReductionError> {
+    pub(super) fn at(&self, square: f64, precision: Precision) -> Result<Shifted, ReductionError> {
         let mut parts = vec![];
         for (index, pencil) in self.pencils.iter().enumerate() {
             let ldlt = pencil.ldlt(-square, precision)?;
-            let matrices = [pencil.stiffness, pencil.mass];
-            parts.push(PartFactor::new(ldlt, matrices, self.offsets[index], self.touched[index].len()));
+            parts.push(PartFactor::new(ldlt, self.offsets[index], self.touched[index].len()));
         }
         Ok(Shifted { square, precision, parts })
     }
@@ -98,10 +96,8 @@ pub(super) struct PartBytes {
 }
 
 /// Factor of one part.
-struct PartFactor<'a> {
+struct PartFactor {
     ldlt: Ldlt,
-    /// `K` and `M`.
-    matrices: [&'a SparseMatrix; 2],
     offset: usize,
     pivots: Vec<f64>,
     /// Trailing block of `L`, for the contact rows.
@@ -110,15 +106,15 @@ struct PartFactor<'a> {
     flexibility: Mat<f64>,
 }
 
-impl<'a> PartFactor<'a> {
-    fn new(ldlt: Ldlt, matrices: [&'a SparseMatrix; 2], offset: usize, touched: usize) -> Self {
+impl PartFactor {
+    fn new(ldlt: Ldlt, offset: usize, touched: usize) -> Self {
         let (pivots, last) = (ldlt.pivots(), ldlt.trailing(touched));
         let first = pivots.len() - touched;
         let mut inverse = Mat::<f64>::identity(touched, touched);
         solve_unit_lower_triangular_in_place(last.as_ref(), inverse.as_mut(), Par::Seq);
         let scaled = Mat::from_fn(touched, touched, |i, j| inverse[(i, j)] / pivots[first + i]);
         let flexibility = inverse.transpose() * scaled;
-        Self { ldlt, matrices, offset, pivots, last, flexibility }
+        Self { ldlt, offset, pivots, last, flexibility }
     }
 
     /// Position of the first contact row in the order of elimination.
@@ -133,11 +129,11 @@ impl<'a> PartFactor<'a> {
 }
 
 /// Factors of `K - ω² M` of every part at one shift.
-pub(super) struct Shifted<'a> {
+pub(super) struct Shifted {
     /// `ω²`, rad²/s².
     pub square: f64,
-    pub precision: Precision,
-    parts: Vec<PartFactor<'a>>,
+    precision: Precision,
+    parts: Vec<PartFactor>,
 }
 
 /// Rows of the contact pairs, for each part, indexed by position among its contact rows.
@@ -145,7 +141,7 @@ type Placed = Vec<Vec<SparseRow>>;
 
 /// Solver with `Q(s)`, or its transpose, at one shift and operating point.
 pub(super) struct Coupled<'a, T: Number> {
-    shifted: &'a Shifted<'a>,
+    shifted: &'a Shifted,
     left: Placed,
     right: Placed,
     weights: Vec<T>,
@@ -153,7 +149,7 @@ pub(super) struct Coupled<'a, T: Number> {
     factor: PartialPivLu<T>,
 }
 
-impl Shifted<'_> {
+impl Shifted {
     /// Whether `K - ω² M` of every part is positive definite.
     pub(super) fn is_definite(&self) -> bool {
         self.parts.iter().flat_map(|part| &part.pivots).all(|pivot| *pivot > 0.0)
@@ -194,7 +190,7 @@ impl Shifted<'_> {
 
     /// Converts rows over all degrees of freedom to rows over the contact rows of each part.
     fn placed(&self, rows: &[SparseRow]) -> Placed {
-        let of_part = |part: &PartFactor<'_>| {
+        let of_part = |part: &PartFactor| {
             let order = part.contact_rows();
             let place: std::collections::HashMap<usize, usize> =
                 order.iter().enumerate().map(|(place, row)| (part.offset + row, place)).collect();
@@ -236,59 +232,25 @@ impl<T: Number> Coupled<'_, T>
 where
     PartialPivLu<T>: Solver<T>,
 {
-    /// `Q⁻¹ B`.
+    /// `Q⁻¹ B`. `times` returns `Q X`, with which solves in single precision are refined.
     ///
     /// # Errors
     /// [`Stalled`] if factors in single precision are too inaccurate.
-    pub(super) fn solve(&self, b: MatRef<'_, T>) -> Result<Mat<T>, Stalled> {
+    pub(super) fn solve(&self, b: MatRef<'_, T>, times: impl Fn(MatRef<'_, T>) -> Mat<T>) -> Result<Mat<T>, Stalled> {
         match self.shifted.precision {
-            Precision::Double => Ok(self.solve_once(b)),
-            Precision::Single => refined(b, |x| self.times(x), |r| self.solve_once(r)),
+            Precision::Double => Ok(self.solve_unrefined(b)),
+            Precision::Single => refined(b, times, |r| self.solve_unrefined(r)),
         }
     }
 
-    /// `Q X`.
-    fn times(&self, x: MatRef<'_, T>) -> Mat<T> {
-        let columns = x.ncols();
-        let real = |value: f64| T::from_complex(c64::new(value, 0.0));
-        let mut forces = Mat::<T>::zeros(self.weights.len(), columns);
-        let mut y = Mat::<T>::zeros(x.nrows(), columns);
-        for (part, right) in self.shifted.parts.iter().zip(&self.right) {
-            let (n, contact) = (part.pivots.len(), part.contact_rows());
-            let [stiffness, mass] = part.matrices;
-            let parts = Mat::from_fn(n, real_columns::<T>(columns), |i, j| {
-                part_of(x[(part.offset + i, j % columns)], j < columns)
-            });
-            let z = symmetric_times(stiffness, parts.as_ref())
-                - faer::Scale(self.shifted.square) * symmetric_times(mass, parts.as_ref());
-            for j in 0..columns {
-                (0..n).for_each(|i| y[(part.offset + i, j)] = whole(&z, i, j, columns));
-                for (pair, row) in right.iter().enumerate() {
-                    for &(place, weight) in row {
-                        forces[(pair, j)] += self.weights[pair] * real(weight) * x[(part.offset + contact[place], j)];
-                    }
-                }
-            }
-        }
-        for (part, left) in self.shifted.parts.iter().zip(&self.left) {
-            let contact = part.contact_rows();
-            for (pair, row) in left.iter().enumerate() {
-                for &(place, weight) in row {
-                    (0..columns).for_each(|j| y[(part.offset + contact[place], j)] += real(weight) * forces[(pair, j)]);
-                }
-            }
-        }
-        y
-    }
-
-    /// `Q⁻¹ B` as exactly as the factors are kept.
-    fn solve_once(&self, b: MatRef<'_, T>) -> Mat<T> {
+    /// `Q⁻¹ B` as exactly as the factors are kept: in single precision to a few digits.
+    pub(super) fn solve_unrefined(&self, b: MatRef<'_, T>) -> Mat<T> {
         let (columns, real) = (b.ncols(), real_columns::<T>(b.ncols()));
         let mut u = Mat::<f64>::zeros(self.weights.len(), real);
         let mut reduced = vec![];
         for (part, right) in self.shifted.parts.iter().zip(&self.right) {
             let (order, n) = (part.ldlt.order(), part.pivots.len());
-            let mut z = Mat::from_fn(n, real, |i, j| part_of(b[(part.offset + order[i], j % columns)], j < columns));
+            let mut z = Mat::from_fn(n, real, |i, j| component(b[(part.offset + order[i], j % columns)], j < columns));
             part.ldlt.forward(z.as_mut());
             let touched = part.last.nrows();
             let mut x = Mat::from_fn(touched, real, |i, j| z[(part.first() + i, j)] / part.pivots[part.first() + i]);
@@ -300,7 +262,7 @@ where
             }
             reduced.push(z);
         }
-        let loads = Mat::from_fn(u.nrows(), columns, |pair, j| self.weights[pair] * whole::<T>(&u, pair, j, columns));
+        let loads = Mat::from_fn(u.nrows(), columns, |pair, j| self.weights[pair] * joined::<T>(&u, pair, j, columns));
         let y = self.factor.solved(loads);
         let mut x = Mat::<T>::zeros(b.nrows(), columns);
         for ((part, left), mut z) in self.shifted.parts.iter().zip(&self.left).zip(reduced) {
@@ -308,7 +270,8 @@ where
             let mut pushed = Mat::<f64>::zeros(n - first, real);
             for (pair, row) in left.iter().enumerate() {
                 for &(place, weight) in row {
-                    (0..real).for_each(|j| pushed[(place, j)] += weight * part_of(y[(pair, j % columns)], j < columns));
+                    (0..real)
+                        .for_each(|j| pushed[(place, j)] += weight * component(y[(pair, j % columns)], j < columns));
                 }
             }
             solve_unit_lower_triangular_in_place(part.last.as_ref(), pushed.as_mut(), Par::Seq);
@@ -320,7 +283,7 @@ where
             part.ldlt.backward(z.as_mut());
             for j in 0..columns {
                 for (i, &row) in order.iter().enumerate() {
-                    x[(part.offset + row, j)] = whole(&z, i, j, columns);
+                    x[(part.offset + row, j)] = joined(&z, i, j, columns);
                 }
             }
         }
@@ -334,13 +297,13 @@ fn real_columns<T: Number>(columns: usize) -> usize {
     if T::REAL { columns } else { 2 * columns }
 }
 
-/// The real or the imaginary part of a number.
-fn part_of<T: Number>(value: T, real: bool) -> f64 {
+/// The real component of a number, or the imaginary one.
+fn component<T: Number>(value: T, real: bool) -> f64 {
     let value = value.complex();
     if real { value.re } else { value.im }
 }
 
-/// The number at `(i, j)` of a block of `columns`, from its parts.
-fn whole<T: Number>(parts: &Mat<f64>, i: usize, j: usize, columns: usize) -> T {
-    T::from_complex(c64::new(parts[(i, j)], if T::REAL { 0.0 } else { parts[(i, columns + j)] }))
+/// The number at `(i, j)` of a block of `columns`, from its components.
+fn joined<T: Number>(components: &Mat<f64>, i: usize, j: usize, columns: usize) -> T {
+    T::from_complex(c64::new(components[(i, j)], if T::REAL { 0.0 } else { components[(i, columns + j)] }))
 }

@@ -142,27 +142,17 @@ impl<'a> FullSolver<'a> {
         self.elsewhere_bytes = bytes;
     }
 
-    /// Estimated bytes a solve needs in addition to memory already in use, with one factor in memory and `roots` roots
-    /// in the band.
-    pub fn bytes(&self, vectors: FullVectors, roots: usize) -> usize {
-        let PartBytes { held, factors, factoring } = self.part_bytes();
-        held + factors + factoring.max(self.vector_bytes(vectors, roots))
-    }
-
-    fn part_bytes(&self) -> PartBytes {
-        let n = self.model.dimension();
-        match &self.factors {
-            Some(factors) => factors.bytes(),
-            // The fill of a sparse LU is not known in advance: 400 entries a column are assumed, at most a tenth of a
-            // full matrix.
-            // For each damped mode, a real vector and two complex ones are held as well.
-            None if self.engine.foreign() => PartBytes { held: 0, factors: 0, factoring: 0 },
-            None => {
-                let modes: usize = self.model.modal_damping.iter().map(|damping| damping.rates_per_s.len()).sum();
-                let factors = size_of::<c64>() * ((n * n / 10).min(400 * n) + 5 * n * modes / 2);
-                PartBytes { held: 0, factors, factoring: 0 }
-            }
+    /// Estimated memory of a model that is not just parts joined by contact, with one factor.
+    fn system_bytes(&self) -> PartBytes {
+        if self.engine.foreign() {
+            return PartBytes { held: 0, factors: 0, factoring: 0 };
         }
+        // The fill of a sparse LU is not known in advance: 400 entries a column are assumed, at most a tenth of a full matrix.
+        // For each damped mode, a real vector and two complex ones are held as well.
+        let n = self.model.dimension();
+        let modes: usize = self.model.modal_damping.iter().map(|damping| damping.rates_per_s.len()).sum();
+        let factors = size_of::<c64>() * ((n * n / 10).min(400 * n) + 5 * n * modes / 2);
+        PartBytes { held: 0, factors, factoring: 0 }
     }
 
     /// Bytes of the vectors held at the peak of a solve with `roots` roots in the band: the largest of three phases,
@@ -212,7 +202,10 @@ impl<'a> FullSolver<'a> {
         let limit = self.memory_limit_bytes.unwrap_or(usize::MAX);
         let bytes = match &mut self.factors {
             Some(factors) => factors.make_room(limit, &rest),
-            None => rest(self.part_bytes()) + self.part_bytes().factors,
+            None => {
+                let bytes = self.system_bytes();
+                rest(bytes) + bytes.factors
+            }
         };
         if bytes > limit {
             return Err(ReductionError::Memory { what: self.what.clone(), bytes, limit });
@@ -246,7 +239,7 @@ impl<'a> FullSolver<'a> {
     }
 
     /// The factors of `K + sigma M` made by [`Self::factor_at`], if they are still kept.
-    pub(super) fn factors_at(&self, sigma: f64) -> Option<&Shifted<'a>> {
+    pub(super) fn factors_at(&self, sigma: f64) -> Option<&Shifted> {
         self.factors.as_ref()?.find(-sigma)
     }
 
@@ -351,18 +344,25 @@ impl<'a> FullSolver<'a> {
         let mut last = String::new();
         for attempt in 0..6 {
             let square = omega * omega * (1.0 + 0.002 * f64::from(attempt));
-            let (index, made) = factors.at(square)?;
+            let (index, made) = match factors.at(square) {
+                Ok(at) => at,
+                Err(ReductionError::Factorisation { reason, .. }) => {
+                    last = reason;
+                    continue;
+                }
+                Err(error) => return Err(error),
+            };
             if let Some(precision) = made {
                 progress(FullProgress::Factored { shift_rad_s: square.sqrt(), precision });
             }
             last = match problem.solve_residual(factors.get(index)) {
                 Ok(residual) if residual < SOLVE_LIMIT => return Ok(index),
-                Ok(residual) => format!("it leaves residuals of {residual:.1e}, limit {SOLVE_LIMIT:.1e}"),
+                Ok(residual) => format!("a solve leaves a residual of {residual:.1e}, limit {SOLVE_LIMIT:.1e}"),
                 Err(stalled) => stalled.reason(),
             };
             factors.drop(index);
         }
-        let reason = format!("L D Lᵀ around {omega} rad/s is too inaccurate: {last}");
+        let reason = format!("L D Lᵀ around {omega} rad/s cannot be used: {last}");
         Err(ReductionError::Factorisation { what: problem.what.to_owned(), reason })
     }
 
@@ -628,26 +628,36 @@ pub(super) mod tests {
                 });
                 (found, precisions)
             };
-            let mut double = FullSolver::new("full", &model, None, &mut |_| {}).unwrap();
-            let need = double.bytes(FullVectors::None, 0);
+            let need = |limit: Option<usize>| {
+                let mut need = 0;
+                let solver = FullSolver::new("full", &model, limit, &mut |step| {
+                    if let FullProgress::Analysed { bytes } = step {
+                        need = bytes;
+                    }
+                });
+                (solver.unwrap(), need)
+            };
+            let (mut double, most) = need(None);
             let (expected, precisions) = solve(&mut double);
             let expected = expected.unwrap();
             assert!(!precisions.is_empty() && precisions.iter().all(|precision| *precision == Precision::Double));
 
-            let mut single = FullSolver::new("full", &model, Some(need - 1), &mut |_| {}).unwrap();
-            assert!(single.bytes(FullVectors::None, 0) < need);
+            let (mut single, less) = need(Some(most - 1));
+            assert!(0 < less && less < most);
             let (found, precisions) = solve(&mut single);
             let found = found.unwrap();
             assert!(!precisions.is_empty() && precisions.iter().all(|precision| *precision == Precision::Single));
             assert!(expected.roots.len() > 20 && found.roots.len() == expected.roots.len());
             for (found, expected) in found.roots.iter().zip(&expected.roots) {
-                // Both differ from the roots by their residuals, at most 4e-12 of `|K|`, about 1e7, times condition numbers.
+                // Both differ from the roots by their residuals, relative to `|K|`, about 1e7, times condition numbers of a few
+                // hundred.
                 let off = (found.lambda * found.lambda - expected.lambda * expected.lambda).norm();
-                assert!(off < 1e-4, "{} {}", found.lambda, expected.lambda);
+                let limit = 1e10 * (found.residual + expected.residual);
+                assert!(off < limit, "{} {}: {off:e}, limit {limit:e}", found.lambda, expected.lambda);
             }
             vectors_belong(&model, &p, &found);
 
-            let mut wrong = FullSolver::new("full", &model, Some(need - 1), &mut |_| {}).unwrap();
+            let (mut wrong, _) = need(Some(most - 1));
             let refused = crate::spoil::with(crate::spoil::Spoil::Factor, || solve(&mut wrong).0.map(|_| ()));
             let Err(ReductionError::Factorisation { reason, .. }) = refused else { panic!("{refused:?}") };
             assert!(reason.contains("in single precision is too inaccurate"), "{reason}");

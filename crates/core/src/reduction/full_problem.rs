@@ -190,16 +190,17 @@ impl<'a> Problem<'a> {
     ///
     /// # Errors
     /// [`Stalled`] if the factors are in single precision and too inaccurate.
-    pub fn solve_residual(&self, shifted: &Shifted<'_>) -> Result<f64, Stalled> {
+    pub fn solve_residual(&self, shifted: &Shifted) -> Result<f64, Stalled> {
         let s = c64::new(0.0, shifted.square.sqrt());
         let b = random::<c64>(self.model.dimension(), 1, 77);
-        let x = self.coupled(shifted, s, false).solve(b.as_ref())?;
-        let r = self.times([s * s, s, c64::new(1.0, 0.0)], x.as_ref(), false) - &b;
+        let times = |x: MatRef<'_, c64>| self.times([s * s, s, c64::new(1.0, 0.0)], x, false);
+        let x = self.coupled(shifted, s, false).solve(b.as_ref(), times)?;
+        let r = times(x.as_ref()) - &b;
         let parts = shifted.square * self.norms[0] + s.im * self.norms[1] + self.norms[2];
         Ok(r.norm_l2() / (parts * x.norm_l2() + b.norm_l2()))
     }
 
-    fn coupled<'s>(&self, shifted: &'s Shifted<'s>, s: c64, transposed: bool) -> Coupled<'s, c64> {
+    fn coupled<'s>(&self, shifted: &'s Shifted, s: c64, transposed: bool) -> Coupled<'s, c64> {
         let weight = |(k, c): (&f64, &f64)| c64::new(*k, 0.0) + s * *c;
         let weights = self.low_rank.stiffness.iter().zip(&self.low_rank.damping).map(weight).collect();
         shifted.couple(&self.low_rank, weights, transposed)
@@ -212,7 +213,7 @@ impl<'a> Problem<'a> {
     /// The roots nearest to a shift, for a model of parts joined by contact.
     pub fn around_parts(
         &mut self,
-        shifted: &Shifted<'_>,
+        shifted: &Shifted,
         gap: [f64; 2],
         progress: &mut dyn FnMut(FullProgress),
     ) -> Result<Found, ReductionError> {
@@ -222,7 +223,9 @@ impl<'a> Problem<'a> {
             // Solvers with `Q(s)` and with its transpose, each set up once.
             let (forward, backward) = (self.coupled(shifted, s, false), self.coupled(shifted, s, true));
             let solve = |b: MatRef<'_, c64>, transposed: bool| {
-                if transposed { backward.solve(b) } else { forward.solve(b) }.map_err(|stalled| self.stalled(stalled))
+                let solver = if transposed { &backward } else { &forward };
+                let times = |x: MatRef<'_, c64>| self.times([s * s, s, c64::new(1.0, 0.0)], x, transposed);
+                solver.solve(b, times).map_err(|stalled| self.stalled(stalled))
             };
             return self.linearised(omega, gap, &solve, progress);
         }
@@ -230,7 +233,10 @@ impl<'a> Problem<'a> {
             .map(|transposed| shifted.couple::<f64>(&self.low_rank, self.low_rank.stiffness.clone(), transposed));
         let inverse = |x: Mat<f64>, transposed: bool| {
             let b = self.model.mass_times(x.as_ref());
-            coupled[usize::from(transposed)].solve(b.as_ref()).map_err(|stalled| self.stalled(stalled))
+            let times = |x: MatRef<'_, f64>| {
+                self.model.stiffness_times(&self.here, x, transposed) - faer::Scale(square) * self.model.mass_times(x)
+            };
+            coupled[usize::from(transposed)].solve(b.as_ref(), times).map_err(|stalled| self.stalled(stalled))
         };
         self.around(omega, gap, &inverse, &|theta| undamped_roots(theta, square), progress)
     }

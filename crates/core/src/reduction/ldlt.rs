@@ -108,3 +108,24 @@ fn in_single(mut z: MatMut<'_, f64>, solve: impl FnOnce(MatMut<'_, f32>)) {
             .for_each(|(to, value)| *to = size * value.double());
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::fronts::tests::cube;
+    use super::*;
+
+    /// Numbers below the smallest of single precision, 1e-45, are solved for like others: powers of two scale exactly.
+    #[test]
+    fn small_right_sides_keep_their_digits_in_single_precision() {
+        let [mass, stiffness] = cube(6);
+        let n = mass.nrows();
+        let pencil = Pencil::new("cube", &mass, &stiffness).unwrap();
+        let ldlt = pencil.ldlt(3.0, Precision::Single).unwrap();
+        // The first column is 0.
+        let b = Mat::from_fn(n, 2, |i, j| j as f64 * (i as f64).sin());
+        let small = 2.0_f64.powi(-200);
+        let [of_small, of_all] = [small, 1.0].map(|scale| ldlt.solve((faer::Scale(scale) * &b).as_ref()));
+        assert!(of_all.norm_max() > 0.0);
+        assert_eq!(of_small, faer::Scale(small) * of_all);
+    }
+}

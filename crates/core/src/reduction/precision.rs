@@ -24,7 +24,6 @@ impl Precision {
 
 /// A number of a factor.
 pub(super) trait Real: faer::traits::RealField + Copy {
-    const MINUS_ONE: Self;
     /// The nearest number of this type.
     fn rounded(value: f64) -> Self;
     /// The same number in double precision.
@@ -32,7 +31,6 @@ pub(super) trait Real: faer::traits::RealField + Copy {
 }
 
 impl Real for f64 {
-    const MINUS_ONE: Self = -1.0;
     fn rounded(value: f64) -> Self {
         value
     }
@@ -42,7 +40,6 @@ impl Real for f64 {
 }
 
 impl Real for f32 {
-    const MINUS_ONE: Self = -1.0;
     fn rounded(value: f64) -> Self {
         value as f32
     }
@@ -61,16 +58,16 @@ impl Values {
     /// Zeros, or `None` if memory is insufficient.
     pub(super) fn zeros(length: usize, precision: Precision) -> Option<Self> {
         match precision {
-            Precision::Double => room(length).map(Self::Double),
-            Precision::Single => room(length).map(Self::Single),
+            Precision::Double => zeros(length).map(Self::Double),
+            Precision::Single => zeros(length).map(Self::Single),
         }
     }
 }
 
 /// Zeros, or `None` if memory is insufficient.
-pub(super) fn room<T: Real>(length: usize) -> Option<Vec<T>> {
+pub(super) fn zeros<T: Real>(length: usize) -> Option<Vec<T>> {
     let mut values = vec![];
     values.try_reserve_exact(length).ok()?;
-    values.resize(length, T::rounded(0.0));
+    values.resize(length, T::zero());
     Some(values)
 }

@@ -7,7 +7,7 @@ use super::front_blocks::Broken;
 use super::krylov::random_block;
 use super::ldlt::Ldlt;
 use super::pencil::{Llt, Pencil};
-use super::precision::{Precision, room};
+use super::precision::{Precision, zeros};
 use super::refinement::{Stalled, refined};
 use super::sparse::{one_norm, symmetric_times};
 
@@ -22,7 +22,7 @@ impl Pencil<'_> {
 
     /// Cholesky factor `K + s M = L Lᵀ`, probed by a solve; `None` if the matrix is not positive definite.
     pub(super) fn llt(&self, shift: f64) -> Result<Option<Llt<'_>>, ReductionError> {
-        let mut values = room(self.factor_entries()).ok_or_else(|| self.no_memory())?;
+        let mut values = zeros(self.factor_entries()).ok_or_else(|| self.no_memory())?;
         match self.fronts(shift).cholesky(&mut values) {
             Ok(()) => {}
             Err(Broken::Indefinite) => return Ok(None),

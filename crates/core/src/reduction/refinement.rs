@@ -14,10 +14,13 @@ use faer::{Mat, MatRef};
 
 use super::krylov::Number;
 
-/// The error to reach, relative to that of a solve without refinement: 256 times the ratio of the rounding errors of double
-/// and of single precision. An entry of the factor is rounded once, but one of `r` is a sum of hundreds of products.
-const GAIN: f64 = 256.0 * f64::EPSILON / f32::EPSILON as f64;
-/// Largest ratio of two corrections, one after the other. Above it, the factor is too far from the matrix.
+/// The ratio of the rounding errors of double and of single precision. A correction `d` at most this small, relative to `x`, leaves a
+/// residual of at most `|A - F| |d|`, about `2^-23 |A| · 2^-29 |x| = ε |A| |x|`: that of a solve in double precision.
+const FLOOR: f64 = f64::EPSILON / f32::EPSILON as f64;
+/// The error to reach, relative to that of a solve without refinement. An entry of the factor is rounded once, but one of `r`
+/// is a sum of hundreds of products.
+const GAIN: f64 = 256.0 * FLOOR;
+/// Largest ratio of a correction to the one before it. Above it, the factor is too far from the matrix.
 const SLOWEST: f64 = 0.25;
 
 /// A solve whose corrections do not shrink.
@@ -43,18 +46,19 @@ impl Stalled {
 /// `A⁻¹ B`, where `solve` returns `F⁻¹ R` and `times` returns `A X`.
 ///
 /// The corrections shrink by `ρ` at each step, so that `ρ |d|` of error is left after the last one. The steps end once that
-/// is at most [`GAIN`] times the first correction, in every column.
+/// is at most [`GAIN`] times the first correction, in every column, or rounding errors of `r` keep corrections from shrinking.
 ///
 /// # Errors
-/// [`Stalled`] if corrections shrink by less than [`SLOWEST`] before that, or are not finite.
+/// [`Stalled`] if larger corrections shrink by less than [`SLOWEST`], or are not finite.
 pub(super) fn refined<T: Number>(
     b: MatRef<'_, T>,
     times: impl Fn(MatRef<'_, T>) -> Mat<T>,
     solve: impl Fn(MatRef<'_, T>) -> Mat<T>,
 ) -> Result<Mat<T>, Stalled> {
     let mut x = solve(b);
-    // Of each column, relative to `x`. The whole of `x` is a correction of 0.
+    // Sizes of corrections relative to `x`, by column. `x` itself counts as the one before the first, with size 1.
     let (mut first, mut before) = (vec![], vec![1.0; b.ncols()]);
+    let mut open: Vec<usize> = (0..b.ncols()).collect();
     loop {
         let d = solve((b - times(x.as_ref())).as_ref());
         x += &d;
@@ -68,10 +72,13 @@ pub(super) fn refined<T: Number>(
         }
         // `min` makes infinity of what is not a number.
         let ratio = |column: usize| (now[column] / before[column]).min(f64::INFINITY);
-        let left = |column: usize| ratio(column).min(1.0) * now[column];
-        let done = |column: usize| now[column] == 0.0 || left(column) <= GAIN * first[column];
-        let open = (0..b.ncols()).filter(|&column| !done(column));
-        let slowest = open.max_by(|&a, &b| ratio(a).total_cmp(&ratio(b)));
+        let done = |column: usize| {
+            let (ratio, now, first) = (ratio(column), now[column], first[column]);
+            now == 0.0 || ratio * now <= GAIN * first || (ratio > SLOWEST && now <= FLOOR)
+        };
+        // What follows in a finished column are rounding errors of `r`, which do not shrink.
+        open.retain(|&column| !done(column));
+        let slowest = open.iter().copied().max_by(|&a, &b| ratio(a).total_cmp(&ratio(b)));
         let Some(slowest) = slowest else { return Ok(x) };
         if ratio(slowest) > SLOWEST {
             return Err(Stalled { correction: now[slowest], ratio: ratio(slowest) });
@@ -84,31 +91,34 @@ pub(super) fn refined<T: Number>(
 mod tests {
     use super::*;
 
-    /// `A` is diagonal; `F` differs from it by at most `error` of each entry.
-    fn solved(error: f64) -> (Result<Mat<f64>, Stalled>, Mat<f64>, usize) {
+    /// `A` is diagonal. `F` differs from it by at most `errors` of each entry, one for each column, and products with `A` have other
+    /// errors of at most `rounding` each time.
+    fn solved(errors: [f64; 3], rounding: f64) -> (Result<Mat<f64>, Stalled>, Mat<f64>, usize) {
         let n = 50;
         let a = |i: usize| 10.0_f64.powi(i as i32 % 9);
-        let f = |i: usize| a(i) * (1.0 + error * (i as f64).sin());
+        let f = |i: usize, j: usize| a(i) * (1.0 + errors[j] * (i as f64).sin());
         // A column of zeros has the solution 0.
         let b = Mat::from_fn(n, 3, |i, j| if j == 1 { 0.0 } else { a(i) * (1.0 + (i * (j + 2)) as f64).cos() });
-        let divided = |x: MatRef<'_, f64>, by: &dyn Fn(usize) -> f64| Mat::from_fn(n, 3, |i, j| x[(i, j)] / by(i));
         let solves = std::cell::Cell::new(0);
         let found = refined(
             b.as_ref(),
-            |x| Mat::from_fn(n, 3, |i, j| a(i) * x[(i, j)]),
+            |x| {
+                let seed = n * solves.get();
+                Mat::from_fn(n, 3, |i, j| a(i) * x[(i, j)] * (1.0 + rounding * ((seed + i) as f64).cos()))
+            },
             |r| {
                 solves.set(solves.get() + 1);
-                divided(r, &f)
+                Mat::from_fn(n, 3, |i, j| r[(i, j)] / f(i, j))
             },
         );
-        (found, divided(b.as_ref(), &a), solves.get())
+        (found, Mat::from_fn(n, 3, |i, j| b[(i, j)] / a(i)), solves.get())
     }
 
     /// The error falls by `ρ`, at most `error / (1 - error)`, with every solve; `ρ^k ≤ 2^-21` for a solve and `k` corrections.
     #[test]
     fn solves_are_refined_to_double_precision() {
         for error in [1e-3, 1e-2, 0.1] {
-            let (found, expected, solves) = solved(error);
+            let (found, expected, solves) = solved([error; 3], 0.0);
             let corrections = (GAIN.ln() / (error / (1.0 - error)).ln()).ceil() as usize;
             assert!(solves <= 2 + corrections, "{error}: {solves}");
             let error_left = (found.unwrap() - &expected).norm_max() / expected.norm_max();
@@ -116,12 +126,26 @@ mod tests {
         }
     }
 
+    /// Corrections of rounding errors end the steps if they are below 2^-29, and are refused above it. Those of a finished column
+    /// do not matter while another is refined.
+    #[test]
+    fn refinement_ends_at_the_rounding_errors_of_the_residual() {
+        for errors in [[1e-6; 3], [1e-7, 0.0, 1e-2]] {
+            let rounding = if errors[2] == 1e-2 { 3e-8 } else { 5e-9 };
+            let (found, expected, solves) = solved(errors, rounding);
+            let error = (found.unwrap() - &expected).norm_max() / expected.norm_max();
+            assert!(error < 2.0 * rounding && solves >= 4, "{errors:?}: {error:e} after {solves}");
+        }
+        let stalled = solved([1e-6; 3], 2e-8).0.unwrap_err();
+        assert!(stalled.correction > FLOOR && stalled.ratio > SLOWEST, "{stalled:?}");
+    }
+
     #[test]
     fn a_factor_too_far_from_the_matrix_is_refused() {
         for error in [0.5, 3.0, f64::NAN] {
-            let stalled = solved(error).0.unwrap_err();
+            let stalled = solved([error; 3], 0.0).0.unwrap_err();
             assert!(stalled.ratio > SLOWEST, "{error}: {stalled:?}");
         }
-        assert!(solved(0.5).0.unwrap_err().reason().contains("in single precision is too inaccurate"));
+        assert!(solved([0.5; 3], 0.0).0.unwrap_err().reason().contains("in single precision is too inaccurate"));
     }
 }

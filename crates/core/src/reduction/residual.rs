@@ -259,7 +259,7 @@ mod tests {
             assert!(refused(found.unwrap_err()), "{spoilt:?}");
         }
         assert!(refused(with(Spoil::Factor, || analysed.pencil.llt(shift)).err().unwrap()));
-        // Single precision holds with a matrix of a condition of at most 1e4.
+        // Far from the rigid motion: the condition of `K + s M` is a few thousand.
         let shift = analysed.pencil.typical_square() * 1e-3;
         for precision in [Precision::Double, Precision::Single] {
             let spoilt = with(Spoil::Factor, || analysed.pencil.ldlt(shift, precision));

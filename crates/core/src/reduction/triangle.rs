@@ -148,7 +148,7 @@ impl<T: Real> Triangle<'_, T> {
             pattern.iter().zip(to).for_each(|(&row, value)| *value = from[place[row] as usize]);
         }
         let mut of_node = local.subrows_mut(first, panel.ncols());
-        matmul(of_node.as_mut(), Accum::Add, rest.transpose(), below.as_ref(), T::MINUS_ONE, Par::Seq);
+        matmul(of_node.as_mut(), Accum::Add, rest.transpose(), below.as_ref(), -T::one(), Par::Seq);
         self.solve_top(top, of_node, true);
     }
 
@@ -165,7 +165,7 @@ impl<T: Real> Triangle<'_, T> {
             let chunks = row_blocks(below, BLOCK);
             shared(chunks, rest.nrows() * width >= DIVIDED, |(at, below): (usize, MatMut<'_, T>)| {
                 let rest = rest.subrows(at, below.nrows());
-                matmul(below, Accum::Add, rest, of_block, T::MINUS_ONE, Par::Seq);
+                matmul(below, Accum::Add, rest, of_block, -T::one(), Par::Seq);
             });
         }
     }
@@ -182,7 +182,7 @@ impl<T: Real> Triangle<'_, T> {
             let chunks = row_blocks(of_block.as_mut(), COLUMNS);
             shared(chunks, rest.nrows() * width >= DIVIDED, |(at, of_columns): (usize, MatMut<'_, T>)| {
                 let rest = rest.subcols(at, of_columns.nrows());
-                matmul(of_columns, Accum::Add, rest.transpose(), below, T::MINUS_ONE, Par::Seq);
+                matmul(of_columns, Accum::Add, rest.transpose(), below, -T::one(), Par::Seq);
             });
             self.solve_top(top, of_block, true);
         }

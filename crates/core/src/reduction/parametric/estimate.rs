@@ -5,6 +5,7 @@ use faer::{Mat, c64};
 use super::super::ReductionError;
 use super::super::checked::definite;
 use super::super::full_model::Projected;
+use super::super::krylov::random_block;
 use super::super::{on_threads, threads_for};
 use super::condition::slope;
 use super::request::ParametricStep;
@@ -31,6 +32,11 @@ impl Building<'_, '_> {
             let weights = low_rank.stiffness.clone();
             shifted.couple::<f64>(&low_rank, weights, false)
         });
+        // Estimates take unrefined solves. A refined one fails unless corrections are at most a quarter of the solution.
+        if let Some(coupled) = &coupled {
+            let b = random_block(self.full.dimension(), 1, 5);
+            coupled.solve(b.as_ref(), |x| self.span.metric.times(x)).map_err(|stalled| failed(stalled.reason()))?;
+        }
         let factor =
             match &self.pencil {
                 Some(pencil) => Some(definite(self.solver.engine(), pencil, sigma)?.ok_or_else(|| {
@@ -39,7 +45,8 @@ impl Building<'_, '_> {
                 None => None,
             };
         let inverse = |mut b: Mat<f64>| match (&coupled, &factor) {
-            (Some(coupled), _) => coupled.solve(b.as_ref()).map_err(|stalled| failed(stalled.reason())),
+            // Estimates need one digit; the solve above showed that the factors have it.
+            (Some(coupled), _) => Ok(coupled.solve_unrefined(b.as_ref())),
             (None, Some(factor)) => {
                 factor.solve(&mut b, false)?;
                 Ok(b)
