@@ -632,7 +632,7 @@ fn chart_options(plan: &Plan) -> ChartOptions {
     };
     let smallest_share = match plan.kind {
         // Low speeds, where roots move most, are few of the conditions.
-        Kind::Lateral | Kind::Damped => 1e-6,
+        Kind::Lateral | Kind::Damped => 1e-8,
         Kind::Undamped | Kind::Hertzian | Kind::Rough | Kind::Opening | Kind::Turning => 1e-4,
     };
     ChartOptions {
