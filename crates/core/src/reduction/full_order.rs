@@ -105,6 +105,13 @@ impl<'a> FullSolver<'a> {
         Ok(solver)
     }
 
+    /// The same with factors in single precision, whatever the memory.
+    #[cfg(test)]
+    pub(super) fn in_single_precision(mut self) -> Self {
+        self.factors.iter_mut().for_each(|factors| factors.precision = super::precision::Precision::Single);
+        self
+    }
+
     /// Calls `work` with `threads` solvers of the same model, one for each thread; each may take an equal share of the
     /// memory. If that is too little, `work` is called again with this solver alone: `is_of_memory` recognises the error.
     ///

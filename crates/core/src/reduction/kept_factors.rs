@@ -14,7 +14,7 @@ pub(super) struct KeptFactors<'a> {
     kept: Vec<Shifted>,
     /// Largest number of them.
     most: usize,
-    precision: Precision,
+    pub precision: Precision,
 }
 
 impl<'a> KeptFactors<'a> {

@@ -270,6 +270,20 @@ mod tests {
         }
     }
 
+    /// The same with factors in single precision, and an error if one is wrong.
+    #[test]
+    fn a_basis_by_factors_in_single_precision_holds_its_tolerance() {
+        use crate::spoil::{Spoil, with};
+        let full = chains(5.0, LAW);
+        let mut single = solver(&full).in_single_precision();
+        let basis = parametric_basis(&full, &mut single, &request(1e-6), &mut |_| {}).unwrap();
+        assert!(basis.worst() <= 1e-6 && basis.held_out.len() == 4);
+        let mut wrong = solver(&full).in_single_precision();
+        let refused = with(Spoil::Factor, || parametric_basis(&full, &mut wrong, &request(1e-6), &mut |_| {}));
+        let message = refused.map(|_| ()).unwrap_err().to_string();
+        assert!(message.contains("in single precision is too inaccurate"), "{message}");
+    }
+
     /// The same for a disc that turns, with Rayleigh damping of the pad: rotation shifts the roots by far more than the
     /// tolerance, and its projection stays exactly skew.
     #[test]
