@@ -232,6 +232,11 @@ impl<T: Number> Coupled<'_, T>
 where
     PartialPivLu<T>: Solver<T>,
 {
+    /// Whether the factors are kept in single precision.
+    pub(super) fn is_single(&self) -> bool {
+        self.shifted.precision == Precision::Single
+    }
+
     /// `Q⁻¹ B`. `times` returns `Q X`, with which solves in single precision are refined.
     ///
     /// # Errors

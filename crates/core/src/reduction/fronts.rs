@@ -20,7 +20,7 @@ use faer::{Mat, MatMut};
 use super::SparseMatrix;
 use super::elimination_tree::Tree;
 use super::front_blocks::{Broken, positive, signed, subtract_lower};
-use super::precision::{Real, Values};
+use super::precision::Values;
 use super::threads::shared;
 
 /// Number of rows of a front below which it is not divided among threads.
@@ -218,7 +218,7 @@ impl<'a, 'f> Sweep<'a, 'f> {
         if let Kept::Single(factor) = &self.factor
             && let Ok(mut kept) = factor[s].lock()
         {
-            let rounded = panel.col_iter().flat_map(|column| column.iter().copied().map(f32::rounded));
+            let rounded = panel.col_iter().flat_map(|column| column.iter().map(|value| *value as f32));
             kept.iter_mut().zip(rounded).for_each(|(to, value)| *to = value);
         }
         Update { supernode: s, value: update }

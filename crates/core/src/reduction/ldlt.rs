@@ -98,7 +98,7 @@ impl Ldlt {
 /// residual would be lost below the smallest of that precision.
 fn in_single(mut z: MatMut<'_, f64>, solve: impl FnOnce(MatMut<'_, f32>)) {
     let sizes: Vec<f64> = z.as_ref().col_iter().map(|column| column.norm_max().max(f64::MIN_POSITIVE)).collect();
-    let mut single = Mat::from_fn(z.nrows(), z.ncols(), |i, j| f32::rounded(z[(i, j)] / sizes[j]));
+    let mut single = Mat::from_fn(z.nrows(), z.ncols(), |i, j| (z[(i, j)] / sizes[j]) as f32);
     solve(single.as_mut());
     for (j, size) in sizes.iter().enumerate() {
         z.as_mut()

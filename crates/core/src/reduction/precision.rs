@@ -24,25 +24,17 @@ impl Precision {
 
 /// A number of a factor.
 pub(super) trait Real: faer::traits::RealField + Copy {
-    /// The nearest number of this type.
-    fn rounded(value: f64) -> Self;
     /// The same number in double precision.
     fn double(self) -> f64;
 }
 
 impl Real for f64 {
-    fn rounded(value: f64) -> Self {
-        value
-    }
     fn double(self) -> f64 {
         self
     }
 }
 
 impl Real for f32 {
-    fn rounded(value: f64) -> Self {
-        value as f32
-    }
     fn double(self) -> f64 {
         f64::from(self)
     }

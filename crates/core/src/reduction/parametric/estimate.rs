@@ -33,7 +33,7 @@ impl Building<'_, '_> {
             shifted.couple::<f64>(&low_rank, weights, false)
         });
         // Estimates take unrefined solves. A refined one fails unless corrections are at most a quarter of the solution.
-        if let Some(coupled) = &coupled {
+        if let Some(coupled) = coupled.as_ref().filter(|coupled| coupled.is_single()) {
             let b = random_block(self.full.dimension(), 1, 5);
             coupled.solve(b.as_ref(), |x| self.span.metric.times(x)).map_err(|stalled| failed(stalled.reason()))?;
         }
